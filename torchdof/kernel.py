@@ -1,0 +1,331 @@
+"""Point spread functions, integrated over the pixel: non-negative, sum 1, differentiable in their parameters.
+
+Every family is isotropic, a profile ``f(r)`` over the distance ``r`` from the kernel's centre. A pixel's value is the
+integral of ``f`` over the pixel's square. It is taken ring by ring: a pixel is cut by circles into thin slices, the
+area of each slice is exact (circle against square), and within a slice ``f`` is replaced by its mean over r, which has
+a closed form for every family. A disc thus is a soft disc with a softness of 0, and kernels stay right down to radii
+far below a pixel, where sampling ``f`` at the pixels' centres fails.
+
+All arithmetic is in float64 on the CPU's or the parameter's device; parameters are in pixels.
+"""
+
+import functools
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+__all__ = ["FAMILIES", "disc", "gaussian", "profile", "radial", "render", "ring", "softm", "support"]
+
+FAMILIES: dict[str, tuple[str, ...]] = {
+    "gaussian": ("sigma",),
+    "ring": ("sigma", "r_c"),
+    "disc": ("radius",),
+    "softm": ("radius", "sigma", "b", "m"),
+    "radial": ("values", "radius"),
+}
+"""Names of the parameters of each family."""
+
+LENGTHS = frozenset({"sigma", "r_c", "radius"})
+"""Parameters that are lengths; the others are pure numbers."""
+
+_SMALLEST = 1e-4  # px; a length below it is rendered as this, which is a kernel of one pixel
+_CACHED_HALF_WIDTH = 64
+
+Number = float | Tensor
+
+
+def gaussian(sigma: Number, size: int | None = None) -> Tensor:
+    """Gaussian of standard deviation ``sigma`` along each axis; its pixel integral is a product of two erf differences.
+
+    Args:
+        sigma: Pixels, >= 0, float or ``[...]``.
+        size: Odd width of the kernel; None takes the smallest that holds it.
+
+    Returns:
+        ``[..., size, size]``, float64.
+
+    Example:
+        >>> gaussian(1.0).shape
+        torch.Size([11, 11])
+    """
+    return render("gaussian", {"sigma": sigma}, size)
+
+
+def ring(sigma: Number, r_c: Number, size: int | None = None) -> Tensor:
+    """The paper's blur, ``exp(-(r - r_c)^2 / (2 sigma^2))``: a Gaussian in r whose peak sits at radius ``r_c``.
+
+    Args:
+        sigma: Width of the peak in pixels, >= 0, float or ``[...]``.
+        r_c: Radius of the peak in pixels, >= 0.
+        size: Odd width of the kernel; None takes the smallest that holds it.
+
+    Returns:
+        ``[..., size, size]``, float64. The paper's ``N`` scales light, not shape, and is left out.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, eq. (1): sigma^2 -> ``sigma ** 2``, r_c -> ``r_c``.
+
+    Example:
+        >>> round(float(ring(sigma=1.0, r_c=4.0).sum()), 12)
+        1.0
+    """
+    return render("ring", {"sigma": sigma, "r_c": r_c}, size)
+
+
+def disc(radius: Number, size: int | None = None) -> Tensor:
+    """Uniform disc: the image of a point through a perfect lens with a round aperture.
+
+    Args:
+        radius: Pixels, >= 0, float or ``[...]``. Up to half a pixel the kernel is a single pixel.
+        size: Odd width of the kernel; None takes the smallest that holds it.
+
+    Returns:
+        ``[..., size, size]``, float64.
+
+    Example:
+        >>> disc(0.5).tolist()
+        [[1.0]]
+    """
+    return render("disc", {"radius": radius}, size)
+
+
+def softm(radius: Number, sigma: Number, b: Number = 0.0, m: Number = 2.0, size: int | None = None) -> Tensor:
+    """Disc with a soft edge and a radial tilt: ``erfc((r - R) / (sqrt(2) sigma)) / 2 * (1 + b (r / R)^m)``.
+
+    ``b = 0`` is a soft disc, ``b = 0`` and ``sigma = 0`` a disc; ``b > 0`` has the bright rim of an over-corrected lens.
+
+    Args:
+        radius: Pixels, >= 0, float or ``[...]`` (``R``).
+        sigma: Softness of the edge in pixels, >= 0.
+        b: Tilt, >= -1.
+        m: Exponent of the tilt, > 0.
+        size: Odd width of the kernel; None takes the smallest that holds it.
+
+    Returns:
+        ``[..., size, size]``, float64.
+
+    Example:
+        >>> bool(torch.equal(softm(3.0, 0.0, size=9), disc(3.0, size=9)))
+        True
+    """
+    return render("softm", {"radius": radius, "sigma": sigma, "b": b, "m": m}, size)
+
+
+def radial(values: Tensor, radius: Number, size: int | None = None) -> Tensor:
+    """Any isotropic profile: a table of its values over r.
+
+    Args:
+        values: ``[..., P]``, >= 0: the profile at ``r = radius * i / (P - 1)``, linear in between, 0 beyond ``radius``.
+        radius: Pixels, >= 0, float or ``[...]``.
+        size: Odd width of the kernel; None takes the smallest that holds it.
+
+    Returns:
+        ``[..., size, size]``, float64.
+
+    Example:
+        >>> bool(torch.allclose(radial(torch.ones(5), 3.0), disc(3.0), atol=1e-9))
+        True
+    """
+    return render("radial", {"values": values, "radius": radius}, size)
+
+
+def render(family: str, params: Mapping[str, Number], size: int | None = None) -> Tensor:
+    """Kernel of a family by name.
+
+    Args:
+        family: A key of :data:`FAMILIES`.
+        params: Its parameters by name; lengths in pixels, floats or ``[...]`` (``values``: ``[..., P]``), which
+            broadcast against each other.
+        size: Odd width of the kernel; None takes the smallest that holds the largest kernel asked for.
+
+    Returns:
+        ``[..., size, size]``, float64, non-negative, each kernel summing to 1. What lies beyond ``size`` is cut off.
+
+    Raises:
+        ValueError: If the family, a parameter or the size is not as described.
+    """
+    given = _checked(family, params)
+    if size is None:
+        size = 2 * half_width(support(family, given)) + 1
+    if size < 1 or size % 2 == 0:
+        raise ValueError(f"size must be a positive odd number of pixels, got {size}")
+    half = size // 2
+    lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in given.items()}
+    if family == "gaussian":
+        quadrant = _gaussian_quadrant(lengths["sigma"], half)
+    else:
+        inner, outer, area = _slices(half, lengths[FAMILIES[family][-1]].device)
+        mean = _slice_means(family, lengths, inner, outer)
+        quadrant = (mean * area).sum(-1).unflatten(-1, (half + 1, half + 1))
+    kernel = torch.cat([quadrant[..., 1:, :].flip(-2), quadrant], -2)
+    kernel = torch.cat([kernel[..., 1:].flip(-1), kernel], -1)
+    return kernel / kernel.sum((-2, -1), keepdim=True)
+
+
+def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
+    """The profile ``f(r)`` itself, not normalised and not integrated: eq. (1) without N for ``ring``.
+
+    Args:
+        family: A key of :data:`FAMILIES`.
+        r: Distances from the centre, ``[n]``, in the unit of the lengths among the parameters.
+        params: Parameters by name, floats or ``[...]``.
+
+    Returns:
+        ``[..., n]``, float64.
+
+    Raises:
+        ValueError: If the family or a parameter is not as described.
+    """
+    given = {k: v if k == "values" else v.unsqueeze(-1) for k, v in _checked(family, params).items()}
+    r = r.to(torch.float64)
+    if family == "gaussian":
+        return torch.exp(-0.5 * (r / given["sigma"]) ** 2)
+    if family == "ring":
+        return torch.exp(-0.5 * ((r - given["r_c"]) / given["sigma"]) ** 2)
+    if family == "disc":
+        return (r <= given["radius"]).to(torch.float64)
+    if family == "softm":
+        edge = 0.5 * torch.erfc((r - given["radius"]) / (math.sqrt(2) * given["sigma"].clamp_min(1e-12)))
+        return edge * _tilt(r, given)
+    values, radius = given["values"], given["radius"]
+    where = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
+    low = where.floor().long().clamp(max=values.shape[-1] - 2)
+    batch = torch.broadcast_shapes(values.shape[:-1], low.shape[:-1])
+    values, low = values.expand(*batch, -1), low.expand(*batch, -1)
+    mixed = torch.lerp(values.gather(-1, low), values.gather(-1, low + 1), where - low)
+    return torch.where(r <= radius, mixed, 0.0)
+
+
+def support(family: str, params: Mapping[str, Number]) -> float:
+    """Radius in pixels beyond which a kernel holds less than 4e-6 of its light (for the largest parameters given)."""
+    given = _checked(family, params)
+    if family == "gaussian":
+        reach = 5.0 * given["sigma"]
+    elif family == "ring":
+        reach = given["r_c"] + 5.0 * given["sigma"]
+    elif family == "softm":
+        reach = given["radius"] + 4.5 * given["sigma"]
+    else:
+        reach = given["radius"]
+    return float(reach.detach().max())
+
+
+def half_width(reach: float) -> int:
+    """Pixels on each side of the centre that a kernel of radius ``reach`` touches."""
+    return max(0, math.ceil(reach - 0.5 - 1e-9))
+
+
+def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
+    if family not in FAMILIES:
+        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}")
+    if set(params) != set(FAMILIES[family]):
+        raise ValueError(f"{family} takes the parameters {', '.join(FAMILIES[family])}, got {', '.join(params)}")
+    device = next((p.device for p in params.values() if isinstance(p, Tensor)), torch.device("cpu"))
+    given = {k: torch.as_tensor(v, dtype=torch.float64, device=device) for k, v in params.items()}
+    for name, value in given.items():
+        low = -1.0 if name == "b" else 0.0
+        if not bool((torch.isfinite(value.detach()) & (value.detach() >= low)).all()):
+            raise ValueError(f"{name} of {family} must be finite and >= {low:g}, got {value.detach().flatten()[:4]}")
+    if family == "radial" and (given["values"].ndim < 1 or given["values"].shape[-1] < 2):
+        raise ValueError(f"values must be [..., P] with P >= 2, got {list(given['values'].shape)}")
+    return given
+
+
+def _tilt(r: Tensor, given: Mapping[str, Tensor]) -> Tensor:
+    return (1.0 + given["b"] * (r / given["radius"]) ** given["m"]).clamp_min(0.0)
+
+
+def _gaussian_quadrant(sigma: Tensor, half: int) -> Tensor:
+    edges = torch.arange(half + 2, dtype=torch.float64, device=sigma.device) - 0.5
+    cumulative = torch.erf(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
+    tail = torch.erfc(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
+    # erf loses the tail, erfc the centre: each where it is exact
+    line = torch.where(edges[:-1] < 1.0, cumulative[..., 1:] - cumulative[..., :-1], tail[..., :-1] - tail[..., 1:])
+    return line.unsqueeze(-1) * line.unsqueeze(-2)
+
+
+def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Tensor) -> Tensor:
+    """Mean over r of the profile in each slice: ``[..., pixels, slices]``."""
+    p = {k: v if k == "values" else v[..., None, None] for k, v in p.items()}
+    thickness = outer - inner
+    if family == "disc":
+        return ((p["radius"] - inner) / thickness).clamp(0.0, 1.0)
+    if family == "ring":
+        width = math.sqrt(2) * p["sigma"]
+        return (torch.erf((outer - p["r_c"]) / width) - torch.erf((inner - p["r_c"]) / width)) * width / thickness
+    if family == "softm":
+        width = math.sqrt(2) * p["sigma"]
+        rise = _erfc_integral((outer - p["radius"]) / width) - _erfc_integral((inner - p["radius"]) / width)
+        return (rise * width / thickness).clamp_min(0.0) * _tilt((inner + outer) / 2, p)
+    return (_table_integral(outer, p) - _table_integral(inner, p)).clamp_min(0.0) / thickness
+
+
+def _erfc_integral(x: Tensor) -> Tensor:
+    """``integral of erfc(x) / 2``, without the cancellation that would follow where erfc is nearly 2."""
+    a = x.abs()
+    tail = 0.5 * (a * torch.erfc(a) - torch.exp(-a * a) / math.sqrt(math.pi))
+    return torch.where(x < 0, x + tail, tail)
+
+
+def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
+    """Integral from 0 to r of the piecewise linear table: ``[..., pixels, slices]``."""
+    values, radius = p["values"], p["radius"]
+    last = values.shape[-1] - 1
+    where = (r / radius).clamp(max=1.0) * last
+    low = where.detach().floor().long().clamp(max=last - 1)
+    whole = torch.cat(
+        [torch.zeros_like(values[..., :1]), torch.cumsum((values[..., 1:] + values[..., :-1]) / 2, -1)], -1
+    )
+    batch = torch.broadcast_shapes(values.shape[:-1], low.shape[:-2])
+    flat = low.expand(*batch, *low.shape[-2:]).flatten(-2)
+    start, left, right = (
+        v.expand(*batch, -1).gather(-1, i).unflatten(-1, low.shape[-2:])
+        for v, i in ((whole, flat), (values, flat), (values, flat + 1))
+    )
+    part = where - low
+    return (start + left * part + (right - left) * part * part / 2) * radius / last
+
+
+def _slices(half: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Slices of the pixels of a quadrant: inner and outer radius and area, each ``[pixels, slices]``."""
+    cut = _cut_quadrant if half <= _CACHED_HALF_WIDTH else _cut_quadrant.__wrapped__
+    inner, outer, area = cut(half)
+    return inner.to(device), outer.to(device), area.to(device)
+
+
+@functools.lru_cache(maxsize=2 * _CACHED_HALF_WIDTH)
+def _cut_quadrant(half: int) -> tuple[Tensor, Tensor, Tensor]:
+    # finer slices where a pixel is a larger part of the kernel
+    slices = 64 if half <= 4 else 32 if half <= 12 else 16 if half <= 64 else 8
+    index = torch.arange(half + 1, dtype=torch.float64)
+    low, high = (index - 0.5).clamp_min(0.0), index + 0.5
+    nearest = torch.hypot(low[:, None], low[None, :]).flatten()
+    farthest = torch.hypot(high[:, None], high[None, :]).flatten()
+    share = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64)
+    r = nearest[:, None] + (farthest - nearest)[:, None] * share
+    low_y, low_x = (v.flatten()[:, None] for v in torch.meshgrid(low, low, indexing="ij"))
+    high_y, high_x = (v.flatten()[:, None] for v in torch.meshgrid(high, high, indexing="ij"))
+    covered = (
+        _corner_area(high_x, high_y, r)
+        - _corner_area(low_x, high_y, r)
+        - _corner_area(high_x, low_y, r)
+        + _corner_area(low_x, low_y, r)
+    )
+    # a pixel on an axis reaches as far to the other side of it
+    twice = torch.where(index == 0, 2.0, 1.0)
+    covered = covered * (twice[:, None] * twice[None, :]).flatten()[:, None]
+    return r[:, :-1].contiguous(), r[:, 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
+
+
+def _corner_area(x: Tensor, y: Tensor, r: Tensor) -> Tensor:
+    """Area of the quarter disc of radius r that lies within the rectangle from the origin to (x, y)."""
+    x, y = torch.minimum(x, r), torch.minimum(y, r)
+    reach = torch.sqrt((r * r - y * y).clamp_min(0.0))  # up to here the rectangle's top is inside the disc
+
+    def under_arc(t: Tensor) -> Tensor:
+        return 0.5 * (t * torch.sqrt((r * r - t * t).clamp_min(0.0)) + r * r * torch.asin((t / r).clamp(max=1.0)))
+
+    beyond = torch.where(x > reach, under_arc(x) - under_arc(torch.minimum(reach, x)), 0.0)
+    return torch.where(r > 0, y * torch.minimum(x, reach) + beyond, 0.0)
