@@ -1,0 +1,6 @@
+"""``python -m torchdof``."""
+
+from .command import main
+
+if __name__ == "__main__":
+    main()

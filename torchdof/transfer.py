@@ -1,0 +1,53 @@
+"""Transfer curves: what a file stores to linear light and back, with alpha straight or premultiplied."""
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+__all__ = ["Transfer", "decode", "default_transfer", "encode"]
+
+Transfer = Literal["linear", "srgb"]
+
+
+def default_transfer(sample: str) -> Transfer:
+    """What a file of such samples ("8", "16", "half", "float") is taken for when nobody says: floats are linear."""
+    return "linear" if sample in ("half", "float") else "srgb"
+
+
+def decode(pixels: Tensor, transfer: Transfer, has_alpha: bool, straight: bool) -> Tensor:
+    """File values to linear light, premultiplied."""
+    if not has_alpha:
+        return _srgb_to_linear(pixels) if transfer == "srgb" else pixels
+    colour, alpha = pixels[:, :-1], pixels[:, -1:]
+    if transfer == "srgb":
+        colour = colour if straight else _divide(colour, alpha)
+        colour, straight = _srgb_to_linear(colour), True
+    return torch.cat([colour * alpha if straight else colour, alpha], dim=1)
+
+
+def encode(pixels: Tensor, transfer: Transfer, has_alpha: bool, straight: bool) -> Tensor:
+    """Linear light, premultiplied, to file values."""
+    if not has_alpha:
+        return _linear_to_srgb(pixels) if transfer == "srgb" else pixels
+    colour, alpha = pixels[:, :-1], pixels[:, -1:]
+    if straight or transfer == "srgb":
+        colour = _divide(colour, alpha)
+        colour = _linear_to_srgb(colour) if transfer == "srgb" else colour
+        colour = colour if straight else colour * alpha
+    return torch.cat([colour, alpha], dim=1)
+
+
+def _divide(colour: Tensor, alpha: Tensor) -> Tensor:
+    return torch.where(alpha > 0, colour / torch.where(alpha > 0, alpha, 1.0), 0.0)
+
+
+def _srgb_to_linear(encoded: Tensor) -> Tensor:
+    """IEC 61966-2-1; negative values by symmetry."""
+    size = encoded.abs()
+    return torch.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4) * encoded.sign()
+
+
+def _linear_to_srgb(linear: Tensor) -> Tensor:
+    size = linear.abs()
+    return torch.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055) * linear.sign()
