@@ -1,0 +1,264 @@
+"""Depth of field as a module and as functions: the chain of the other rooms and nothing else."""
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from . import check as checks
+from . import composite, layers, spread
+from .camera import Camera
+from .plan import Plan
+from .table import BlurTable
+
+__all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
+
+Method = Literal["layered", "fold"]
+
+
+class DepthOfField(nn.Module):
+    """The photograph a real lens would have taken, from an all-in-focus image and its depth.
+
+    Args:
+        camera: The camera; its focus and f-number can be overridden in each call.
+        table: Blur measured from a lens; None takes the ideal disc.
+        tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and
+            full resolution. 0 asks for that rendering itself.
+        occlusion: True composites layers far to near, so that blurred foregrounds cover what is behind and sharp ones
+            are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
+        normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.
+        method: ``"layered"`` spreads layers by convolution (fast); ``"fold"`` by the paper's literal scatter.
+        max_coc_px: Largest radius that a static plan (compiled, exported) covers; larger ones are rendered with it.
+        check: Look for NaN and non-positive depths and non-finite light before rendering, and refuse them. False skips
+            that (and its cost); a pixel with a bad depth then passes through sharp and touches nothing else.
+
+    Raises:
+        ValueError: If an option is not as described.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 3; Ikoma et al. 2021 for the composite.
+
+    Example:
+        >>> dof = DepthOfField(Camera(focus_m=1.0), BlurTable.disc())
+        >>> image, depth = torch.rand(1, 3, 8, 12), torch.full((1, 1, 8, 12), 1.0)
+        >>> bool(torch.equal(dof(image, depth), image))
+        True
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        table: BlurTable | None = None,
+        tolerance: float = 1 / 255,
+        occlusion: bool = True,
+        normalize: bool = True,
+        method: Method = "layered",
+        max_coc_px: float = 64.0,
+        check: bool = True,
+    ) -> None:
+        super().__init__()
+        if not isinstance(camera, Camera):
+            raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
+        table = BlurTable.disc() if table is None else table
+        checks.options(table, tolerance, occlusion, normalize, method, max_coc_px)
+        self.camera, self.table = camera, table
+        self.tolerance, self.occlusion, self.normalize = float(tolerance), bool(occlusion), bool(normalize)
+        self.method, self.max_coc_px, self.check = method, float(max_coc_px), bool(check)
+
+    def forward(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        focus_m: float | Tensor | None = None,
+        f_number: float | Tensor | None = None,
+        plan: Plan | None = None,
+    ) -> Tensor:
+        """Render.
+
+        Args:
+            image: ``[B, C, H, W]``, linear light, floating point.
+            depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed.
+            focus_m: Focus distance in metres for this call, float or ``[B]``; None takes the camera's.
+            f_number: F-number for this call, float or ``[B]``; None takes the camera's.
+            plan: Layers to render with, from :meth:`plan`; None plans for this image.
+
+        Returns:
+            ``[B, C, H, W]`` in the image's dtype. Differentiable with respect to image, depth, focus and f-number.
+            While gradients with respect to the circle of confusion are recorded, the layers stand still (they do not
+            follow the scene), so that the picture is a continuous, piecewise linear function of it.
+
+        Raises:
+            ValueError: If shapes, types or values are not as described.
+        """
+        return blur_by_coc(image, self.coc_px(image, depth, focus_m, f_number), plan=plan, **self._options())
+
+    def coc_px(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        focus_m: float | Tensor | None = None,
+        f_number: float | Tensor | None = None,
+    ) -> Tensor:
+        """Signed circle of confusion of the call :meth:`forward` with the same arguments: ``[B, 1, H, W]``, pixels."""
+        checks.image_and_depth(image, depth, values=self.check)
+        changes = {"focus_m": focus_m, "f_number": f_number}
+        camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
+        coc = camera.coc_px(depth, image.shape[-1])
+        return coc if self.check else torch.where(depth > 0, coc, torch.nan)
+
+    def plan(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        focus_m: float | Tensor | None = None,
+        f_number: float | Tensor | None = None,
+    ) -> Plan:
+        """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`."""
+        coc = self.coc_px(image, depth, focus_m, f_number)
+        return Plan.of_scene(coc, self.tolerance)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Camera, table and options: the whole configuration travels with ``state_dict``."""
+        camera = {k: getattr(self.camera, k) for k in Camera.__dataclass_fields__}
+        return {"camera": camera, "table": self.table.to_dict(), **self._options(table=False)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave."""
+        state = dict(state)
+        self.camera, self.table = Camera(**state.pop("camera")), BlurTable.from_dict(state.pop("table"))
+        for name, value in state.items():
+            setattr(self, name, value)
+
+    def extra_repr(self) -> str:
+        """Camera, table and options, as ``repr`` shows them."""
+        options = ", ".join(f"{k}={v!r}" for k, v in self._options(table=False).items())
+        return f"{self.camera!r},\n{self.table!r},\n{options}"
+
+    def _options(self, table: bool = True) -> dict[str, Any]:
+        names = ("table", "tolerance", "occlusion", "normalize", "method", "max_coc_px", "check")
+        return {name: getattr(self, name) for name in names[0 if table else 1 :]}
+
+
+def depth_of_field(
+    image: Tensor,
+    depth: Tensor,
+    camera: Camera,
+    *,
+    table: BlurTable | None = None,
+    focus_m: float | Tensor | None = None,
+    f_number: float | Tensor | None = None,
+    plan: Plan | None = None,
+    **options: Any,
+) -> Tensor:
+    """Functional form of :class:`DepthOfField`; the options are those of its constructor.
+
+    Args:
+        image: ``[B, C, H, W]``, linear light.
+        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres.
+        camera: The camera.
+        table: Blur measured from a lens; None takes the ideal disc.
+        focus_m: Overrides the camera's focus distance, float or ``[B]``.
+        f_number: Overrides the camera's f-number, float or ``[B]``.
+        plan: Layers to render with; None plans for this image.
+        **options: Of :class:`DepthOfField`.
+
+    Returns:
+        ``[B, C, H, W]`` in the image's dtype.
+
+    Raises:
+        ValueError: If an argument is not as described.
+
+    Example:
+        >>> image, depth = torch.rand(1, 3, 8, 12), torch.full((1, 1, 8, 12), 3.0)
+        >>> depth_of_field(image, depth, Camera(focus_m=1.0)).shape
+        torch.Size([1, 3, 8, 12])
+    """
+    return DepthOfField(camera, table, **options)(image, depth, focus_m, f_number, plan)
+
+
+def blur_by_coc(
+    image: Tensor,
+    coc_px: Tensor,
+    *,
+    table: BlurTable | None = None,
+    tolerance: float = 1 / 255,
+    occlusion: bool = True,
+    normalize: bool = True,
+    method: Method = "layered",
+    max_coc_px: float = 64.0,
+    check: bool = True,
+    plan: Plan | None = None,
+) -> Tensor:
+    """Depth of field for pipelines that hold a map of the circle of confusion already.
+
+    Args:
+        image: ``[B, C, H, W]``, linear light.
+        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane.
+        table: Blur measured from a lens; None takes the ideal disc.
+        tolerance: As in :class:`DepthOfField`.
+        occlusion: As in :class:`DepthOfField`.
+        normalize: As in :class:`DepthOfField`.
+        method: As in :class:`DepthOfField`.
+        max_coc_px: As in :class:`DepthOfField`.
+        check: As in :class:`DepthOfField`; a bad coc is NaN.
+        plan: Layers to render with; None plans for this image.
+
+    Returns:
+        ``[B, C, H, W]`` in the image's dtype.
+
+    Raises:
+        ValueError: If an argument is not as described.
+
+    Example:
+        >>> image = torch.rand(1, 3, 8, 12)
+        >>> blur_by_coc(image, torch.linspace(-2, 2, 12).expand(1, 1, 8, 12)).shape
+        torch.Size([1, 3, 8, 12])
+    """
+    table = BlurTable.disc() if table is None else table
+    checks.options(table, tolerance, occlusion, normalize, method, max_coc_px)
+    checks.image_and_coc(image, coc_px, table, values=check)
+    wide = image.dtype if image.dtype in (torch.float32, torch.float64) else torch.float32
+    wide = torch.promote_types(wide, coc_px.dtype) if coc_px.dtype == torch.float64 else wide
+    light, coc = image.to(wide), coc_px.to(wide).expand(image.shape[0], -1, -1, -1)
+    traced = torch.compiler.is_compiling() or torch.compiler.is_exporting()
+    still = traced or plan is not None or (torch.is_grad_enabled() and coc_px.requires_grad)
+    if still:
+        if plan is None:
+            plan = Plan.all(max_coc_px, tolerance) if traced else Plan.still(coc, tolerance)
+        out = _render(light, coc, plan, table, occlusion, normalize, method, check)
+    else:
+        # each item has its own layers, as it would have alone
+        items = [
+            _render(light[i : i + 1], coc[i : i + 1], Plan.of_scene(coc[i : i + 1], tolerance), table, occlusion,
+                    normalize, method, check)
+            for i in range(image.shape[0])
+        ]  # fmt: skip
+        out = items[0] if len(items) == 1 else torch.cat(items)
+    return out.to(image.dtype)
+
+
+def _render(
+    light: Tensor,
+    coc: Tensor,
+    plan: Plan,
+    table: BlurTable,
+    occlusion: bool,
+    normalize: bool,
+    method: Method,
+    check: bool,
+) -> Tensor:
+    if plan.nodes == (0.0,):
+        return light.clone()
+    valid = None
+    if not check:
+        valid = torch.isfinite(coc)
+        coc = torch.where(valid, coc, 0.0)
+    x = layers.blur_axis(coc).clamp(plan.nodes[0], plan.nodes[-1])
+    bank = plan.kernels(table, light.shape[-2:], light.dtype, light.device)
+    sample = (light, x, None if valid is None else valid.to(light.dtype))
+    scatter = spread.conv if method == "layered" else spread.fold
+    if occlusion:
+        out = composite.over([sample], plan.nodes, bank, scatter)
+    else:
+        out = composite.accumulate([sample], plan.nodes, bank, scatter, normalize)
+    return out if valid is None else torch.where(valid, out, light)
