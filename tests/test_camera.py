@@ -1,0 +1,271 @@
+import math
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchdof import Camera
+
+Number = float | Tensor
+DISTANCE_M = st.floats(0.2, 1e4)
+
+
+def depth_of(*metres: float, dtype: torch.dtype = torch.float64) -> Tensor:
+    return torch.tensor(metres, dtype=dtype).reshape(1, 1, 1, -1)
+
+
+def coc_in_millimetres(focal_mm: float, f_number: float, focus_m: float, z_m: float) -> float:
+    """Textbook: where the image of z falls behind the lens, and the cone's radius on the sensor."""
+    focal = focal_mm / 1000.0
+    sensor = focal if math.isinf(focus_m) else focus_m * focal / (focus_m - focal)
+    image = focal if math.isinf(z_m) else z_m * focal / (z_m - focal)
+    return 1000.0 * (focal / f_number / 2) * (sensor - image) / image
+
+
+@pytest.mark.parametrize("focus_m", [0.3, 2.0, 50.0, math.inf])
+@pytest.mark.parametrize("z_m", [0.1, 0.5, 1.99, 2.5, 1e3, math.inf])
+def test_coc_is_the_cone_of_light_on_the_sensor(focus_m: float, z_m: float) -> None:
+    camera = Camera(focal_length_mm=50.0, f_number=1.8, focus_m=focus_m, sensor_width_mm=36.0)
+    coc = camera.coc_px(depth_of(z_m), width=1920)
+    expected = coc_in_millimetres(50.0, 1.8, focus_m, z_m) * 1920 / 36.0
+    assert_close(float(coc), expected, rtol=1e-11, atol=1e-11)
+
+
+@given(DISTANCE_M, DISTANCE_M, st.floats(0.5, 64.0))
+def test_coc_is_negative_in_front_and_positive_behind_and_zero_on_the_focus_plane(
+    focus_m: float, z_m: float, f_number: float
+) -> None:
+    coc = float(Camera(focus_m=focus_m, f_number=f_number).coc_px(depth_of(z_m), 1000))
+    assert (coc > 0) == (z_m > focus_m)
+    assert (coc < 0) == (z_m < focus_m)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_coc_next_to_the_focus_plane_does_not_cancel(dtype: torch.dtype) -> None:
+    focus = torch.tensor([1.7], dtype=dtype)
+    beyond = torch.nextafter(focus, focus.new_tensor([9.0]))
+    nearer = torch.nextafter(focus, focus.new_tensor([0.0]))
+    camera = Camera(focus_m=focus)
+    near, on, far = camera.coc_px(torch.cat([nearer, focus, beyond]).reshape(1, 1, 1, 3), 1920).flatten()
+    step = float(beyond.double() - focus.double())
+    slope = camera.aperture_radius_m * float(camera.focal_px(1920)) / 1.7**2
+    assert float(on) == 0.0
+    assert_close(float(far), slope * step, rtol=1e-5, atol=0.0)
+    assert_close(float(near), -slope * step, rtol=1e-5, atol=0.0)
+
+
+def test_coc_at_infinity_is_exactly_that_of_inverse_depth_zero() -> None:
+    camera = Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0)
+    expected = camera.aperture_radius_m * camera.focal_px(1000) / 2.0
+    assert float(camera.coc_px(depth_of(math.inf), 1000)) == expected
+    assert float(camera.coc_px(depth_of(1e12), 1000)) == pytest.approx(expected, rel=1e-11)
+
+
+def test_focused_at_infinity_everything_is_in_front_and_infinity_is_sharp() -> None:
+    coc = Camera(focus_m=math.inf).coc_px(depth_of(1.0, 1e6, math.inf), 1000).flatten()
+    assert float(coc[2]) == 0.0
+    assert coc[0] < coc[1] < 0.0
+
+
+def test_coc_is_proportional_to_width_and_inversely_to_f_number() -> None:
+    depth = depth_of(0.7, 1.9, 30.0)
+    base = Camera(f_number=4.0).coc_px(depth, 1000)
+    assert_close(Camera(f_number=4.0).coc_px(depth, 2000), 2 * base)
+    assert_close(Camera(f_number=2.0).coc_px(depth, 1000), 2 * base)
+
+
+def test_rendering_convention_keeps_the_field_of_view_at_any_focus() -> None:
+    for focus_m in (0.1, 2.0, math.inf):
+        camera = Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=focus_m)
+        assert camera.focal_px(768) == pytest.approx(384.0 / math.tan(math.radians(20.0)), rel=1e-14)
+        assert camera.aperture_radius_m == pytest.approx(0.012, rel=1e-14)
+
+
+def test_rendering_convention_gives_the_coc_of_inverse_depths() -> None:
+    camera = Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0)
+    expected = 0.012 * 384.0 / math.tan(math.radians(20.0)) * (1 / 2.0 - 1 / 3.0)
+    assert float(camera.coc_px(depth_of(3.0), 768)) == pytest.approx(expected, rel=1e-13)
+
+
+def test_field_of_view_as_a_tensor_equals_the_float() -> None:
+    fov = torch.tensor([40.0, 75.0], dtype=torch.float64)
+    both = Camera.from_fov(fov, 0.012, 2.0).focal_px(768)
+    each = [Camera.from_fov(float(f), 0.012, 2.0).focal_px(768) for f in fov]
+    assert_close(both, torch.tensor(each, dtype=torch.float64))
+
+
+def test_a_lens_focused_nearer_sees_a_narrower_field() -> None:
+    assert Camera(focus_m=0.3).focal_px(1000) > Camera(focus_m=3.0).focal_px(1000)
+    far = Camera(focal_length_mm=50.0, sensor_width_mm=36.0, focus_m=math.inf)
+    assert far.focal_px(1000) == pytest.approx(50.0 / 36.0 * 1000)
+
+
+def test_hyperfocal_distance_is_the_textbook_one() -> None:
+    camera = Camera(focal_length_mm=50.0, f_number=8.0, sensor_width_mm=36.0)
+    diameter_mm = 0.030
+    radius_px = diameter_mm / 2 / 36.0 * 1920
+    textbook_m = (50.0**2 / (8.0 * diameter_mm) + 50.0) / 1000.0
+    assert camera.hyperfocal_m(radius_px, 1920) == pytest.approx(textbook_m, rel=1e-12)
+
+
+def test_focused_at_the_hyperfocal_distance_infinity_is_just_acceptable() -> None:
+    camera = Camera(focal_length_mm=35.0, f_number=5.6)
+    focused = camera.replace(focus_m=camera.hyperfocal_m(0.8, 1920))
+    assert float(focused.coc_px(depth_of(math.inf), 1920)) == pytest.approx(0.8, rel=1e-12)
+    near, far = focused.sharp_limits_m(0.8, 1920)
+    assert near == pytest.approx(focused.focus_m / 2, rel=1e-9)
+    assert far > 1e9
+
+
+@pytest.mark.parametrize("camera", [Camera(focus_m=3.0), Camera.from_fov(40.0, 0.01, 3.0)], ids=["lens", "fov"])
+def test_the_limits_of_sharpness_have_the_acceptable_coc(camera: Camera) -> None:
+    near, far = (float(limit) for limit in camera.sharp_limits_m(2.0, 1920))
+    assert near < 3.0 < far
+    assert_close(camera.coc_px(depth_of(near, far), 1920).flatten(), torch.tensor([-2.0, 2.0], dtype=torch.float64))
+
+
+def test_beyond_the_hyperfocal_distance_the_far_limit_is_infinite() -> None:
+    camera = Camera(focal_length_mm=35.0, f_number=5.6)
+    beyond = camera.replace(focus_m=2 * camera.hyperfocal_m(0.8, 1920))
+    assert beyond.sharp_limits_m(0.8, 1920)[1] == math.inf
+    assert camera.replace(focus_m=math.inf).sharp_limits_m(0.8, 1920)[1] == math.inf
+
+
+def test_limits_of_a_batch_equal_those_of_its_items() -> None:
+    focus = torch.tensor([1.0, 30.0, 500.0], dtype=torch.float64)
+    near, far = Camera(focus_m=focus).sharp_limits_m(1.0, 1920)
+    each = [Camera(focus_m=float(s)).sharp_limits_m(1.0, 1920) for s in focus]
+    assert_close(near, torch.tensor([n for n, _ in each], dtype=torch.float64))
+    assert_close(far, torch.tensor([f for _, f in each], dtype=torch.float64))
+
+
+def test_a_batch_of_cameras_equals_each_camera_alone() -> None:
+    depth = 0.5 + 5 * torch.rand(3, 1, 4, 5, dtype=torch.float64)
+    numbers: dict[str, Any] = {
+        "focal_length_mm": torch.tensor([24.0, 50.0, 85.0], dtype=torch.float64),
+        "f_number": torch.tensor([1.4, 2.8, 8.0], dtype=torch.float64),
+        "focus_m": torch.tensor([0.6, 2.0, math.inf], dtype=torch.float64),
+        "sensor_width_mm": torch.tensor([36.0, 23.5, 17.3], dtype=torch.float64),
+    }
+    together = Camera(**numbers).coc_px(depth, 640)
+    for i in range(3):
+        one: dict[str, Any] = {name: float(value[i]) for name, value in numbers.items()}
+        alone = Camera(**one)
+        assert_close(together[i : i + 1], alone.coc_px(depth[i : i + 1], 640))
+    assert Camera(**numbers).coc_px(depth[:1], 640).shape == (3, 1, 4, 5)
+
+
+@pytest.mark.parametrize("focus_m", [2.0, math.inf])
+def test_coc_is_differentiable_in_depth_and_in_every_number_of_the_camera(focus_m: float) -> None:
+    depth = depth_of(0.7, 1.9, 2.0, 5.0).requires_grad_()
+    numbers = [torch.tensor([v], dtype=torch.float64, requires_grad=True) for v in (50.0, 2.8, 36.0)]
+    if math.isfinite(focus_m):
+        numbers.append(torch.tensor([focus_m], dtype=torch.float64, requires_grad=True))
+
+    def coc(depth: Tensor, focal: Tensor, f_number: Tensor, sensor: Tensor, focus: Number = focus_m) -> Tensor:
+        return Camera(focal, f_number, focus, sensor).coc_px(depth, 100)
+
+    assert torch.autograd.gradcheck(coc, (depth, *numbers))
+
+
+def test_gradients_at_infinite_depth_and_focus_are_zero_and_not_nan() -> None:
+    depth = depth_of(1.0, math.inf).requires_grad_()
+    (slope,) = torch.autograd.grad(Camera(focus_m=math.inf).coc_px(depth, 100).sum(), depth)
+    assert torch.isfinite(slope).all()
+    assert float(slope[..., 1]) == 0.0
+
+
+def test_half_precision_depth_is_computed_in_single() -> None:
+    depth = depth_of(1.0, 3.0, dtype=torch.float16)
+    coc = Camera().coc_px(depth, 1920)
+    assert coc.dtype == torch.float32
+    assert_close(coc, Camera().coc_px(depth.float(), 1920), rtol=0.0, atol=0.0)
+
+
+def test_focus_at_takes_the_median_of_a_patch_and_ignores_bad_depth() -> None:
+    depth = torch.full((1, 1, 9, 9), 7.0)
+    depth[0, 0, 3:6, 3:6] = 3.0
+    depth[0, 0, 4, 4] = math.nan
+    depth[0, 0, 3, 3] = 0.0
+    depth[0, 0, 5, 5] = -1.0
+    assert Camera().focus_at(depth, x=4.5, y=4.2, patch=3).focus_m == 3.0
+    assert Camera().focus_at(depth, x=0.0, y=8.9, patch=3).focus_m == 7.0
+
+
+def test_focus_at_counts_columns_by_x_and_rows_by_y() -> None:
+    depth = torch.ones(1, 1, 4, 8)
+    depth[0, 0, 1, 6] = 5.0
+    assert Camera().focus_at(depth, x=6.5, y=1.5, patch=1).focus_m == 5.0
+
+
+def test_focus_at_gives_each_item_its_own_focus() -> None:
+    depth = torch.tensor([1.0, math.inf]).reshape(2, 1, 1, 1).expand(2, 1, 3, 3)
+    assert torch.as_tensor(Camera().focus_at(depth, 1, 1).focus_m).tolist() == [1.0, math.inf]
+
+
+@pytest.mark.parametrize(("x", "y"), [(8.0, 0.0), (0.0, 4.0), (-0.1, 0.0), (0.0, -1.0), (math.nan, 0.0)])
+def test_focus_at_refuses_a_point_outside_the_frame(x: float, y: float) -> None:
+    with pytest.raises(ValueError, match="must lie in the frame of 8 x 4 pixels"):
+        Camera().focus_at(torch.ones(1, 1, 4, 8), x, y)
+
+
+def test_focus_at_refuses_a_patch_without_depth() -> None:
+    with pytest.raises(ValueError, match="no valid depth"):
+        Camera().focus_at(torch.zeros(1, 1, 4, 8), 2, 2)
+
+
+@pytest.mark.parametrize("name", ["focal_length_mm", "f_number", "focus_m", "sensor_width_mm"])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, torch.tensor([2.0, 0.0]), "2.8", True, torch.ones(1, 1)])
+def test_a_bad_number_is_refused_by_name(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        Camera().replace(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["focal_length_mm", "f_number", "sensor_width_mm"])
+def test_only_the_focus_may_be_infinite(name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} must be positive and finite"):
+        Camera().replace(**{name: math.inf})
+
+
+def test_focus_within_the_focal_length_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"focus_m must be longer than the focal length \(50 mm\), got 0.05 m"):
+        Camera(focal_length_mm=50.0, focus_m=0.05)
+    with pytest.raises(ValueError, match="focus_m must be longer"):
+        Camera(focal_length_mm=50.0).replace(focus_m=torch.tensor([1.0, 0.04]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [((180.0, 0.01, 1.0), "fov_x_deg"), ((0.0, 0.01, 1.0), "fov_x_deg"), ((40.0, 0.0, 1.0), "aperture_radius_m")],
+)
+def test_a_bad_field_of_view_or_aperture_is_refused_by_name(arguments: tuple[float, float, float], name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} must be"):
+        Camera.from_fov(*arguments)
+
+
+@pytest.mark.parametrize("depth", [torch.ones(1, 1, 2, 2, dtype=torch.int32), 2.0, None])
+def test_depth_that_is_not_floating_point_is_refused(depth: Any) -> None:
+    with pytest.raises(ValueError, match="depth must be a floating-point tensor in metres"):
+        Camera().coc_px(depth, 100)
+
+
+def test_depth_whose_batch_does_not_fit_the_camera_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"depth must be \[2, 1, H, W\].* got \[3, 1, 4, 4\]"):
+        Camera(focus_m=torch.tensor([1.0, 2.0])).coc_px(torch.ones(3, 1, 4, 4), 100)
+
+
+def test_repr_tells_the_camera() -> None:
+    assert repr(Camera(35.0, 1.4, 0.8, 23.5)) == "Camera(35 mm, f/1.4, focus 0.8 m, sensor 23.5 mm)"
+    assert "fixed field of view" in repr(Camera.from_fov(40.0, 0.01, 2.0))
+    assert "focus [1, 2] m" in repr(Camera(focus_m=torch.tensor([1.0, 2.0])))
+
+
+def test_a_camera_cannot_be_changed_in_place_and_replace_refuses_unknown_names() -> None:
+    with pytest.raises(AttributeError):
+        setattr(Camera(), "focus_m", 3.0)  # noqa: B010
+    with pytest.raises(TypeError, match="focus"):
+        Camera().replace(focus=3.0)

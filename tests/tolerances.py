@@ -1,0 +1,11 @@
+"""How closely results are compared: one table, by the type of the values. Absolute ones are for values around 1."""
+
+import torch
+
+TOLERANCES: dict[torch.dtype, dict[str, float]] = {
+    torch.float64: {"rtol": 1e-10, "atol": 1e-12},
+    torch.float32: {"rtol": 1e-5, "atol": 1e-6},
+    torch.bfloat16: {"rtol": 2**-8, "atol": 1e-6},
+    torch.float16: {"rtol": 2**-11, "atol": 1e-6},
+}
+"""The two narrow types hold results of float32 arithmetic: half a unit in the last place, rounded once."""
