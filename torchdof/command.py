@@ -1,52 +1,56 @@
-"""The command line: ``torchdof render``, and the commands that other rooms bring (``fit``, ``export``, ``bench``)."""
+"""The command line. Each command lives in a module of its own, which is imported when the command is asked for."""
 
-import contextlib
 import errno
 import importlib
 import importlib.util
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.progress import TimeRemainingColumn as Remaining
 from typer.core import TyperGroup
-
-from .render import RenderSettings, load_table, pick_device, render_frame
-from .sequence import FramePattern, parse_focus, parse_frames
 
 __all__ = ["app", "main"]
 
-# Commands that live elsewhere: each module defines a function of the command's name. They are imported when asked for.
-_ELSEWHERE = {"fit": "torchdof.fit.command", "export": "torchdof.export.command", "bench": "torchdof.bench"}
-_EXTRA = {"scipy": "fit", "onnx": "export", "onnxscript": "export", "onnxruntime": "export", "matplotlib": "plot"}
+# Each module defines a function of the command's name, with the options as Typer reads them off its signature.
+_MODULES = {
+    "render": "torchdof.render_command",
+    "fit": "torchdof.fit.command",
+    "export": "torchdof.export.command",
+    "bench": "torchdof.bench",
+}
+_EXTRAS = {"scipy": "fit", "onnx": "export", "onnxscript": "export", "onnxruntime": "export", "matplotlib": "plot"}
 
 
 class _Commands(TyperGroup):
-    """A group whose commands come from several modules, and whose errors are one sentence and exit code 2."""
+    """The commands that are installed; whatever is wrong with the input ends in one sentence and exit code 2."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*super().list_commands(ctx), *(name for name in _ELSEWHERE if _present(name))]
+        return [name for name in _MODULES if _installed(name)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        if cmd_name not in _ELSEWHERE or not _present(cmd_name):
-            return super().get_command(ctx, cmd_name)
-        single = typer.Typer(add_completion=False)
+        if cmd_name not in _MODULES or not _installed(cmd_name):
+            return None
+        single = typer.Typer(add_completion=False, rich_markup_mode="markdown")
         try:
-            single.command(cmd_name)(getattr(importlib.import_module(_ELSEWHERE[cmd_name]), cmd_name))
+            function = getattr(importlib.import_module(_MODULES[cmd_name]), cmd_name)
         except ModuleNotFoundError as error:
-            single.command(cmd_name, help=f"Not available: {_missing(error)}.")(_refuse(error))
+            message = _advice(error)
+
+            def function() -> None:
+                raise ValueError(message)
+
+            single.command(cmd_name, help=message)(function)
+        else:
+            single.command(cmd_name, no_args_is_help=cmd_name == "render")(function)
         return typer.main.get_command(single)
 
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
         except ModuleNotFoundError as error:
-            message = _missing(error)
+            message = _advice(error)
         except torch.OutOfMemoryError:
             message = "the device has too little memory for this image; try --device cpu"
         except OSError as error:
@@ -59,282 +63,28 @@ class _Commands(TyperGroup):
         raise typer.Exit(2)
 
 
-app = typer.Typer(
-    cls=_Commands,
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    help="Depth of field from an image and its depth: the photograph that a real lens would have taken.",
-)
+app = typer.Typer(cls=_Commands, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
 @app.callback()
-def _root() -> None:
-    pass
+def _torchdof() -> None:
+    """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
 
 
-_LENS, _DEPTH, _BLUR, _FILES = "Focus and lens", "Depth map", "Blur", "Files and frames"
+def _installed(name: str) -> bool:
+    package, _, module = _MODULES[name].rpartition(".")
+    spec = importlib.util.find_spec(package)  # finds the package without running it
+    folders = spec.submodule_search_locations if spec is not None else None
+    return any((Path(folder) / f"{module}.py").is_file() for folder in folders or [])
 
 
-@app.command(no_args_is_help=True)
-def render(
-    image: Annotated[
-        Path, typer.Argument(help="All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr.")
-    ],
-    depth: Annotated[
-        Path | None, typer.Argument(help="Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel.")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, or out.####.exr.")] = ...,  # type: ignore[assignment]
-    focus_m: Annotated[
-        str | None,
-        typer.Option(
-            help="Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5, between which "
-            "1/distance is linear, so that the blur changes evenly.",
-            rich_help_panel=_LENS,
-        ),
-    ] = None,
-    focus_at: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y",
-            help="Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame.",
-            rich_help_panel=_LENS,
-        ),
-    ] = None,
-    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_LENS)] = None,
-    focal_length_mm: Annotated[
-        float | None, typer.Option(help="Real focal length, not the 35 mm equivalent.", rich_help_panel=_LENS)
-    ] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_LENS)] = None,
-    fov_deg: Annotated[
-        float | None,
-        typer.Option(help="Horizontal field of view of a rendered image, instead of a lens.", rich_help_panel=_LENS),
-    ] = None,
-    aperture_radius_m: Annotated[
-        float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=_LENS)
-    ] = None,
-    depth_kind: Annotated[
-        Literal["z", "distance", "disparity", "inverse", "coc"],
-        typer.Option(
-            help="What the numbers are: z along the optical axis or distance along the ray, both as scale * (value + offset) "
-            "in metres; disparity or inverse depth, as scale / (value + offset); or coc, signed blur radius in pixels.",
-            rich_help_panel=_DEPTH,
-        ),
-    ] = "z",
-    depth_scale: Annotated[
-        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_DEPTH)
-    ] = None,
-    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_DEPTH)] = 0.0,
-    depth_unknown: Annotated[
-        float | None,
-        typer.Option(help="A value that means 'not measured', such as 0, -1 or inf.", rich_help_panel=_DEPTH),
-    ] = None,
-    fill_depth: Annotated[
-        str | None,
-        typer.Option(
-            metavar="nearest|far|METRES",
-            help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see lies "
-            "behind), or with a distance (inf for a sky). Without this they are refused.",
-            rich_help_panel=_DEPTH,
-        ),
-    ] = None,
-    depth_channel: Annotated[
-        str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=_DEPTH)
-    ] = None,
-    table: Annotated[
-        str,
-        typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=_BLUR),
-    ] = "disc",
-    tolerance: Annotated[
-        float, typer.Option(help="Largest error of a pixel, for an image in [0, 1].", rich_help_panel=_BLUR)
-    ] = 1 / 255,
-    no_occlusion: Annotated[
-        bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=_BLUR)
-    ] = False,
-    method: Annotated[
-        Literal["layered", "fold"],
-        typer.Option(help="fold is the literal scatter: exact, slow.", rich_help_panel=_BLUR),
-    ] = "layered",
-    show_focus: Annotated[
-        bool,
-        typer.Option(
-            "--show-focus", help="Don't blur: tint near orange, in focus green, far blue.", rich_help_panel=_BLUR
-        ),
-    ] = False,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=_BLUR)] = "auto",
-    transfer: Annotated[
-        Literal["linear", "srgb"] | None,
-        typer.Option(help="How IMAGE is encoded. Default: integers srgb, floats linear.", rich_help_panel=_FILES),
-    ] = None,
-    out_transfer: Annotated[
-        Literal["linear", "srgb"] | None,
-        typer.Option(
-            help="How OUT is encoded. Default: as IMAGE, or by type if one is integers and the other floats.",
-            rich_help_panel=_FILES,
-        ),
-    ] = None,
-    bits: Annotated[
-        Literal["8", "16", "half", "float"] | None,
-        typer.Option(help="What OUT stores. Default: as IMAGE, where the type can.", rich_help_panel=_FILES),
-    ] = None,
-    layer: Annotated[
-        str | None, typer.Option(help="Layer or part of an EXR that is the image.", rich_help_panel=_FILES)
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="FIRST-LAST", help="Part of a sequence.", rich_help_panel=_FILES)
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Render only the frames that OUT lacks.", rich_help_panel=_FILES)
-    ] = False,
-) -> None:
-    """Blur IMAGE by its DEPTH as a lens would.
-
-    A photograph and its depth in millimetres, focused on what is at column 320, row 200:
-
-        torchdof render photo.jpg depth.png -o out.jpg --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
-
-    A rendered image with a Z channel:
-
-        torchdof render shot.exr -o out.exr --fov-deg 40 --aperture-radius-m 0.012 --focus-m 2
-
-    A sequence with the focus pulled from 2 m to 5.5 m; --resume goes on after an interruption:
-
-        torchdof render shot.####.exr -o out.####.exr --focus-m 1:2.0,48:5.5 --f-number 2 --resume
-
-    A stereo disparity map (scale = baseline in metres * focal length in pixels) with holes:
-
-        torchdof render left.png disp.npz -o out.png --depth-kind disparity --depth-scale 192 --depth-offset 31.1
-        --fill-depth far --focus-m 2.4
-
-    The lens is what you state, else what the file's EXIF data states, else 50 mm at f/2.8 on 36 mm; the line that is printed
-    says which. Pixels of metadata and alpha are kept. Files are written whole or not at all.
-    """
-    settings = RenderSettings(
-        focus=None if focus_m is None else parse_focus(focus_m),
-        focus_at=None if focus_at is None else _point(focus_at),
-        f_number=f_number,
-        focal_length_mm=focal_length_mm,
-        sensor_width_mm=sensor_width_mm,
-        fov_x_deg=fov_deg,
-        aperture_radius_m=aperture_radius_m,
-        depth_kind=depth_kind,
-        depth_scale=depth_scale,
-        depth_offset=depth_offset,
-        depth_unknown=depth_unknown,
-        depth_channel=depth_channel,
-        fill=None if fill_depth is None else _fill(fill_depth),
-        table=load_table(table),
-        tolerance=tolerance,
-        occlusion=not no_occlusion,
-        method=method,
-        device=pick_device(device),
-        transfer=transfer,
-        out_transfer=out_transfer,
-        sample=bits,
-        layer=layer,
-        show_focus=show_focus,
-    )
-    if FramePattern.matches(image):
-        _render_sequence(image, depth, out, settings, frames, resume)
-        return
-    if FramePattern.matches(out) or (depth is not None and FramePattern.matches(depth)) or frames is not None:
-        raise ValueError(f"{image}: is a single image; for a sequence write it as shot.####.exr")
-    if len(settings.focus or []) > 1:
-        raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
-    if resume and out.exists():
-        typer.echo(f"{out}: is there already")
-        return
-    with _progress() as progress:
-        progress.add_task(f"rendering {out.name}", total=None)
-        line = render_frame(image, depth, out, settings)
-    typer.echo(line)
-
-
-def _render_sequence(
-    image: Path, depth: Path | None, out: Path, settings: RenderSettings, frames: str | None, resume: bool
-) -> None:
-    source, target = FramePattern(image), FramePattern(out)
-    depths = FramePattern(depth) if depth is not None and FramePattern.matches(depth) else None
-    numbers = source.frames()
-    if frames is not None:
-        first, last = parse_frames(frames)
-        there = set(numbers)
-        numbers = list(range(first, last + 1))
-        absent = [source.name(n) for n in numbers if n not in there]
-        if absent:
-            raise FileNotFoundError(
-                f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} frames missing)"
-            )
-    if not numbers:
-        raise FileNotFoundError(f"{image}: there are no such files")
-    if depths is not None:
-        absent = [path for n in numbers if not (path := depths.name(n)).is_file()]
-        if absent:
-            raise FileNotFoundError(
-                f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} depths missing)"
-            )
-    todo = [n for n in numbers if not (resume and target.name(n).is_file())]
-    if len(todo) < len(numbers):
-        typer.echo(f"{len(numbers) - len(todo)} of {len(numbers)} frames are there already")
-    with _progress() as progress:
-        task = progress.add_task("rendering", total=len(todo))
-        for n in todo:
-            line = render_frame(source.name(n), depths.name(n) if depths else depth, target.name(n), settings, n)
-            typer.echo(line)
-            progress.advance(task)
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Progress]:
-    """A bar on standard error, where that is a terminal."""
-    columns = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
-    columns += [TimeElapsedColumn(), Remaining()]
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
-        yield progress
-
-
-def _point(text: str) -> tuple[float, float]:
-    try:
-        x, y = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"--focus-at expects a pixel X,Y such as 320,200, got {text!r}") from None
-    return x, y
-
-
-def _fill(text: str) -> Literal["nearest", "far"] | float:
-    if text == "nearest" or text == "far":
-        return "nearest" if text == "nearest" else "far"
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"--fill-depth expects nearest, far or metres, got {text!r}") from None
-
-
-def _present(name: str) -> bool:
-    package, _, module = _ELSEWHERE[name].rpartition(".")
-    if package == "torchdof":
-        return importlib.util.find_spec(_ELSEWHERE[name]) is not None
-    spec = importlib.util.find_spec(package)  # looks, without running the package
-    return spec is not None and any(
-        (Path(folder) / f"{module}.py").is_file() for folder in spec.submodule_search_locations or []
-    )
-
-
-def _missing(error: ModuleNotFoundError) -> str:
+def _advice(error: ModuleNotFoundError) -> str:
     package = (error.name or "").partition(".")[0]
-    extra = _EXTRA.get(package)
-    if extra is None:
+    if package not in _EXTRAS:
         raise error
-    return f"this command needs {package}; install it with: pip install 'torchdof[{extra}]'"
-
-
-def _refuse(error: ModuleNotFoundError) -> Any:
-    def command() -> None:
-        raise error
-
-    return command
+    return f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
 
 
 def main() -> None:
-    """Entry point of ``torchdof`` and ``python -m torchdof``."""
+    """Entry point of ``torchdof`` and of ``python -m torchdof``."""
     app(prog_name="torchdof")

@@ -85,7 +85,8 @@ def fill_holes(depth: Tensor, fill: Literal["nearest", "far"] | float) -> Tensor
         depth: ``[1, 1, H, W]``.
         fill: "nearest" takes the nearest pixel that has depth (by jump flooding: now and then one that is a
             fraction of a pixel farther). "far" takes the farthest of the first pixels with depth to the left, right,
-            above and below: what stereo cannot see lies behind. A number is the depth in metres, for example inf for a sky.
+            above and below: what stereo cannot see lies behind. A number is the depth in metres, for example inf for
+            a sky.
 
     Returns:
         ``[1, 1, H, W]`` without NaN; where there was a depth it is unchanged.
@@ -107,12 +108,12 @@ def fill_holes(depth: Tensor, fill: Literal["nearest", "far"] | float) -> Tensor
         return depth
     if bool(depth.isnan().all()):
         raise ValueError("no pixel has a depth; check the kind, scale and offset of the depth map")
-    near = _nearest(depth[0, 0])[None, None]
     if fill == "nearest":
-        return near
+        return _nearest(depth[0, 0])[None, None]
     candidates = torch.stack([_first_along(depth, dim, back) for dim in (-1, -2) for back in (False, True)])
     farthest = torch.where(candidates.isnan(), -torch.inf, candidates).amax(dim=0)
-    return torch.where(depth.isnan(), torch.where(farthest > -torch.inf, farthest, near), depth)
+    filled = torch.where(depth.isnan() & (farthest > -torch.inf), farthest, depth)
+    return fill_holes(filled, "nearest")  # what has no depth in its row or column
 
 
 def resolve_holes(depth: Tensor, name: str, fill: Literal["nearest", "far"] | float | None) -> tuple[Tensor, int]:

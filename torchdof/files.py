@@ -179,6 +179,8 @@ def write_image(
         elif name != "ICCProfile" or transfer == picture.transfer:
             spec.attribute(name, kind, value)
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
+    if transfer == "linear" and suffix != ".exr":
+        spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
     if straight:
         spec.attribute("oiio:UnassociatedAlpha", 1)
     if suffix in (".jpg", ".jpeg"):

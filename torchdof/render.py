@@ -4,6 +4,7 @@ import dataclasses
 import math
 import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,8 +14,8 @@ from torch import Tensor
 from .camera import Camera
 from .depthmap import DepthKind, depth_from_values, resolve_holes
 from .files import Picture, read_image, read_values, write_image
-from .functional import blur_by_coc, depth_of_field
 from .metadata import camera_facts
+from .module import blur_by_coc, depth_of_field
 from .sequence import focus_at_frame
 from .stored import Sample
 from .table import BlurTable
@@ -45,7 +46,7 @@ class RenderSettings:
         depth_channel: Channel or array that holds depth.
         fill: How to fill holes in the depth; None refuses them.
         table: Blur table.
-        tolerance: Largest error of a pixel that saves time, for an image in [0, 1].
+        tolerance: Accepted RMS error, as in :class:`torchdof.DepthOfField`.
         occlusion: False for the paper's single pass without occlusion.
         method: "layered" or "fold".
         device: Where to compute.
@@ -75,7 +76,7 @@ class RenderSettings:
     table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
     tolerance: float = 1 / 255
     occlusion: bool = True
-    method: str = "layered"
+    method: Literal["layered", "fold"] = "layered"
     device: torch.device = torch.device("cpu")
     transfer: Transfer | None = None
     out_transfer: Transfer | None = None
@@ -100,10 +101,10 @@ class RenderSettings:
             raise ValueError("--fov-deg and --focal-length-mm with --sensor-width-mm say the same; give one of them")
         if not 0.0 < self.fov_x_deg < 180.0:
             raise ValueError(f"--fov-deg must be between 0 and 180 degrees, got {self.fov_x_deg:g}")
-        if self.depth_kind != "coc" and (self.f_number is None) == (self.aperture_radius_m is None):
-            raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
+        if self.f_number is not None and self.aperture_radius_m is not None:
+            raise ValueError("--f-number and --aperture-radius-m both say how wide the lens opens; give one of them")
 
-    def camera(self, metadata: dict[str, Any], width: int, frame: int) -> tuple[Camera, list[str]]:
+    def camera(self, metadata: Mapping[str, Any], width: int, frame: int) -> tuple[Camera, list[str]]:
         """The camera of one frame: what the user said, else the file's metadata, else 50 mm, f/2.8 and 36 mm.
 
         Returns:
@@ -121,18 +122,19 @@ class RenderSettings:
             remarks.append("focus from the file")
         if self.fov_x_deg is not None:
             radius_m = self.aperture_radius_m
-            if radius_m is None:
-                assert self.f_number is not None
+            if radius_m is None and self.f_number is not None:  # on the equivalent sensor, 36 mm wide
                 radius_m = 18.0 / math.tan(math.radians(self.fov_x_deg) / 2) / (2000.0 * self.f_number)
+            if radius_m is None:
+                raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
             return Camera.from_fov(self.fov_x_deg, radius_m, focus_m), remarks
-        lens = {}
+        lens: dict[str, float] = {}
         for name, assumed in _ASSUMED.items():
             said = getattr(self, name)
             lens[name] = facts.get(name, assumed) if said is None else said
             if said is None:
                 plain = name.rsplit("_", 1)[0].replace("_", " ") if name != "f_number" else "f-number"
                 remarks.append(f"{plain} {'from the file' if name in facts else 'assumed'}")
-        return Camera(focus_m=focus_m, **lens), remarks
+        return Camera(lens["focal_length_mm"], lens["f_number"], focus_m, lens["sensor_width_mm"]), remarks
 
 
 def render_frame(
@@ -165,11 +167,12 @@ def render_frame(
     height, width = picture.pixels.shape[-2:]
     values, holes = _depth(image, depth, picture, settings)
     values = values.to(settings.device)
-    parts, remarks = [], []
+    parts: list[str] = []
+    remarks: list[str] = []
     if settings.depth_kind == "coc":
         camera, coc_px = None, values
     else:
-        camera, remarks = settings.camera(dict(picture.metadata), width, frame)
+        camera, remarks = settings.camera(picture.metadata, width, frame)
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
@@ -181,7 +184,8 @@ def render_frame(
         parts.append("focus shown: near orange, sharp green, far blue")
         picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
     else:
-        how: dict[str, Any] = {"table": settings.table, "tolerance": settings.tolerance}
+        table = _with_alpha(settings.table) if picture.has_alpha else settings.table
+        how: dict[str, Any] = {"table": table, "tolerance": settings.tolerance}
         how |= {"occlusion": settings.occlusion, "method": settings.method}
         with torch.inference_mode():
             blurred = (
@@ -210,18 +214,17 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
         ``[B, 3, H, W]``, or ``[B, 4, H, W]`` with alpha.
 
     Example:
-        >>> tint_focus(torch.ones(1, 1, 1, 2), torch.tensor([[[[-3.0, 0.2]]]]))[0, :, 0].T.round(decimals=2)
-        tensor([[1.0500, 0.8200, 0.6800],
-                [0.8000, 1.1000, 0.9000]])
+        >>> tinted = tint_focus(torch.ones(1, 1, 1, 3), torch.tensor([[[[-3.0, 0.2, 5.0]]]]))
+        >>> tinted[0, :, 0].argmax(dim=0)  # red, green and blue are strongest
+        tensor([0, 1, 2])
     """
     colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
     grey = colour.mean(dim=1, keepdim=True)
     tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
     which = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
     tint = tints[which[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
-    return torch.cat(
-        [0.35 * colour + 0.65 * grey * tint / tint.mean(dim=1, keepdim=True), alpha.expand_as(alpha)], dim=1
-    )
+    tinted = 0.35 * colour + 0.65 * grey * tint / tint.mean(dim=1, keepdim=True)
+    return torch.cat([tinted, alpha], dim=1)
 
 
 def load_table(name: str) -> BlurTable:
@@ -272,7 +275,7 @@ def _depth(
         raise ValueError(f"{name}: depth is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
     fov_x_deg = settings.fov_x_deg
     if settings.depth_kind == "distance" and fov_x_deg is None:
-        facts = camera_facts(dict(picture.metadata), values.shape[-1])
+        facts = camera_facts(picture.metadata, values.shape[-1])
         focal_mm = settings.focal_length_mm or facts.get("focal_length_mm")
         sensor_mm = settings.sensor_width_mm or facts.get("sensor_width_mm")
         if focal_mm is None or sensor_mm is None:
@@ -287,6 +290,14 @@ def _depth(
         fov_x_deg=fov_x_deg,
     )
     return resolve_holes(result, name, settings.fill)
+
+
+def _with_alpha(table: BlurTable) -> BlurTable:
+    """A table that blurs colours differently blurs alpha like green."""
+    if table.channels == 1:
+        return table
+    params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
+    return BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
 
 
 def _describe(camera: Camera) -> str:

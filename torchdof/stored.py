@@ -141,7 +141,8 @@ def _read_pfm(path: Path) -> Part:
         raise OSError(f"{path}: is cut short ({len(data)} of {4 * count} bytes of pixels)")
     values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4").astype(np.float32)
     values = values.reshape(height, width, channels)[::-1]  # stored from the bottom row up
-    return Part("", tuple("Y" if channels == 1 else "RGB"), values, samples=("float", "float", "float")[:channels])
+    samples: list[Sample] = ["float"] * channels
+    return Part("", tuple("Y" if channels == 1 else "RGB"), values, tuple(samples))
 
 
 def read_array(path: Path, key: str | None) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""A module as ONNX, checked against the module it came from."""
