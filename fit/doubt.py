@@ -1,0 +1,168 @@
+"""What to doubt about a forward fit: its residual, its roundness, its window, its bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .dot import Dot, noise_inside
+from .edge import Edge, soft_edge
+from .forward import Forward, Solution
+from .problems import (
+    AsymmetryWarning,
+    BoundaryWarning,
+    FitError,
+    FlatProfileError,
+    FlatProfileWarning,
+    MagnificationWarning,
+    NotLinearWarning,
+    ResidualWarning,
+    WindowError,
+    WindowWarning,
+    warn,
+)
+from .profile import polar_samples
+from .result import Array, BlurFit
+
+__all__ = ["EXPLAINED", "asymmetry_of", "doubt_forward", "doubt_linearity", "signal_pixels"]
+
+EXPLAINED = 1.15
+"""Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
+
+_DARK_NOISE = 1.6  # dark noise over bright noise; light itself only makes noise grow with the level
+_ENCODED = 0.7
+_FAR_ABOVE = 1.6  # residual over noise
+_MATTERS = 0.005
+_UNEVEN = 0.3
+_MAGNIFIED = 0.08
+_OUTSIDE_REFUSED, _OUTSIDE_DOUBTED = 0.05, 0.005
+
+
+def signal_pixels(pair: Forward) -> Array:
+    """Pixels with light in them `[H, W]`: used, and within the blurred dot's reach."""
+    rows, columns = np.indices(pair.data.shape)
+    near = np.hypot(columns - pair.data_dot.x, rows - pair.data_dot.y) <= pair.data_dot.reach + 1
+    return np.asarray(near & pair.used)
+
+
+def asymmetry_of(pair: Forward, solution: Solution) -> float:
+    """Norm of what depends on the angle in the residual (its first four harmonics) over the norm of the light."""
+    residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
+    centre = (pair.data_dot.x + solution.moves["dx"], pair.data_dot.y + solution.moves["dy"])
+    r, _, uneven = polar_samples(residual, centre, max(pair.data_dot.reach, 2.0), step_deg=10.0)
+    light = polar_samples(pair.data - solution.background, centre, float(r[-1]), step_deg=10.0)[2]
+    waves = np.fft.rfft(uneven, axis=0)[1:5] / uneven.shape[0]
+    # r weighs a sample by the area it stands for
+    varying = float(np.sum(r * 2 * np.sum(np.abs(waves) ** 2, axis=0)))
+    whole = float(np.sum(r * np.mean(light**2, axis=0)))
+    return float(np.sqrt(varying / whole)) if whole > 0 else np.inf
+
+
+def doubt_forward(
+    pair: Forward, solution: Solution, fit: BlurFit, files: tuple[str | None, str | None], stacklevel: int = 4
+) -> None:
+    """Raise or warn about everything that makes a fit less than it looks.
+
+    Raises:
+        FitError: the fit has no gain (the pictures have nothing in common).
+        FlatProfileError: the kernel's size is not determined at all.
+        WindowError: more than 5 % of the blur's light falls outside the window.
+    """
+    file = files[1]
+    if not fit.gain > 0:
+        raise FitError("the blurred picture has nothing in common with the sharp one", file=file, number=fit.gain)
+    outside = _outside(pair, solution)
+    if outside > _OUTSIDE_REFUSED:
+        raise WindowError(
+            f"the window cuts the blur: {100 * outside:.0f} % of its light falls outside {_size(pair)}; "
+            "cut a larger one",
+            file=file,
+            number=outside,
+        )
+    if outside > _OUTSIDE_DOUBTED:
+        text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {_size(pair)}; cut a larger one"
+        warn(WindowWarning(text, file=file, number=outside), stacklevel)
+    if fit.residual > _MATTERS and fit.residual_over_noise > _FAR_ABOVE:
+        warn(
+            ResidualWarning(
+                f"the residual is {100 * fit.residual:.1f} %, {fit.residual_over_noise:.1f} times the noise; is the "
+                "image linear, not sRGB encoded, and is it a single white dot? "
+                + (f"family {fit.family!r} may be too simple" if fit.family != "radial" else ""),
+                file=file,
+                number=fit.residual_over_noise,
+            ),
+            stacklevel,
+        )
+    change = fit.magnification / pair.magnification
+    if abs(np.log(change)) > _MAGNIFIED:
+        text = (
+            f"the blurred dot is {change:.3f} times the size it should have; are the distances right, and is the image "
+            "linear, not sRGB encoded?"
+        )
+        warn(MagnificationWarning(text, file=file, number=change), stacklevel)
+    if fit.asymmetry > _UNEVEN:
+        text = (
+            f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle, which no family here "
+            "has; is the lens decentred, or the dot off the axis?"
+        )
+        warn(AsymmetryWarning(text, file=file, number=fit.asymmetry), stacklevel)
+    if solution.family != "radial":
+        _doubt_parameters(pair, solution, fit, file, stacklevel + 1)
+
+
+def doubt_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
+    """Warn where a sharp picture shows that it is not in linear light: by its noise, or by its dot's edge."""
+    bright = noise_inside(still, dot)
+    if bright is not None and dot.noise > _DARK_NOISE * bright and dot.noise > 1e-4 * dot.peak:
+        ratio = dot.noise / max(bright, 1e-9 * dot.peak)
+        text = (
+            f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
+            "encoded; is the image linear? Decode it first"
+        )
+        warn(NotLinearWarning(text, file=file, number=ratio), stacklevel)
+        return
+    if edge.misfit < EXPLAINED:
+        return
+    bent = soft_edge(still, dot, fit_exponent=True)
+    if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
+        text = (
+            f"the dot's edge is that of light to the power {bent.exponent:.2f}, as in a picture that is left sRGB "
+            "encoded (about 0.45); is the image linear? Decode it first"
+        )
+        warn(NotLinearWarning(text, file=file, number=bent.exponent), stacklevel)
+
+
+def _outside(pair: Forward, solution: Solution) -> float:
+    kernel = pair.kernels(solution.family, {k: np.asarray(v)[None] for k, v in solution.params.items()})
+    source = pair.moved_source(solution.moves)
+    inside = float(pair.convolve(source, kernel, whole=True)[0].sum())
+    total = float(source[0, 0].real)
+    # what the window-wide kernel itself left out
+    return 1 - inside / total if total > 0 else 1.0
+
+
+def _doubt_parameters(
+    pair: Forward, solution: Solution, fit: BlurFit, file: str | None, stacklevel: int
+) -> None:
+    low, high = pair.bounds(solution.names)
+    for name, least, most in zip(solution.names, low, high, strict=True):
+        value = solution.params.get(name, solution.moves.get(name, 0.0))
+        # r_c = 0 and sigma or b at its least are honest answers; a blur below a pixel has no shape
+        natural = name in ("r_c", "sigma", "radius", "b", "m") and float(value) <= least + 1e-6
+        if not natural and (float(value) >= most * (1 - 1e-6) or float(value) <= least + 1e-6 * abs(least)):
+            if name in ("sigma", "radius", "r_c"):
+                raise FlatProfileError(
+                    f"the blur is wider than the window: {name} ran to {float(value):.3g} px", file=file, number=float(value)
+                )
+            if name == "m":
+                continue  # the exponent of a tilt that is not there
+            text = f"{name} ended on its bound {float(value):.4g}; it is only a limit"
+            warn(BoundaryWarning(text, file=file, number=float(value)), stacklevel)
+    size = {"gaussian": "sigma", "ring": "sigma", "disc": "radius", "softm": "radius"}[solution.family]
+    value, error = float(fit.params[size]), float(fit.stderr[size])  # type: ignore[arg-type]
+    if not error < 0.5 * value:
+        text = f"{size} = {value:.3g} +- {error:.2g} px is not determined: too little blur, or too much noise"
+        warn(FlatProfileWarning(text, file=file, number=error / value if value else np.inf), stacklevel)
+
+
+def _size(pair: Forward) -> str:
+    return f"{pair.data.shape[1]}x{pair.data.shape[0]} px"

@@ -1,0 +1,93 @@
+"""What a fit returns: parameters with calibrated errors, and how well they explain the data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+__all__ = ["Array", "BlurFit"]
+
+
+@dataclass(frozen=True)
+class BlurFit:
+    """A fitted kernel, its errors and its residual.
+
+    Attributes:
+        family: "gaussian", "ring", "disc", "softm" or "radial".
+        params: the family's parameters (see `torchdof.kernel.FAMILIES`), lengths in the caller's unit (pixels for
+            `fit_pair`). Floats, and for `radial` the array "values" [P]. A profile fit (`fit_profile`, model "ratio")
+            has the strength "N" too.
+        stderr: one standard error for each parameter, calibrated against repeated simulated captures.
+        residual: norm of (data - model) over norm of (data above background): 0 is perfect, 1 explains nothing.
+        noise: the noise that was expected in the data, as a share of the same norm. NaN where it is not known.
+        covariance: covariance of the parameters in `names` [n, n].
+        names: the order of `covariance`; also holds what was fitted beside the kernel ("dx", "dy", "magnification").
+        bic: Bayesian information criterion; lower is better, comparable between families on the same data.
+        count: the number of samples or pixels used.
+        model: "forward", "ratio" or "profile".
+        gain: the fitted exposure ratio between the pictures (forward model), else 1.
+        background: the fitted level under the blurred dot (forward model), else 0.
+        shift: the fitted displacement (x, y) of the blurred dot against the sharp one, px.
+        magnification: the fitted size of the blurred picture's dot over the sharp one's.
+        asymmetry: the share of the blur's contrast that depends on the angle (0 for a round one), NaN where unknown.
+        why: one sentence: how the family was chosen.
+        psnr: for family="auto", dB on a natural image that each family reached against "radial".
+        samples: the radii and strengths [2, n] that a picture of the fit shows.
+        curve: the fitted curve at those radii, [2, m].
+    """
+
+    family: str
+    params: dict[str, float | Array]
+    stderr: dict[str, float | Array]
+    residual: float
+    noise: float
+    covariance: Array
+    names: tuple[str, ...]
+    bic: float
+    count: int
+    model: str
+    gain: float = 1.0
+    background: float = 0.0
+    shift: tuple[float, float] = (0.0, 0.0)
+    magnification: float = 1.0
+    asymmetry: float = math.nan
+    why: str = ""
+    psnr: dict[str, float] = field(default_factory=dict)
+    samples: Array = field(default_factory=lambda: np.zeros((2, 0)), repr=False)
+    curve: Array = field(default_factory=lambda: np.zeros((2, 0)), repr=False)
+
+    @property
+    def residual_over_noise(self) -> float:
+        """How far the residual lies above the noise: about 1 for a model that explains everything."""
+        return self.residual / self.noise if self.noise > 0 else math.nan
+
+    def kernel_params(self) -> dict[str, float | Array]:
+        """The parameters that `torchdof.kernel` takes (without the strength N)."""
+        return {name: value for name, value in self.params.items() if name != "N"}
+
+    def summary(self) -> str:
+        """A few readable lines: each parameter with its error, the residual against the noise, the reason."""
+        lines = [f"{self.family} ({self.model})"]
+        for name, value in self.params.items():
+            error = self.stderr[name]
+            if isinstance(value, np.ndarray):
+                lines.append(f"  {name}: {value.size} numbers, largest {np.max(value):.4g}")
+            else:
+                lines.append(f"  {name} = {value:.6g} +- {error:.2g}")
+        ratio = self.residual_over_noise
+        lines.append(
+            f"  residual {100 * self.residual:.2f} %" + ("" if math.isnan(ratio) else f", {ratio:.2f} x the noise")
+        )
+        if self.model == "forward":
+            lines.append(
+                f"  gain {self.gain:.4g}, shift ({self.shift[0]:+.2f}, {self.shift[1]:+.2f}) px, "
+                f"magnification {self.magnification:.4f}"
+            )
+        if self.why:
+            lines.append(f"  {self.why}")
+        return "\n".join(lines)

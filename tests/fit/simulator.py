@@ -1,0 +1,116 @@
+"""A camera that photographs a white dot, sharp and defocused, with everything that goes wrong in a real one.
+
+The dot is drawn with anti-aliased edges; the blur is the renderer's own: the pixel-integrated kernel applied to the
+sharp picture's pixels. Both pictures are in linear light.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.signal import fftconvolve
+
+from torchdof.kernel import render
+
+
+def draw_dot(size: int, radius: float, centre: tuple[float, float] = (0.0, 0.0), oversample: int = 16) -> np.ndarray:
+    """A white disc of `radius` px at `centre` (x, y) px from the picture's centre, each pixel its covered share."""
+    axis = (np.arange(size * oversample) + 0.5) / oversample - size / 2
+    inside = (axis[None, :] - centre[0]) ** 2 + (axis[:, None] - centre[1]) ** 2 <= radius**2
+    return inside.reshape(size, oversample, size, oversample).mean((1, 3))
+
+
+def blur(picture: np.ndarray, family: str, params: dict) -> np.ndarray:
+    """The picture convolved with a kernel of `torchdof.kernel`."""
+    kernel = render(family, {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}).numpy()
+    return fftconvolve(picture, kernel, mode="same")
+
+
+@dataclass
+class Simulator:
+    """What the camera does to the light; every default is harmless.
+
+    Attributes:
+        size: width of the square window in px.
+        dot_radius: radius of the sharp dot in px.
+        snr_db: 20 log10(1 / read noise), None for none; 1 is the sharp dot's level.
+        full_well: electrons at 1, for shot noise; None for none.
+        level: of the sharp dot; below 1 keeps encoded pictures from clipping.
+        exposure: light in the defocused picture over the sharp one.
+        black: level added to both pictures.
+        offset: level added to the defocused picture alone (stray light).
+        shift: displacement (x, y) of the defocused dot in px.
+        magnification: size of the defocused picture's dot over the sharp one's.
+        bits: quantisation; None for none.
+        clip: level above which the picture is clipped; None for none.
+        srgb: leave both pictures sRGB encoded.
+        jpeg: JPEG quality the sRGB-encoded pictures are stored at and decoded from; None for none.
+        edge_sigma: softness of the sharp picture in px, in both pictures.
+    """
+
+    size: int = 101
+    dot_radius: float = 12.0
+    snr_db: float | None = 40.0
+    full_well: float | None = None
+    level: float = 1.0
+    exposure: float = 1.0
+    black: float = 0.0
+    offset: float = 0.0
+    shift: tuple[float, float] = (0.0, 0.0)
+    magnification: float = 1.0
+    bits: int | None = None
+    clip: float | None = None
+    srgb: bool = False
+    jpeg: int | None = None
+    edge_sigma: float = 0.0
+
+    def pair(self, family: str, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Sharp and defocused picture `[size, size]` of one dot."""
+        rng = np.random.default_rng(seed)
+        sharp = draw_dot(self.size, self.dot_radius)
+        moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, self.shift), self.size)
+        if self.edge_sigma:
+            sharp, moved = (blur(p, "gaussian", {"sigma": self.edge_sigma}) for p in (sharp, moved))
+        blurred = blur(moved, family, params)[self.size : 2 * self.size, self.size : 2 * self.size]
+        still, defocused = self.level * sharp, self.level * self.exposure * blurred + self.offset
+        return self.record(still, rng), self.record(defocused, rng)
+
+    def record(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """What the file holds of a picture in linear light, decoded to linear light unless `srgb`."""
+        picture = np.maximum(light, 0.0) + self.black
+        if self.full_well is not None:
+            picture = rng.poisson(picture * self.full_well) / self.full_well
+        if self.snr_db is not None:
+            picture = picture + rng.normal(0.0, 10 ** (-self.snr_db / 20), picture.shape)
+        if self.clip is not None:
+            picture = np.minimum(picture, self.clip)
+        if self.jpeg is not None:
+            return decode_srgb(_through_jpeg(encode_srgb(picture), self.jpeg))
+        if self.srgb:
+            picture = encode_srgb(picture)
+        if self.bits is not None:
+            levels = 2**self.bits - 1
+            picture = np.round(np.clip(picture, 0, 1) * levels) / levels
+        return picture
+
+
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear light to sRGB, clipped to 0..1."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(encoded: np.ndarray) -> np.ndarray:
+    """sRGB to linear light."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def _through_jpeg(picture: np.ndarray, quality: int) -> np.ndarray:
+    from PIL import Image
+
+    stored = io.BytesIO()
+    Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(stored, "jpeg", quality=quality)
+    return np.asarray(Image.open(stored), dtype=np.float64) / 255
