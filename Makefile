@@ -24,8 +24,8 @@ check: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	rm -rf build/typecheck build/lib build/bdist.*
 	$(BIN)/pip install --quiet --no-deps --target build/typecheck .
-	cd build && MYPYPATH=typecheck ../$(BIN)/mypy --config-file ../pyproject.toml --cache-dir ../.mypy_cache -p torchdof
-	cd build && MYPYPATH=typecheck ../$(BIN)/mypy --config-file ../pyproject.toml --cache-dir ../.mypy_cache ../tests ../examples
+	MYPYPATH=build/typecheck $(BIN)/mypy -p torchdof
+	MYPYPATH=build/typecheck $(BIN)/mypy tests examples
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@echo "installing into $(VENV); the first time this takes a minute or two"

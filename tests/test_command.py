@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from typer.testing import CliRunner
@@ -30,6 +31,13 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_image("image.exr", Picture(image(), sample="float"))
     np.save("depth.npy", depth().numpy())
     return tmp_path
+
+
+def store(path: str, array: np.ndarray, sample: str, names: tuple[str, ...]) -> None:
+    spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], sample)
+    spec.channelnames = names
+    output = oiio.ImageOutput.create(path)
+    assert output is not None and output.open(path, spec) and output.write_image(array) and output.close()
 
 
 def image() -> torch.Tensor:
@@ -71,13 +79,8 @@ def test_render_is_the_function_on_files(scene: Path) -> None:
 
 
 def test_depth_channel_of_the_image_is_used_when_no_depth_is_named(scene: Path) -> None:
-    import OpenImageIO as oiio
-
-    spec = oiio.ImageSpec(WIDTH, HEIGHT, 4, "float")
-    spec.channelnames = ("R", "G", "B", "Z")
-    output = oiio.ImageOutput.create("zed.exr")
     both = torch.cat([image(), depth()], dim=1)[0].permute(1, 2, 0).contiguous().numpy()
-    assert output.open("zed.exr", spec) and output.write_image(both) and output.close()
+    store("zed.exr", both, "float", ("R", "G", "B", "Z"))
     run("zed.exr", "-o", "a.exr", "--focus-m", "2", *LENS)
     run("image.exr", "depth.npy", "-o", "b.exr", "--focus-m", "2", *LENS)
     assert torch.equal(pixels("a.exr"), pixels("b.exr"))
@@ -128,13 +131,9 @@ def test_assumed_lens_is_said(scene: Path) -> None:
 
 
 def test_disparity_in_sixteen_bits_with_holes_is_filled_and_counted(scene: Path) -> None:
-    import OpenImageIO as oiio
-
     disparity = np.where(depth()[0, 0].numpy() == 2.0, 300, 100).astype(np.uint16)
     disparity[3, 4] = disparity[9, 20] = 0
-    output = oiio.ImageOutput.create("disparity.png")
-    assert output.open("disparity.png", oiio.ImageSpec(WIDTH, HEIGHT, 1, "uint16"))
-    assert output.write_image(disparity[..., None]) and output.close()
+    store("disparity.png", disparity[..., None], "uint16", ("Y",))
     options = ("--depth-kind", "disparity", "--depth-scale", "600", "--depth-unknown", "0", "--focus-m", "2", *LENS)
     message = run("image.exr", "disparity.png", "-o", "a.exr", *options, code=2)
     assert message.startswith("error: disparity.png: 2 pixels (0.5 %) have no depth")

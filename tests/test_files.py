@@ -26,9 +26,20 @@ def store(path: Path, array: np.ndarray, sample: str, names: tuple[str, ...] | N
         spec.alpha_channel = names.index("A") if "A" in names else -1
     for name, value in attributes.items():
         spec.attribute(name.replace("__", ":"), value)
+    return store_by(path, spec, array)
+
+
+def store_by(path: Path, spec: oiio.ImageSpec, array: np.ndarray) -> Path:
     output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), spec) and output.write_image(np.ascontiguousarray(array)) and output.close()
+    assert output is not None and output.open(str(path), spec)
+    assert output.write_image(np.ascontiguousarray(array)) and output.close()
     return path
+
+
+def spec_of(path: Path) -> oiio.ImageSpec:
+    source = oiio.ImageInput.open(str(path))
+    assert source is not None
+    return source.spec()
 
 
 def stored(path: Path) -> np.ndarray:
@@ -36,7 +47,10 @@ def stored(path: Path) -> np.ndarray:
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
-    return source.read_image(source.spec().format)
+    assert source is not None
+    values = source.read_image(source.spec().format)
+    assert values is not None
+    return values
 
 
 def ramp(channels: int = 3, height: int = 4, width: int = 6) -> torch.Tensor:
@@ -103,7 +117,7 @@ def test_integers_are_srgb_and_floats_are_linear_unless_stated(
 
 def test_float_tiff_is_linear_though_its_tag_says_srgb(tmp_path: Path) -> None:
     path = store(tmp_path / "x.tif", np.full((2, 2, 3), 0.5, np.float32), "float", FNumber=2.0)
-    assert oiio.ImageInput.open(str(path)).spec().get_string_attribute("oiio:ColorSpace").startswith("srgb")
+    assert spec_of(path).get_string_attribute("oiio:ColorSpace").startswith("srgb")
     assert read_image(path).pixels.mean().item() == 0.5
 
 
@@ -196,7 +210,7 @@ def two_parts(path: Path, depth_size: tuple[int, int] = (2, 3)) -> Path:
         spec.full_width, spec.full_height = 6, 4  # parts share the full frame
         spec.attribute("oiio:subimagename", name)
     output = oiio.ImageOutput.create(str(path))
-    assert output.open(str(path), (colour, depth)), output.geterror()
+    assert output is not None and output.open(str(path), (colour, depth))
     assert output.write_image(np.full((2, 3, 3), 0.25, np.float32))
     assert output.open(str(path), depth, "AppendSubimage")
     assert output.write_image(np.full((*depth_size, 1), 7.7, np.float32)) and output.close()
@@ -219,9 +233,7 @@ def test_half_colour_with_float_depth_stays_half(tmp_path: Path) -> None:
     spec = oiio.ImageSpec(3, 2, 4, "half")
     spec.channelnames = ("R", "G", "B", "Z")
     spec.channelformats = (oiio.HALF, oiio.HALF, oiio.HALF, oiio.FLOAT)
-    output = oiio.ImageOutput.create(str(tmp_path / "x.exr"))
-    assert output.open(str(tmp_path / "x.exr"), spec) and output.write_image(np.full((2, 3, 4), 1.0001, np.float32))
-    assert output.close()
+    store_by(tmp_path / "x.exr", spec, np.full((2, 3, 4), 1.0001, np.float32))
     picture = read_image(tmp_path / "x.exr")
     assert picture.sample == "half"
     assert picture.depth is not None and picture.depth[0, 0, 0, 0].item() == pytest.approx(1.0001, abs=1e-7)
@@ -229,7 +241,7 @@ def test_half_colour_with_float_depth_stays_half(tmp_path: Path) -> None:
 
 def test_layers_are_chosen_by_name(tmp_path: Path) -> None:
     names = ("a.R", "a.G", "a.B", "b.R", "b.G", "b.B")
-    values = np.repeat(np.float32([[[1, 1, 1, 2, 2, 2]]]), 2, axis=0)
+    values = np.repeat(np.array([[[1, 1, 1, 2, 2, 2]]], np.float32), 2, axis=0)
     path = store(tmp_path / "x.exr", values, "float", names)
     assert read_image(path).pixels.unique().tolist() == [1.0]
     assert read_image(path, layer="b").pixels.unique().tolist() == [2.0]
@@ -240,11 +252,9 @@ def test_layers_are_chosen_by_name(tmp_path: Path) -> None:
 def test_exr_keeps_its_place_in_the_full_frame(tmp_path: Path) -> None:
     spec = oiio.ImageSpec(4, 3, 3, "float")
     spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = -2, 5, 0, 0, 100, 50
-    output = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
-    assert output.open(str(tmp_path / "a.exr"), spec) and output.write_image(np.ones((3, 4, 3), np.float32))
-    assert output.close()
+    store_by(tmp_path / "a.exr", spec, np.ones((3, 4, 3), np.float32))
     write_image(tmp_path / "b.exr", read_image(tmp_path / "a.exr"))
-    back = oiio.ImageInput.open(str(tmp_path / "b.exr")).spec()
+    back = spec_of(tmp_path / "b.exr")
     assert (back.x, back.y, back.full_width, back.full_height) == (-2, 5, 100, 50)
 
 
@@ -253,7 +263,7 @@ def test_metadata_of_the_input_is_kept(tmp_path: Path, suffix: str) -> None:
     attributes: dict[str, Any] = {"Make": "Maker", "Exif__FocalLength": 85.0, "FNumber": 1.8, "ImageDescription": "a b"}
     source = store(tmp_path / f"a{suffix}", np.zeros((4, 4, 3), np.float32), "uint8", **attributes)
     write_image(tmp_path / f"b{suffix}", read_image(source))
-    back = oiio.ImageInput.open(str(tmp_path / f"b{suffix}")).spec()
+    back = spec_of(tmp_path / f"b{suffix}")
     assert back.get_string_attribute("Make") == "Maker"
     assert back.get_string_attribute("ImageDescription") == "a b"
     assert back.get_float_attribute("Exif:FocalLength") == 85.0
@@ -263,7 +273,7 @@ def test_metadata_of_the_input_is_kept(tmp_path: Path, suffix: str) -> None:
 def test_lossy_compression_of_an_exr_is_not_repeated(tmp_path: Path) -> None:
     source = store(tmp_path / "a.exr", np.zeros((4, 4, 3), np.float32), "half", compression="dwaa:45")
     write_image(tmp_path / "b.exr", read_image(source))
-    assert oiio.ImageInput.open(str(tmp_path / "b.exr")).spec().get_string_attribute("compression") == "zip"
+    assert spec_of(tmp_path / "b.exr").get_string_attribute("compression") == "zip"
 
 
 def test_pfm_rows_run_from_the_bottom_and_its_scale_is_not_applied(tmp_path: Path) -> None:
