@@ -82,8 +82,9 @@ def normalised_convolution(image: Tensor, kernel: Tensor) -> Tensor:
     return scatter(image, lambda *_: kernel) / scatter(torch.ones_like(image), lambda *_: kernel)
 
 
-def disc_by_columns(radius: float, size: int, columns: int = 4000) -> Tensor:
+def disc_by_columns(radius: float, size: int) -> Tensor:
     """Disc integrated over the pixels: each pixel cut into columns, the disc's chord clipped to each."""
+    columns = 40_000 // size
     half = size // 2
     edge = torch.arange(size + 1, dtype=torch.float64) - half - 0.5
     x = edge[:-1, None] + (torch.arange(columns, dtype=torch.float64) + 0.5) / columns  # [size, columns]

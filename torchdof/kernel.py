@@ -1,9 +1,9 @@
 """Point spread functions, integrated over the pixel: non-negative, sum 1, differentiable in their parameters.
 
 Every family is isotropic, a profile ``f(r)`` over the distance ``r`` from the kernel's centre. A pixel's value is the
-integral of ``f`` over the pixel's square. It is taken ring by ring: a pixel is cut by circles into thin slices, the
-area of each slice is exact (circle against square), and within a slice ``f`` is replaced by its mean over r, which has
-a closed form for every family. A disc thus is a soft disc with a softness of 0, and kernels stay right down to radii
+integral of ``f`` over the pixel's square, exact for ``gaussian`` and ``disc``. For the others it is taken ring by ring:
+a pixel is cut by circles into thin slices, the area of each slice is exact (circle against square), and within a slice
+``f`` is replaced by its mean over r, which has a closed form for every family. Kernels thus stay right down to radii
 far below a pixel, where sampling ``f`` at the pixels' centres fails.
 
 All arithmetic is in float64 on the CPU's or the parameter's device; parameters are in pixels.
@@ -94,7 +94,8 @@ def disc(radius: Number, size: int | None = None) -> Tensor:
 def softm(radius: Number, sigma: Number, b: Number = 0.0, m: Number = 2.0, size: int | None = None) -> Tensor:
     """Disc with a soft edge and a radial tilt: ``erfc((r - R) / (sqrt(2) sigma)) / 2 * (1 + b (r / R)^m)``.
 
-    ``b = 0`` is a soft disc, ``b = 0`` and ``sigma = 0`` a disc; ``b > 0`` has the bright rim of an over-corrected lens.
+    ``b = 0`` is a soft disc, ``b = 0`` and ``sigma = 0`` a disc; ``b > 0`` has the bright rim of an over-corrected
+    lens.
 
     Args:
         radius: Pixels, >= 0, float or ``[...]`` (``R``).
@@ -107,7 +108,7 @@ def softm(radius: Number, sigma: Number, b: Number = 0.0, m: Number = 2.0, size:
         ``[..., size, size]``, float64.
 
     Example:
-        >>> bool(torch.equal(softm(3.0, 0.0, size=9), disc(3.0, size=9)))
+        >>> bool(torch.allclose(softm(3.0, 0.0, size=9), disc(3.0, size=9), atol=1e-5))
         True
     """
     return render("softm", {"radius": radius, "sigma": sigma, "b": b, "m": m}, size)
@@ -125,7 +126,7 @@ def radial(values: Tensor, radius: Number, size: int | None = None) -> Tensor:
         ``[..., size, size]``, float64.
 
     Example:
-        >>> bool(torch.allclose(radial(torch.ones(5), 3.0), disc(3.0), atol=1e-9))
+        >>> bool(torch.allclose(radial(torch.ones(5), 3.0), disc(3.0), atol=1e-5))
         True
     """
     return render("radial", {"values": values, "radius": radius}, size)
@@ -155,13 +156,19 @@ def render(family: str, params: Mapping[str, Number], size: int | None = None) -
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in given.items()}
     if family == "gaussian":
         quadrant = _gaussian_quadrant(lengths["sigma"], half)
+    elif family == "disc":
+        quadrant = _disc_quadrant(lengths["radius"], half)
     else:
         inner, outer, area = _slices(half, lengths[FAMILIES[family][-1]].device)
         mean = _slice_means(family, lengths, inner, outer)
         quadrant = (mean * area).sum(-1).unflatten(-1, (half + 1, half + 1))
     kernel = torch.cat([quadrant[..., 1:, :].flip(-2), quadrant], -2)
     kernel = torch.cat([kernel[..., 1:].flip(-1), kernel], -1)
-    return kernel / kernel.sum((-2, -1), keepdim=True)
+    total = kernel.sum((-2, -1), keepdim=True)
+    centre = torch.zeros_like(kernel)
+    centre[..., half, half] = 1.0
+    # too small to hold any light in float64, or all of it beyond size: a single pixel
+    return torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
 
 
 def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
@@ -246,12 +253,29 @@ def _gaussian_quadrant(sigma: Tensor, half: int) -> Tensor:
     return line.unsqueeze(-1) * line.unsqueeze(-2)
 
 
+def _disc_quadrant(radius: Tensor, half: int) -> Tensor:
+    radius = radius[..., None, None]
+    index = torch.arange(half + 1, dtype=torch.float64, device=radius.device)
+    edge = torch.cat([index.new_zeros(1), index + 0.5])
+    covered = _corner_area(edge[None, :], edge[:, None], radius).diff(dim=-1).diff(dim=-2).clamp_min(0.0)
+    width = edge.diff()
+    # outside and inside the circle without the rounding of differences
+    nearest = torch.hypot(edge[:-1, None], edge[None, :-1])
+    farthest = torch.hypot(edge[1:, None], edge[None, 1:])
+    covered = torch.where(farthest <= radius, width[:, None] * width[None, :], covered)
+    return torch.where(nearest < radius, covered, 0.0) * _twice(index)
+
+
+def _twice(index: Tensor) -> Tensor:
+    """How often a pixel's area in the quadrant counts: one on an axis reaches as far to the other side of it."""
+    twice = torch.where(index == 0, 2.0, 1.0)
+    return twice[:, None] * twice[None, :]
+
+
 def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Tensor) -> Tensor:
     """Mean over r of the profile in each slice: ``[..., pixels, slices]``."""
     p = {k: v if k == "values" else v[..., None, None] for k, v in p.items()}
     thickness = outer - inner
-    if family == "disc":
-        return ((p["radius"] - inner) / thickness).clamp(0.0, 1.0)
     if family == "ring":
         width = math.sqrt(2) * p["sigma"]
         return (torch.erf((outer - p["r_c"]) / width) - torch.erf((inner - p["r_c"]) / width)) * width / thickness
@@ -313,19 +337,25 @@ def _cut_quadrant(half: int) -> tuple[Tensor, Tensor, Tensor]:
         - _corner_area(high_x, low_y, r)
         + _corner_area(low_x, low_y, r)
     )
-    # a pixel on an axis reaches as far to the other side of it
-    twice = torch.where(index == 0, 2.0, 1.0)
-    covered = covered * (twice[:, None] * twice[None, :]).flatten()[:, None]
+    covered = covered * _twice(index).flatten()[:, None]
     return r[:, :-1].contiguous(), r[:, 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
 
 
 def _corner_area(x: Tensor, y: Tensor, r: Tensor) -> Tensor:
     """Area of the quarter disc of radius r that lies within the rectangle from the origin to (x, y)."""
     x, y = torch.minimum(x, r), torch.minimum(y, r)
-    reach = torch.sqrt((r * r - y * y).clamp_min(0.0))  # up to here the rectangle's top is inside the disc
+    reach = _root(r * r - y * y)  # up to here the rectangle's top is inside the disc
 
     def under_arc(t: Tensor) -> Tensor:
-        return 0.5 * (t * torch.sqrt((r * r - t * t).clamp_min(0.0)) + r * r * torch.asin((t / r).clamp(max=1.0)))
+        inside = t < r
+        angle = torch.where(inside, torch.asin(torch.where(inside, t / r, 0.0)), math.pi / 2)
+        return 0.5 * (t * _root(r * r - t * t) + r * r * angle)
 
     beyond = torch.where(x > reach, under_arc(x) - under_arc(torch.minimum(reach, x)), 0.0)
     return torch.where(r > 0, y * torch.minimum(x, reach) + beyond, 0.0)
+
+
+def _root(square: Tensor) -> Tensor:
+    """Square root of the positive, 0 of the rest: with finite gradients."""
+    positive = square > 0
+    return torch.where(positive, torch.sqrt(torch.where(positive, square, 1.0)), 0.0)
