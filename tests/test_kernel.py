@@ -201,8 +201,8 @@ def test_gradients_are_finite_where_kernels_are_not_smooth(family: str, length: 
     lengths = {
         name: torch.tensor(length, dtype=torch.float64, requires_grad=True) for name in ("sigma", "r_c", "radius")
     }
-    others = {"b": 0.5, "m": 2.0, "values": torch.ones(3)}
-    psf = kernel.render(family, {name: lengths.get(name, others.get(name)) for name in kernel.FAMILIES[family]}, 5)
+    others: dict[str, Any] = {"b": 0.5, "m": 2.0, "values": torch.ones(3)}
+    psf = kernel.render(family, {name: ({**others, **lengths})[name] for name in kernel.FAMILIES[family]}, 5)
     grads = torch.autograd.grad(psf.square().sum(), list(lengths.values()), allow_unused=True)
     assert any(grad is not None for grad in grads)
     assert all(torch.isfinite(grad) for grad in grads if grad is not None)

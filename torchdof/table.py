@@ -213,7 +213,7 @@ class BlurTable:
         Example:
             >>> texture = BlurTable.load("sato_j15").blur_texture(10.0, width=512)
             >>> round(float(texture.max()), 3)
-            0.58
+            0.581
         """
         signed = torch.tensor(coc_px, dtype=torch.float64)
         params = self.params(signed, width)
@@ -401,8 +401,10 @@ def _numbers(name: str, value: Any) -> Tensor:
         numbers = torch.as_tensor(value)
         if numbers.dtype == torch.bool or numbers.is_complex():
             raise TypeError
+        if not isinstance(value, Tensor):
+            numbers = torch.as_tensor(value, dtype=torch.float64)  # a list would have come as float32
         numbers = numbers.detach().to("cpu", torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise ValueError(f"{name} must be numbers, got {str(value)[:60]}") from None
     if not bool(torch.isfinite(numbers).all()):
         raise ValueError(f"{name} must be finite numbers, got {_short(numbers)}")
