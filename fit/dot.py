@@ -161,14 +161,14 @@ def radial_mean(picture: Array, distance: Array) -> tuple[Array, Array]:
     return total[:whole] / np.maximum(count[:whole], 1), count[:whole].astype(np.float64)
 
 
-def noise_inside(picture: Array, dot: Dot) -> float | None:
-    """Standard deviation of a pixel's noise within a sharp dot, or None where the dot is too small to tell."""
+def noise_inside(picture: Array, dot: Dot) -> tuple[float, int] | None:
+    """Standard deviation of a pixel's noise within a sharp dot, from how many pixels; None where the dot is too small."""
     rows, columns = np.indices(picture.shape)
     inside = np.hypot(columns - dot.x, rows - dot.y) < dot.radius - 4
     if inside.sum() < 25:
         return None
     across = picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]
-    return float(np.sqrt(np.mean(across[inside[:, 1:-1]] ** 2) / 6))
+    return float(np.sqrt(np.mean(across[inside[:, 1:-1]] ** 2) / 6)), int(inside.sum())
 
 
 def noise_of(picture: Array) -> float:

@@ -28,7 +28,6 @@ __all__ = ["EXPLAINED", "asymmetry_of", "doubt_forward", "doubt_linearity", "sig
 EXPLAINED = 1.15
 """Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
 
-_DARK_NOISE = 1.6  # dark noise over bright noise; light itself only makes noise grow with the level
 _ENCODED = 0.7
 _FAR_ABOVE = 1.6  # residual over noise
 _MATTERS = 0.005
@@ -111,9 +110,10 @@ def doubt_forward(
 
 def doubt_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
     """Warn where a sharp picture shows that it is not in linear light: by its noise, or by its dot's edge."""
-    bright = noise_inside(still, dot)
-    if bright is not None and dot.noise > _DARK_NOISE * bright and dot.noise > 1e-4 * dot.peak:
-        ratio = dot.noise / max(bright, 1e-9 * dot.peak)
+    inside = noise_inside(still, dot)
+    # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
+    if inside and dot.noise > (1 + 4 / np.sqrt(inside[1])) * inside[0] and dot.noise > 1e-4 * dot.peak:
+        ratio = dot.noise / max(inside[0], 1e-9 * dot.peak)
         text = (
             f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
             "encoded; is the image linear? Decode it first"

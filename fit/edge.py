@@ -124,4 +124,4 @@ def _variance(picture: Array, dot: Dot) -> Array:
     """Noise variance of each pixel: the background's, growing with the level to that inside the dot (shot noise)."""
     bright = noise_inside(picture, dot)
     level = np.clip((picture - dot.background) / dot.peak, 0, 1)
-    return np.asarray(dot.noise**2 + (max(bright**2 - dot.noise**2, 0.0) if bright is not None else 0.0) * level)
+    return np.asarray(dot.noise**2 + (max(bright[0] ** 2 - dot.noise**2, 0.0) if bright is not None else 0.0) * level)

@@ -25,6 +25,7 @@ def best_of(
     jacobian: Callable[..., Array] | None = None,
     tolerance: float = _TIGHT,
     attempts: int = 400,
+    loyalty: float = 0.0,
 ) -> Array:
     """Fit roughly from every start, finish from the best, and return the parameters.
 
@@ -36,6 +37,7 @@ def best_of(
         jacobian: `jacobian(x, *params) -> [n, p]`; three-point differences when None.
         tolerance: relative change of cost, parameters and gradient at which to stop.
         attempts: the most evaluations for each start.
+        loyalty: the first start is finished unless another one's sum of squares is smaller by more than this share.
 
     Returns:
         The parameters `[p]`.
@@ -81,6 +83,8 @@ def best_of(
             f"none of {len(starts)} starts converged; is this a picture of a blurred dot?", number=float(len(starts))
         )
     best = min(reached, key=lambda r: r[0])
+    if rough[0] is not None and rough[0][0] <= best[0] * (1 + loyalty):
+        best = rough[0]
     finished = descend(best[1], tolerance)
     if finished is None:
         raise NotConvergedError("the best start did not settle; is this a picture of a blurred dot?", number=1.0)
