@@ -1,0 +1,107 @@
+"""What a file is verified on: frames, lenses and scenes other than the traced ones."""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from torchdof.camera import Camera
+
+from .graph import Portable
+
+__all__ = ["Case", "cases"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One call.
+
+    Args:
+        name: What is special about it.
+        tensors: The inputs, in the graph's order.
+    """
+
+    name: str
+    tensors: tuple[Tensor, ...]
+
+
+def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Case]:
+    """The calls that a file must answer as the module does.
+
+    Args:
+        portable: The module as exported.
+        channels: Channels of the image.
+        large: Add a frame of 960 x 540.
+    """
+    reach = portable.dof.max_coc_px
+    random = torch.Generator().manual_seed(4)
+    frames = [
+        ("one pixel", (1, 1, 1), _ramp(0.3, 0.9)),
+        ("one row", (1, 1, 7), _ramp(-1.0, 1.0)),
+        ("one column", (2, 9, 1), _ramp(-1.0, 1.0)),
+        ("smaller than the kernels", (1, 5, 8), _ramp(-1.0, 1.0)),
+        ("odd, three items", (3, 37, 53), _ramp(-0.6, 0.8)),
+        ("portrait", (1, 96, 31), _ramp(-1.0, 0.4)),
+        ("depth edges", (1, 64, 97), _steps),
+        ("all in focus", (1, 48, 64), _ramp(0.0, 0.0)),
+        ("all behind, out of focus", (1, 48, 64), _ramp(0.9, 0.9)),
+        ("all in front, out of focus", (1, 48, 64), _ramp(-0.9, -0.9)),
+        ("beyond the largest radius", (1, 40, 44), _ramp(-1.6, 1.6)),
+        ("highlight of 6.5e4", (1, 61, 75), _ramp(-0.7, 0.7)),
+        ("infinitely far", (1, 40, 50), _ramp(-0.5, 1.0)),
+        ("bad depths", (2, 41, 50), _ramp(-0.8, 0.8)),
+    ]
+    if large:
+        frames.append(("960 x 540", (1, 540, 960), _steps))
+    for name, (batch, height, width), shape in frames:
+        image = torch.rand((batch, channels, height, width), generator=random)
+        if name.startswith("highlight"):
+            image = 0.1 * image
+            image[:, :, height // 3, width // 4] = 6.5e4
+        coc = reach * shape(batch, height, width)
+        if portable.inputs == "coc_px":
+            if name == "bad depths":
+                coc[:, :, ::7, 3::11] = math.nan
+            yield Case(name, (image, coc))
+            continue
+        focus = torch.linspace(1.2, 3.1, batch)
+        camera, f_number = _lens(portable.dof.camera, focus, 1.05 * coc.abs().amax().clamp_min(1.0), width)
+        depth = _depth(camera, coc, width)
+        if name == "infinitely far":
+            depth[..., -height // 4 :, :] = math.inf
+        if name == "bad depths":
+            depth[:, :, ::7, 3::11] = math.nan
+            depth[:, :, 1::7, 5::11] = 0.0
+            depth[:, :, 2::7, 1::11] = -1.0
+        yield Case(name, (image, depth, focus, f_number))
+
+
+def _ramp(low: float, high: float):  # type: ignore[no-untyped-def]
+    def ramp(batch: int, height: int, width: int) -> Tensor:
+        line = torch.linspace(low, high, height * width)
+        return line.reshape(1, 1, height, width).repeat(batch, 1, 1, 1)
+
+    return ramp
+
+
+def _steps(batch: int, height: int, width: int) -> Tensor:
+    """A wall behind, in focus to the left, with a post in front of it."""
+    coc = torch.linspace(0.0, 1.0, width).expand(batch, 1, height, width).clone()
+    coc[..., width // 3 : width // 2] = -0.7
+    return coc
+
+
+def _lens(camera: Camera, focus: Tensor, reach: Tensor, width: int) -> tuple[Camera, Tensor]:
+    """F-numbers at which infinity has a coc of ``reach`` pixels."""
+    wide = camera.replace(focus_m=focus, f_number=torch.ones_like(focus))
+    f_number = wide.coc_px(torch.full((len(focus), 1, 1, 1), math.inf), width).flatten() / reach
+    return wide.replace(f_number=f_number), f_number
+
+
+def _depth(camera: Camera, coc: Tensor, width: int) -> Tensor:
+    """The depth that has this coc, which must be below that of infinity."""
+    far = camera.coc_px(torch.full_like(coc[..., :1, :1], math.inf), width)
+    focus = torch.as_tensor(camera.focus_m).reshape(-1, 1, 1, 1)
+    return focus / (1.0 - coc / far)

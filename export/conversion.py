@@ -1,0 +1,149 @@
+"""The module to a file: traced, translated, slimmed, labelled, verified, and only then moved into place."""
+
+import contextlib
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import onnx
+import onnx_ir
+import torch
+from onnx_ir.passes import common as passes
+from onnxscript import optimizer
+
+from torchdof import DepthOfField
+
+from .graph import INPUTS, OUTPUT, Portable, trace
+from .metadata import label
+from .verification import Verification, verify
+
+__all__ = ["OPSET", "to_onnx"]
+
+OPSET = 20
+_LARGEST_FOLDED = 64  # elements; larger constants are computed when the file is loaded rather than stored in it
+
+
+def to_onnx(
+    dof: DepthOfField,
+    path: str | os.PathLike[str],
+    *,
+    inputs: str = "depth",
+    channels: int = 3,
+    width: int | None = None,
+    opset: int = OPSET,
+) -> Verification:
+    """Write a module as one ONNX file, verified against the module.
+
+    The graph takes ``image [B, C, H, W]`` (linear light), ``depth [B, 1, H, W]`` (metres), ``focus_m [B]`` and
+    ``f_number [B]``, or ``image`` and ``coc_px [B, 1, H, W]``, all float32, and gives ``out [B, C, H, W]``. B, H and W
+    are free, from 1 upwards. It has the layers of every radius up to ``dof.max_coc_px``; those that no pixel falls into
+    are skipped when it runs. A pixel whose depth is NaN, zero or negative passes through sharp and touches nothing else.
+
+    Args:
+        dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they are
+            inputs.
+        path: The file. It is written to a temporary file beside it and moved into place after it has been verified.
+        inputs: ``"depth"``, or ``"coc_px"`` for pipelines that have the circle of confusion already.
+        channels: Channels of the image, C.
+        width: For a table with lengths in millimetres or fractions of the width: the image width whose kernels the file
+            holds. A radius in pixels then has this kernel at any width.
+        opset: ONNX operator set, 20 or newer.
+
+    Returns:
+        The comparison with the module; ``print`` shows it as a table.
+
+    Raises:
+        ValueError: If an argument is not as described, or the file does not render as the module does; nothing is
+            written then.
+
+    Example:
+        >>> import tempfile, torchdof
+        >>> dof = torchdof.DepthOfField(torchdof.Camera(), max_coc_px=2.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     len(to_onnx(dof, f"{folder}/dof.onnx").cases) > 5
+        True
+    """
+    if not isinstance(dof, DepthOfField):
+        raise ValueError(f"dof must be a torchdof.DepthOfField, got {type(dof).__name__}")
+    if isinstance(opset, bool) or not isinstance(opset, int) or opset < OPSET:
+        raise ValueError(f"opset must be {OPSET} or newer, got {opset!r}")
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
+    portable = Portable(dof, inputs, width)
+    model = onnx_ir.to_proto(_slim(_translate(portable, channels, opset)))
+    label(model, dof, portable, channels, opset)
+    handle, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".onnx", dir=path.parent)
+    os.close(handle)
+    try:
+        onnx.save_model(model, part)
+        report = verify(part, dof)
+        os.chmod(part, 0o644)
+        os.replace(part, path)
+    except BaseException:
+        os.unlink(part)
+        raise
+    return report
+
+
+def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
+    program = trace(portable, channels)
+    frame = {0: "B", 2: "H", 3: "W"}
+    names = INPUTS[portable.inputs]
+    shapes = (frame, frame, *(({0: "B"}, {0: "B"}),) * (len(names) > 2))
+    with _quiet():
+        converted = torch.onnx.export(
+            program,
+            dynamo=True,
+            opset_version=opset,
+            input_names=list(names),
+            output_names=[OUTPUT],
+            dynamic_shapes=shapes,
+            optimize=False,
+            verbose=False,
+        )
+    if converted is None:
+        raise RuntimeError("torch.onnx.export gave no program")
+    return converted.model
+
+
+def _slim(model: onnx_ir.Model) -> onnx_ir.Model:
+    """Inlined and without repeated constants, stack traces and names of source files."""
+    with _quiet():
+        model = optimizer.optimize(model, input_size_limit=_LARGEST_FOLDED, output_size_limit=_LARGEST_FOLDED)
+    for step in (
+        passes.IdentityEliminationPass(),
+        passes.CommonSubexpressionEliminationPass(),
+        passes.DeduplicateInitializersPass(size_limit=2**24),
+        passes.RemoveUnusedNodesPass(),
+        passes.RemoveUnusedOpsetsPass(),
+        passes.ClearMetadataAndDocStringPass(),
+    ):
+        step(model)
+    for graph in model.graphs():
+        for value in [v for node in graph for v in node.outputs]:
+            if not value.is_graph_output():
+                value.shape = None  # shape inference finds them again; they are half of the file
+    return model
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what torch.onnx and onnxscript say about themselves and not about the module."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        # torch's own copy of its tree specs calls a constructor that torch deprecates
+        warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).*", category=FutureWarning)
+        # the axes of depth, focus and f-number are those of the image, which is what is meant
+        warnings.filterwarnings("ignore", message=r".*axis name: [BHW] will not be used", category=UserWarning)
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)  # torchvision's operators are missed at each export
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)

@@ -1,0 +1,113 @@
+"""What is exported: the module with its static plan, tensors in and tensors out."""
+
+import copy
+
+import torch
+from torch import Tensor, nn
+
+from torchdof import BlurTable, DepthOfField, blur_by_coc
+from torchdof.camera import Camera
+from torchdof.plan import Plan
+
+__all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
+
+INPUTS = {"depth": ("image", "depth", "focus_m", "f_number"), "coc_px": ("image", "coc_px")}
+"""Names of the graph's inputs, in order, for each kind of map."""
+
+OUTPUT = "out"
+"""Name of the graph's output; ONNX does not let it share the name of the input ``image``."""
+
+
+class Portable(nn.Module):
+    """The module as its ONNX file computes it: all layers up to ``max_coc_px``, bad values passed through sharp.
+
+    Called outside an export it renders the same thing with eager PyTorch, and that is what a file is verified against.
+
+    Args:
+        dof: The module. Its camera's numbers must be floats.
+        inputs: ``"depth"`` or ``"coc_px"``: the map that the graph takes.
+        width: Image width that a table with lengths in millimetres or fractions of the width is pinned to.
+
+    Raises:
+        ValueError: If the camera has tensors, or the width is missing or superfluous.
+    """
+
+    def __init__(self, dof: DepthOfField, inputs: str = "depth", width: int | None = None) -> None:
+        super().__init__()
+        if inputs not in INPUTS:
+            raise ValueError(f"inputs must be one of {', '.join(INPUTS)}, got {inputs!r}")
+        for name in Camera.__dataclass_fields__:
+            if isinstance(getattr(dof.camera, name), Tensor):
+                raise ValueError(
+                    f"the camera's {name} must be a float to be exported, got a tensor; focus_m and f_number are inputs "
+                    "of the graph, so any value does for them"
+                )
+        self.inputs, self.width = inputs, width
+        self.dof = copy.copy(dof)
+        self.dof.table = pinned(dof.table, width)
+        self.dof.check = False
+        self.eval()
+
+    def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
+        """Render ``[B, C, H, W]`` with depth and ``(focus_m, f_number)``, or with a map of the coc."""
+        plan = None if torch.compiler.is_exporting() else self.plan
+        if self.inputs == "depth":
+            return self.dof(image, map_, *lens, plan=plan)
+        return blur_by_coc(image, map_, plan=plan, **self.dof._options())
+
+    @property
+    def plan(self) -> Plan:
+        """The layers of the graph."""
+        return Plan.all(self.dof.max_coc_px, self.dof.tolerance)
+
+
+class _Pinned(BlurTable):
+    """A table whose kernels are those of one image width, whatever the width of the image at hand."""
+
+    def __init__(self, table: BlurTable, width: int) -> None:
+        rest = {k: v for k, v in table.to_dict().items() if k not in ("schema", "version", "family", "coc", "params")}
+        super().__init__(table.family, table.coc, table.node_params, **rest)
+        self._scale = super()._px_per_unit(width)
+        self.unit = "relative"  # to the plan: not tied to the width
+
+    def _px_per_unit(self, width: int) -> float:
+        return getattr(self, "_scale", 1.0)
+
+
+def pinned(table: BlurTable, width: int | None) -> BlurTable:
+    """The table with its lengths taken at an image width; a table of unit ``"relative"`` as it is.
+
+    Raises:
+        ValueError: If the table needs a width and there is none, or the other way round.
+    """
+    if table.unit == "relative":
+        if width is not None and not isinstance(table, _Pinned):
+            raise ValueError(f"{table!r} has the same kernels at any image width; leave out width={width}")
+        return table
+    if isinstance(width, bool) or not isinstance(width, int) or width < 1:
+        raise ValueError(
+            f"{table!r} holds lengths in {table.unit!r}, and the kernels in the file are those of one image width; "
+            f"state it as width=1920, say, got {width!r}"
+        )
+    return _Pinned(table, width)
+
+
+def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
+    """The exported program with dynamic batch, height and width.
+
+    Raises:
+        ValueError: If the channels do not fit the table.
+    """
+    table, size = portable.dof.table, (2, 64, 64)
+    if table.channels not in (1, channels):
+        raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
+    image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0
+    example = (image, map_, *(torch.full(size[:1], value) for value in (1.5, 2.8)[: len(INPUTS[portable.inputs]) - 2]))
+    # Fills the cache of kernels, which the trace then takes as constants.
+    portable.plan.kernels(table, size[1:], image.dtype, image.device)
+    batch, height, width = (torch.export.Dim(name, min=1) for name in ("B", "H", "W"))
+    frame = {0: batch, 2: height, 3: width}
+    shapes = (frame, frame, *(({0: batch}, {0: batch}),) * (len(example) > 2))
+    with torch.no_grad():
+        return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)
+

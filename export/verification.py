@@ -1,0 +1,224 @@
+"""A file against the module it came from: names, types, shapes, values and time."""
+
+import dataclasses
+import os
+import time
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from torchdof import DepthOfField
+
+from .cases import Case, cases
+from .graph import INPUTS, OUTPUT, Portable
+from .metadata import facts_of, load, table_hash
+
+__all__ = ["TOLERANCE", "Row", "Verification", "session", "verify"]
+
+TOLERANCE = 1e-5
+"""Accepted difference from eager PyTorch, relative to the largest light within a kernel's reach."""
+
+ROUNDING = 2.0**-21
+"""Where the picture itself moves beyond the tolerance when the map does by this, rounding decides and not the file."""
+
+_MOST_DECIDED_BY_ROUNDING = 0.005  # of a frame's pixels
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One case.
+
+    Args:
+        name: What is special about it.
+        shape: Of the image, ``[B, C, H, W]``.
+        max_error: Largest difference, relative to the local range.
+        mean_error: Mean difference.
+        rounded: Pixels left out of the largest difference: where eager PyTorch itself differs by as much when the map
+            changes in its last bits, such as a pixel that only just touches a layer which nothing else is in.
+        torch_s: Seconds in eager PyTorch.
+        onnxruntime_s: Seconds in onnxruntime.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    max_error: float
+    mean_error: float
+    rounded: int
+    torch_s: float
+    onnxruntime_s: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Verification:
+    """How a file compares with the module; ``str`` is a table.
+
+    Args:
+        title: What was compared.
+        cases: One row a call.
+        bytes: Size of the file.
+    """
+
+    title: str
+    cases: tuple[Row, ...]
+    bytes: int
+
+    @property
+    def max_error(self) -> float:
+        """Largest difference of all cases, relative to the local range."""
+        return max(row.max_error for row in self.cases)
+
+    @property
+    def passed(self) -> bool:
+        """Whether every case is within :data:`TOLERANCE`."""
+        return all(row.max_error <= TOLERANCE for row in self.cases)
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.title}: {self.bytes / 1000:.0f} kB, "
+            f"{'verified' if self.passed else 'DIFFERS'} (largest error {self.max_error:.1e} of the local range)",
+            f"{'case':27} {'B x C x H x W':>17} {'max error':>9} {'mean':>7} {'left out':>8} {'torch ms':>8} {'onnx ms':>8}",
+        ]
+        for row in self.cases:
+            shape = " x ".join(map(str, row.shape))
+            lines.append(
+                f"{row.name:27} {shape:>17} {row.max_error:9.1e} {row.mean_error:7.0e} {row.rounded:8} "
+                f"{1000 * row.torch_s:8.1f} {1000 * row.onnxruntime_s:8.1f}"
+            )
+        return "\n".join(lines)
+
+
+def verify(path: str | os.PathLike[str], dof: DepthOfField, *, large: bool = False) -> Verification:
+    """Compare a file with the module it came from.
+
+    The file passes ``onnx.checker`` in full and strict shape inference, uses standard operators only and holds its
+    weights; its inputs and output have the names, types and free sizes that :func:`to_onnx` promises; and onnxruntime
+    renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the largest
+    light within the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced ones.
+
+    Args:
+        path: The file.
+        dof: The module.
+        large: Also compare, and time, a frame of 960 x 540.
+
+    Returns:
+        The comparison, case by case.
+
+    Raises:
+        ValueError: If the file is not valid, was made from another module, or renders something else; the message holds
+            the table.
+        FileNotFoundError: If there is no file.
+    """
+    model = load(path)
+    facts = facts_of(model, str(path))
+    inputs = "depth" if "depth" in facts["inputs"] else "coc_px"
+    portable = Portable(dof, inputs, facts["width"])
+    _check_format(model, os.fspath(path))
+    _check_origin(facts, dof)
+    channels = _check_interface(model, inputs)
+    runner = session(path)
+    rows = tuple(_compare(runner, portable, case) for case in cases(portable, channels, large))
+    options = facts["options"]
+    title = f"{facts['table']['name'] or 'unnamed'} ({facts['table']['family']}), {options['method']}"
+    title += f", {facts['layers']} layers up to {options['max_coc_px']:g} px"
+    report = Verification(title, rows, os.path.getsize(path))
+    if not report.passed:
+        raise ValueError(f"{path} differs from the module by more than {TOLERANCE:g} of the local range\n{report}")
+    return report
+
+
+def session(path: str | os.PathLike[str]) -> onnxruntime.InferenceSession:
+    """An onnxruntime session on the CPU with as many threads as PyTorch uses here."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(os.fspath(path), options, providers=["CPUExecutionProvider"])
+
+
+def local_range(image: Tensor, reach: int) -> Tensor:
+    """Largest light of all channels within ``reach`` pixels of each pixel, ``[B, 1, H, W]``."""
+    largest = functional.pad(image.abs().amax(1, keepdim=True), (reach,) * 4)
+    largest = functional.max_pool2d(largest, (2 * reach + 1, 1), stride=1)
+    return functional.max_pool2d(largest, (1, 2 * reach + 1), stride=1)
+
+
+def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Case) -> Row:
+    start = time.perf_counter()
+    with torch.no_grad():
+        expected = portable(*case.tensors)
+    middle = time.perf_counter()
+    feed = {name: t.numpy() for name, t in zip(INPUTS[portable.inputs], case.tensors, strict=True)}
+    got = runner.run([OUTPUT], feed)[0]
+    end = time.perf_counter()
+    if got.dtype != np.float32 or got.shape != tuple(expected.shape):
+        raise ValueError(f"{case.name}: expected float32 {list(expected.shape)}, got {got.dtype} {list(got.shape)}")
+    reach = max(kernel.shape[-1] for kernel in _bank(portable, expected)) // 2
+    unit = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
+    error = (torch.from_numpy(got) - expected).abs() / unit.clamp_min(torch.finfo(torch.float32).tiny)
+    error = torch.where(torch.isfinite(error), error, torch.inf).amax(1)
+    seconds, mean, rounded = (middle - start, end - middle), float(error.mean()), 0
+    if bool((error > TOLERANCE).any()):
+        moved = _moved(portable, case, expected) / unit[:, 0]
+        decided = (error > TOLERANCE) & (moved > error / 4)
+        if decided.float().mean() <= _MOST_DECIDED_BY_ROUNDING:
+            rounded, error = int(decided.sum()), torch.where(decided, 0.0, error)
+    return Row(case.name, tuple(got.shape), float(error.max()), mean, rounded, *seconds)
+
+
+def _moved(portable: Portable, case: Case, expected: Tensor) -> Tensor:
+    """How far eager PyTorch moves when the map changes in its last bits, ``[B, H, W]``."""
+    image, map_, *lens = case.tensors
+    with torch.no_grad():
+        moved = [(portable(image, map_ * (1 + s * ROUNDING), *lens) - expected).abs().amax(1) for s in (-1, -0.5, 0.5, 1)]
+    # one pixel's rounding shows in its neighbours
+    return functional.max_pool2d(torch.stack(moved).amax(0), 5, stride=1, padding=2)
+
+
+def _bank(portable: Portable, like: Tensor) -> list[Tensor]:
+    size = (int(like.shape[-2]), int(like.shape[-1]))
+    return portable.plan.kernels(portable.dof.table, size, like.dtype, like.device)
+
+
+def _check_format(model: onnx.ModelProto, path: str) -> None:
+    try:
+        onnx.checker.check_model(path, full_check=True)
+        onnx.shape_inference.infer_shapes(model, check_type=True, strict_mode=True, data_prop=True)
+    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
+        raise ValueError(f"{path} is not valid ONNX: {error}") from error
+    domains = sorted({entry.domain for entry in model.opset_import} - {"", "ai.onnx"})
+    if domains:
+        raise ValueError(f"{path} needs operators of {', '.join(domains)}; only standard ones are portable")
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in model.graph.initializer):
+        raise ValueError(f"{path} keeps weights in another file")
+
+
+def _check_origin(facts: dict, dof: DepthOfField) -> None:
+    if facts["table"]["sha256"] != table_hash(dof.table):
+        raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.table!r}")
+    options = dof._options(table=False)
+    for name, value in facts["options"].items():
+        if options[name] != value:
+            raise ValueError(f"the file was made with {name}={value!r}, the module has {options[name]!r}")
+    for name in ("focal_length_mm", "sensor_width_mm", "focus_breathing"):
+        if facts["camera"][name] != getattr(dof.camera, name):
+            raise ValueError(f"the file's camera has {name}={facts['camera'][name]!r}, the module's {dof.camera!r}")
+
+
+def _check_interface(model: onnx.ModelProto, inputs: str) -> int:
+    """Names, types and free sizes; returns the channels."""
+    channels = model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
+    one, many = ("B", 1, "H", "W"), ("B", channels, "H", "W")
+    lens = (("B",), ("B",)) if inputs == "depth" else ()
+    expected = [*zip(INPUTS[inputs], (many, one, *lens), strict=True), (OUTPUT, many)]
+    got = []
+    for value in (*model.graph.input, *model.graph.output):
+        kind = value.type.tensor_type
+        got.append((value.name, tuple(d.dim_param or d.dim_value for d in kind.shape.dim)))
+        if kind.elem_type != onnx.TensorProto.FLOAT:
+            raise ValueError(f"{value.name} must be float32, got {onnx.TensorProto.DataType.Name(kind.elem_type)}")
+    if got != expected:
+        raise ValueError(f"the graph must take and give {expected}, got {got}")
+    return int(channels)
