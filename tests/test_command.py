@@ -181,6 +181,19 @@ def test_options_of_the_blur_are_those_of_the_function(
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
 
 
+def test_method_reaches_the_function(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    methods = []
+
+    def spy(*arguments: Any, method: str, **options: Any) -> torch.Tensor:
+        methods.append(method)
+        return torchdof.depth_of_field(*arguments, method=method, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("torchdof.render.depth_of_field", spy)
+    for method in ("fold", "layered"):
+        run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", "--method", method)
+    assert methods == ["fold", "layered"]
+
+
 def test_alpha_goes_through_the_blur_premultiplied(scene: Path) -> None:
     alpha = torch.zeros(1, 1, HEIGHT, WIDTH)
     alpha[..., 4:12, 6:18] = 1.0

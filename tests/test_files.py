@@ -249,6 +249,12 @@ def test_layers_are_chosen_by_name(tmp_path: Path) -> None:
         read_image(path, layer="c")
 
 
+def test_plain_channels_come_before_those_of_layers(tmp_path: Path) -> None:
+    values = np.repeat(np.array([[[1, 1, 1, 2, 2, 2]]], np.float32), 2, axis=0)
+    path = store(tmp_path / "x.exr", values, "float", ("Albedo.R", "Albedo.G", "Albedo.B", "R", "G", "B"))
+    assert read_image(path).pixels.unique().tolist() == [2.0]
+
+
 def test_exr_keeps_its_place_in_the_full_frame(tmp_path: Path) -> None:
     spec = oiio.ImageSpec(4, 3, 3, "float")
     spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = -2, 5, 0, 0, 100, 50
@@ -323,6 +329,27 @@ def test_colour_picture_is_not_taken_for_depth_but_equal_channels_are(tmp_path: 
         read_values(path)
     store(path, np.repeat(np.full((2, 2, 1), 9, np.uint8), 3, axis=2), "uint8")
     assert read_values(path).unique().tolist() == [9.0]
+
+
+class Bomb:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.path,))
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize("suffix", [".npy", ".npz"])
+def test_pickled_objects_are_not_run(tmp_path: Path, suffix: str) -> None:
+    bombs = np.array([[Bomb(tmp_path / "ran")]], dtype=object)
+    path = tmp_path / f"x{suffix}"
+    np.save(path, bombs, allow_pickle=True) if suffix == ".npy" else np.savez(path, bombs)
+    with pytest.raises(ValueError, match="cannot be read as an array"):
+        read_values(path)
+    assert not (tmp_path / "ran").exists()
 
 
 PICKLE = np.array([[{"a": 1}]], dtype=object)

@@ -191,14 +191,14 @@ def write_image(
         if suffix in (".jpg", ".jpeg"):
             _reserve(part, array.size + 2**20)
         output = oiio.ImageOutput.create(str(part))
-        # A full disk shows only as a pending error, so it is asked for after every step.
-        done = output is not None and output.open(str(part), spec) and output.write_image(array)
-        problem = "" if output is None else output.geterror()
-        if output is not None:
-            done = output.close() and done
-            problem = problem or output.geterror()
+        if output is None or not output.open(str(part), spec):
+            problem = (oiio if output is None else output).geterror()
+            raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
+        done = output.write_image(array)
+        done = output.close() and done
+        problem = output.geterror()  # a full disk shows only here
         if not done or problem:
-            raise OSError(f"{path}: could not be written ({first_line(problem or oiio.geterror())})")
+            raise OSError(f"{path}: could not be written ({first_line(problem)})")
 
 
 def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
