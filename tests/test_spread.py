@@ -1,0 +1,221 @@
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as functional
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchdof import kernel, spread
+
+Tolerances = dict[torch.dtype, Any]
+Spread = Callable[[Tensor, Tensor], Tensor]
+BOTH = pytest.mark.parametrize("scatter", [spread.fold, spread.conv], ids=["fold", "conv"])
+REAL = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+
+
+def bank(*radii: float, size: int | None = None, dtype: torch.dtype = torch.float64) -> Tensor:
+    """One soft disc a channel: `[C, k, k]`."""
+    radius = torch.tensor(radii, dtype=torch.float64)
+    return kernel.softm(radius, radius / 10, b=0.7, m=2.0, size=size).to(dtype)
+
+
+@BOTH
+@REAL
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1), (1, 2, 1, 7), (2, 3, 6, 1), (2, 1, 5, 8)])
+@pytest.mark.parametrize("radius", [0.3, 1.2, 3.4, 9.0])
+def test_scatter_equals_a_plain_loop_over_pixels(
+    scatter: Spread,
+    dtype: torch.dtype,
+    shape: tuple[int, ...],
+    radius: float,
+    loops: ModuleType,
+    tolerances: Tolerances,
+) -> None:
+    light = torch.rand(shape, dtype=dtype)
+    kernels = bank(*(radius * (1 + 0.1 * c) for c in range(shape[1])), dtype=dtype)
+    expected = loops.scatter(light, lambda *_: kernels)
+    assert_close(scatter(light, kernels), expected.to(dtype), **tolerances[dtype])
+
+
+def test_fold_with_a_kernel_of_its_own_for_every_pixel_equals_a_plain_loop(loops: ModuleType) -> None:
+    light = torch.rand(2, 3, 5, 6, dtype=torch.float64)
+    kernels = kernel.disc(torch.tensor([0.0, 1.3, 2.4]), size=5).unsqueeze(1)
+    shares = torch.rand(2, 3, 5, 6, dtype=torch.float64)
+
+    def kernel_of(item: int, row: int, column: int) -> Tensor:
+        return (shares[item, :, row, column, None, None, None] * kernels).sum(0)
+
+    assert_close(spread.fold(light, kernels, shares), loops.scatter(light, kernel_of), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(("dtype", "limit"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
+@pytest.mark.parametrize("radius", [0.8, 5.5, 16.0])
+def test_fold_and_convolution_agree(dtype: torch.dtype, limit: float, radius: float) -> None:
+    light = 100 * torch.rand(1, 3, 40, 50, dtype=dtype) ** 8
+    kernels = bank(radius, 0.9 * radius, 0.8 * radius, dtype=dtype)
+    assert_close(spread.conv(light, kernels), spread.fold(light, kernels), rtol=limit, atol=0.0)
+
+
+@pytest.mark.parametrize(("dtype", "limit"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
+def test_a_very_large_kernel_goes_through_fourier_and_agrees_with_a_direct_sum(
+    dtype: torch.dtype, limit: float
+) -> None:
+    light, kernels = torch.rand(1, 2, 20, 110, dtype=dtype), bank(45.0, 40.0, dtype=dtype)
+    direct = functional.conv2d(light, kernels[:, None], padding=kernels.shape[-1] // 2, groups=2)
+    assert_close(spread.conv(light, kernels), direct, rtol=limit, atol=0.0)
+
+
+@pytest.mark.parametrize("radius", [2.0, 40.0])
+def test_a_highlight_changes_nothing_outside_its_own_disc(radius: float) -> None:
+    # the rounding of a Fourier transform in float32 would be seen all over the frame
+    dark = torch.full((1, 1, 9, 201), 0.1)
+    lit = dark.clone()
+    lit[..., 4, 100] = 6.5e4
+    kernels = kernel.disc(radius).unsqueeze(0).float()
+    apart = (torch.arange(201) - 100).abs() > radius + 1
+    assert_close(spread.conv(lit, kernels)[..., apart], spread.conv(dark, kernels)[..., apart], rtol=1e-6, atol=0.0)
+
+
+@BOTH
+@pytest.mark.parametrize("channels", [1, 3, 16, 17])
+def test_channels_are_spread_apart_from_each_other(scatter: Spread, channels: int) -> None:
+    light = torch.rand(1, channels, 7, 6, dtype=torch.float64)
+    kernels = bank(*(1.0 + 0.1 * c for c in range(channels)), size=7)
+    together = scatter(light, kernels)
+    for c in range(channels):
+        assert_close(together[:, c : c + 1], scatter(light[:, c : c + 1], kernels[c : c + 1]))
+
+
+@BOTH
+@REAL
+def test_light_far_from_the_border_keeps_its_energy(scatter: Spread, dtype: torch.dtype) -> None:
+    light = torch.zeros(1, 1, 35, 35, dtype=dtype)
+    light[..., 15:20, 15:20] = 50 * torch.rand(5, 5, dtype=dtype)
+    spread_out = scatter(light, bank(9.7, dtype=dtype))
+    assert float(spread_out.sum()) == pytest.approx(float(light.sum()), rel=1e-6 if dtype == torch.float32 else 1e-13)
+
+
+@BOTH
+def test_light_over_the_border_is_lost_and_nothing_comes_in(scatter: Spread) -> None:
+    light = torch.ones(1, 1, 6, 6, dtype=torch.float64)
+    kernels = bank(2.0)
+    out = scatter(light, kernels)
+    half = kernels.shape[-1] // 2
+    assert float(out[0, 0, 0, 0]) == pytest.approx(float(kernels[0, half:, half:].sum()), rel=1e-12)
+    assert (out <= 1.0 + 1e-12).all() and (out[..., 0, :] < 1.0).all()
+
+
+@BOTH
+def test_scatter_is_linear(scatter: Spread) -> None:
+    first, second = torch.rand(2, 1, 2, 8, 9, dtype=torch.float64)
+    kernels = bank(2.5, 1.5)
+    mixed = scatter(3.0 * first - 0.5 * second, kernels)
+    assert_close(mixed, 3.0 * scatter(first, kernels) - 0.5 * scatter(second, kernels))
+
+
+def test_the_adjoint_of_fold_is_unfold() -> None:
+    light, seen = torch.rand(2, 2, 3, 9, 7, dtype=torch.float64)
+    kernels = torch.rand(3, 5, 5, dtype=torch.float64)  # no symmetry: a scatter is not yet a gather
+    patches = functional.unfold(seen, (5, 5), padding=2).unflatten(1, (3, 25))
+    gathered = (patches * kernels.flatten(1)[None, :, :, None]).sum(2).unflatten(-1, (9, 7))
+    assert_close((spread.fold(light, kernels) * seen).sum(), (light * gathered).sum(), rtol=1e-12, atol=0.0)
+
+
+@BOTH
+def test_spreading_symmetric_kernels_is_its_own_adjoint(scatter: Spread) -> None:
+    light, seen = torch.rand(2, 2, 3, 9, 7, dtype=torch.float64)
+    kernels = bank(1.2, 2.1, 3.0)
+    assert_close((scatter(light, kernels) * seen).sum(), (light * scatter(seen, kernels)).sum(), rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_strips_agree_with_the_frame_as_a_whole(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    light, kernels = torch.rand(1, 2, 13, 6, dtype=torch.float64), bank(1.2, 2.1, size=7)
+    shares = torch.rand(1, 3, 13, 6, dtype=torch.float64)
+    each = kernel.disc(torch.tensor([0.0, 1.0, 3.4]), size=7).unsqueeze(1)
+    whole, whole_shared = spread.fold(light, kernels), spread.fold(light, each, shares)
+    strips = []
+
+    def counted(*arguments: Any, fold: Any = functional.fold) -> Tensor:
+        strips.append(arguments)
+        return fold(*arguments)
+
+    monkeypatch.setattr(functional, "fold", counted)
+    monkeypatch.setattr(spread, "_COLUMN_BYTES", rows * light[:, :, 0].numel() * 49 * 8)
+    assert_close(spread.fold(light, kernels), whole, rtol=1e-13, atol=1e-15)
+    assert len(strips) == math.ceil(13 / rows)
+    assert_close(spread.fold(light, each, shares), whole_shared, rtol=1e-13, atol=1e-15)
+
+
+@BOTH
+def test_scatter_is_differentiable_in_light_and_kernels(scatter: Spread) -> None:
+    light = torch.rand(1, 2, 4, 5, dtype=torch.float64, requires_grad=True)
+    half = torch.rand(2, 3, 3, dtype=torch.float64)
+    kernels = (half + half.flip(-1, -2)).requires_grad_()
+    assert torch.autograd.gradcheck(scatter, (light, kernels))
+
+
+def test_fold_is_differentiable_in_the_shares_across_strips(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spread, "_COLUMN_BYTES", 1)
+    light = torch.rand(1, 2, 3, 4, dtype=torch.float64, requires_grad=True)
+    kernels = torch.rand(2, 1, 3, 3, dtype=torch.float64, requires_grad=True)
+    shares = torch.rand(1, 2, 3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(spread.fold, (light, kernels, shares))
+
+
+@BOTH
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 2), st.integers(1, 4), st.floats(0.0, 12.0), st.booleans())
+def test_scatter_takes_any_shape_and_stride(
+    scatter: Spread, height: int, width: int, batch: int, channels: int, radius: float, strided: bool
+) -> None:
+    light = torch.rand(batch, channels, height, width, dtype=torch.float64)
+    if strided:
+        light = light.mT.contiguous(memory_format=torch.channels_last).mT[:, :, :: 2 if height > 1 else 1]
+    kernels = bank(*[radius] * channels)
+    out = scatter(light, kernels)
+    assert out.shape == light.shape
+    dense = light.contiguous()
+    columns = functional.conv2d(dense, kernels[:, None], padding=kernels.shape[-1] // 2, groups=channels)
+    assert_close(out, columns, rtol=1e-10, atol=1e-13)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("light", "kernels", "message"),
+    [
+        (torch.rand(3, 4, 4), torch.rand(1, 3, 3), r"light must be \[B, C, H, W\], got \[3, 4, 4\]"),
+        (torch.rand(1, 3, 4, 4), torch.rand(1, 4, 4), r"square with an odd width, got \[1, 4, 4\]"),
+        (torch.rand(1, 3, 4, 4), torch.rand(1, 3, 5), r"square with an odd width, got \[1, 3, 5\]"),
+        (torch.rand(1, 3, 4, 4), torch.rand(2, 3, 3), "kernels must have 1 or 3 channels as the light does, got 2"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(scatter: Spread, light: Tensor, kernels: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        scatter(light, kernels)
+
+
+FRAME_1080P = """
+import resource, torch
+from torchdof import kernel, spread
+light = torch.rand(1, 3, 1080, 1920)
+psf = kernel.disc(16.0).unsqueeze(0).float()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+spread.fold(light, psf)
+print(before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.hard
+def test_fold_of_a_1080p_frame_at_radius_16_stays_within_2_gb() -> None:
+    done = subprocess.run([sys.executable, "-c", FRAME_1080P], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    before, most = (int(kb) * 1024 for kb in done.stdout.split())
+    assert before < most < 2e9
