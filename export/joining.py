@@ -1,68 +1,181 @@
 """A depth estimator and a module in one graph, with everything between them spelled out."""
 
-import json
 import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import onnx
 import onnx.compose
-import onnx.parser
 import onnx.version_converter
+import onnx_ir
 
-from .metadata import PREFIX, facts_of, load
-from .verification import check_format, session
+from . import bridge
+from .graph import INPUTS, OUTPUT
+from .metadata import UNITS, facts_of, load, write_facts
+from .verification import TOLERANCE, check_format, session
 
 __all__ = ["chain"]
 
 Estimate = Literal["metric", "inverse", "relative-inverse"]
+Model = str | os.PathLike[str] | onnx.ModelProto
 
-_ENCODE = """
-<ir_version: {ir}, opset_import: ["": {opset}]>
-encode (float[B,3,H,W] image) => (float[B,3,h,w] encoded, float[B,3,H,W] light) {{
-    light = Identity(image)
-    zero = Constant<value = float {{0.0}}>()
-    one = Constant<value = float {{1.0}}>()
-    low = Constant<value = float {{0.0031308}}>()
-    slope = Constant<value = float {{12.92}}>()
-    power = Constant<value = float {{0.41666666}}>()
-    gain = Constant<value = float {{1.055}}>()
-    offset = Constant<value = float {{0.055}}>()
-    mean = Constant<value = float[1,3,1,1] {{{mean}}}>()
-    std = Constant<value = float[1,3,1,1] {{{std}}}>()
-    clipped = Clip(image, zero, one)
-    is_low = LessOrEqual(clipped, low)
-    line = Mul(clipped, slope)
-    curved = Pow(clipped, power)
-    raised = Mul(curved, gain)
-    curve = Sub(raised, offset)
-    display = Where(is_low, line, curve)
-    centred = Sub(display, mean)
-    normal = Div(centred, std)
-    {resize}
-}}
-"""
 
-_KEEP_SIZE = "encoded = Identity(normal)"
-_FIXED_SIZE = """
-    batch = Shape<start = 0, end = 2>(image)
-    frame = Constant<value_ints = [{height}, {width}]>()
-    size = Concat<axis = 0>(batch, frame)
-    encoded = Resize<mode = "linear", coordinate_transformation_mode = "half_pixel", antialias = 1>(normal, , , size)
-"""
+def chain(
+    depth_model: Model,
+    dof_model: Model,
+    path: str | os.PathLike[str],
+    *,
+    estimate: Estimate,
+    scale: float = 1.0,
+    shift: float = 0.0,
+    size: tuple[int, int] | None = None,
+    mean: Sequence[float] = (0.0, 0.0, 0.0),
+    std: Sequence[float] = (1.0, 1.0, 1.0),
+) -> None:
+    """Join a depth estimator's ONNX and a file of :func:`to_onnx` into one file: an image in, a photograph out.
 
-_DECODE = """
-<ir_version: {ir}, opset_import: ["": {opset}]>
-decode ({estimate} estimate, float[B,3,H,W] light) => (float[B,1,H,W] depth, float[B,3,H,W] image) {{
-    image = Identity(light)
-    zero = Constant<value = int64 {{0}}>()
-    estimate_shape = Shape(estimate)
-    one = Constant<value_ints = [1]>()
-    inner = Constant<value_ints = [-2]>()
-    batch_part = Shape<start = 0, end = 1>(estimate)
-    frame_part = Slice(estimate_shape, inner, far_end)
-    far_end = Constant<value_ints = [9223372036854775807]>()
-}}
-"""
+    The joint graph takes ``image [B, 3, H, W]`` in linear light, ``focus_m [B]`` and ``f_number [B]``, and gives ``out``
+    and the ``depth [B, 1, H, W]`` in metres that was used. The estimator sees the image clipped to [0, 1] and encoded as
+    sRGB, then ``(x - mean) / std``, resized to its own size.
+
+    Args:
+        depth_model: The estimator, a file or a loaded model: one float32 image ``[B, 3, h, w]`` in, one map
+            ``[B, h, w]`` or ``[B, 1, h, w]`` out.
+        dof_model: A file written by :func:`to_onnx`, or one loaded; it must take depth.
+        path: The file to write; it is verified against running the parts in turn and then moved into place.
+        estimate: What the estimator gives. ``"metric"``: depth, ``scale`` of it a metre. ``"inverse"``: inverse depth,
+            ``1 / z = scale * estimate + shift``, at infinity where that is not positive. ``"relative-inverse"``: inverse
+            depth up to an unknown scale and shift (as MiDaS and Depth Anything do); the graph then has two more inputs,
+            ``near_m [B]`` and ``far_m [B]``, which the nearest and the farthest pixel are put at.
+        scale: See ``estimate``.
+        shift: See ``estimate``.
+        size: ``(h, w)`` that the estimator wants; None takes what its input declares, or the image's own size where that
+            is free.
+        mean: What the estimator wants subtracted from its display-encoded input, per channel.
+        std: What it wants it divided by then.
+
+    Raises:
+        ValueError: If the models do not fit each other, or the joint graph is not valid or differs from its parts.
+        FileNotFoundError: If a file is missing.
+    """
+    if estimate not in ("metric", "inverse", "relative-inverse"):
+        raise ValueError(f"estimate must be 'metric', 'inverse' or 'relative-inverse', got {estimate!r}")
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
+    dof = dof_model if isinstance(dof_model, onnx.ModelProto) else load(dof_model)
+    facts = facts_of(dof, "dof_model")
+    if set(facts["inputs"]) != set(INPUTS["depth"]) or dof.graph.input[0].type.tensor_type.shape.dim[1].dim_value != 3:
+        raise ValueError(f"dof_model must take a depth and an image of 3 channels, it takes {facts['inputs']}")
+    opset, ir = _opset(dof), dof.ir_version
+    estimator, declared, rank = _prepare(depth_model, opset, ir)
+    size = size or declared
+    parts = [
+        bridge.encode(opset, ir, size, mean, std),
+        estimator,
+        bridge.decode(opset, ir, estimate, rank, scale, shift),
+        dof,
+    ]
+    joint = _join(parts)
+    facts["inputs"] = {value.name: UNITS[value.name].format(channels=3) for value in joint.graph.input}
+    facts["output"]["depth"] = UNITS["depth"]
+    facts["chain"] = {"estimate": estimate, "scale": scale, "shift": shift, "size": size}
+    facts["chain"] |= {"mean": list(mean), "std": list(std)}
+    write_facts(joint, facts)
+    _write(joint, parts, size or (42, 56), path)
+
+
+def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, tuple[int, int] | None, int]:
+    """The estimator in our version of ONNX, the input size it declares and the rank of its output."""
+    model = depth_model if isinstance(depth_model, onnx.ModelProto) else load(depth_model)
+    weights = {tensor.name for tensor in model.graph.initializer}
+    inputs = [value for value in model.graph.input if value.name not in weights]
+    if len(inputs) != 1 or len(model.graph.output) != 1:
+        raise ValueError(
+            f"depth_model must have one input and one output, it has {[v.name for v in inputs]} and "
+            f"{[v.name for v in model.graph.output]}; cut it down with onnx.utils.extract_model"
+        )
+    if _opset(model) > opset:
+        raise ValueError(
+            f"depth_model uses opset {_opset(model)}, dof_model {opset}: export that with opset={_opset(model)}"
+        )
+    given = [d.dim_value for d in inputs[0].type.tensor_type.shape.dim]
+    rank = len(model.graph.output[0].type.tensor_type.shape.dim)
+    if len(given) != 4 or given[1] not in (0, 3) or rank not in (3, 4):
+        raise ValueError(
+            f"depth_model must map [B, 3, h, w] to [B, h, w] or [B, 1, h, w], it takes {given} and gives rank {rank}"
+        )
+    if _opset(model) < opset:
+        model = onnx.version_converter.convert_version(model, opset)
+    else:
+        model = onnx.ModelProto.FromString(model.SerializeToString())
+    model.ir_version = ir
+    del model.graph.value_info[:]  # its names of sizes are not ours
+    return model, (given[2], given[3]) if given[2] and given[3] else None, rank
+
+
+def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
+    names = ("encode/", "estimator/", "decode/", "dof/")
+    encode, estimator, decode, dof = (
+        onnx.compose.add_prefix(part, name) for part, name in zip(parts, names, strict=True)
+    )
+    taken, given = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"
+    joint = onnx.compose.merge_models(
+        encode, estimator, [("encode/encoded", taken)], outputs=[given, "encode/light"]
+    )
+    joint = onnx.compose.merge_models(joint, decode, [(given, "decode/estimate"), ("encode/light", "decode/light")])
+    io_map = [("decode/depth", "dof/depth"), ("decode/image", "dof/image")]
+    joint = onnx.compose.merge_models(joint, dof, io_map, outputs=[f"dof/{OUTPUT}", "decode/depth"])
+    graph = onnx_ir.from_proto(joint)
+    for value in (*graph.graph.inputs, *graph.graph.outputs):
+        value.name = str(value.name).rpartition("/")[2]
+    joint = onnx_ir.to_proto(graph)
+    joint.producer_name, joint.producer_version = dof.producer_name, dof.producer_version
+    joint.graph.name = "estimated_depth_of_field"
+    return joint
+
+
+def _write(joint: onnx.ModelProto, parts: Sequence[onnx.ModelProto], size: tuple[int, int], path: Path) -> None:
+    handle, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".onnx", dir=path.parent)
+    os.close(handle)
+    try:
+        onnx.save_model(joint, part)
+        check_format(joint, part)
+        _compare(joint, part, parts, size)
+        os.chmod(part, 0o644)
+        os.replace(part, path)
+    except BaseException:
+        os.unlink(part)
+        raise
+
+
+def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto], size: tuple[int, int]) -> None:
+    """Run the joint graph and the parts in turn on noise of a size that is not the estimator's."""
+    frame = (size[0] + 14, 2 * size[1] - 28)
+    values = {"image": np.random.default_rng(4).random((1, 3, *frame), dtype=np.float32)}
+    for name, number in (("focus_m", 1.5), ("f_number", 4.0), ("near_m", 0.7), ("far_m", 30.0)):
+        values[name] = np.full(1, number, dtype=np.float32)
+    feed = {value.name: values[value.name] for value in joint.graph.input}
+    got = session(path).run([OUTPUT, "depth"], feed)
+    for part in parts:
+        with tempfile.TemporaryDirectory() as folder:
+            single = os.path.join(folder, "part.onnx")
+            onnx.save_model(part, single)
+            run = session(single)
+        names = [value.name for value in run.get_inputs()]
+        if part is parts[1]:
+            values[names[0]] = values["encoded"]
+        results = dict(zip([v.name for v in run.get_outputs()], run.run(None, {n: values[n] for n in names}), strict=True))
+        values |= {"estimate": next(iter(results.values()))} if part is parts[1] else results
+    for name, result in zip((OUTPUT, "depth"), got, strict=True):
+        expected = values[name]
+        error = float(np.nanmax(np.abs(result - expected) / np.maximum(np.abs(expected), 1.0)))
+        if result.shape != expected.shape or not error <= TOLERANCE:
+            raise ValueError(f"the joint graph differs from its parts run in turn: {name} by {error:g}")
+
+
+def _opset(model: onnx.ModelProto) -> int:
+    return next(entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx"))

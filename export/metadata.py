@@ -13,15 +13,17 @@ from torchdof.camera import Camera
 
 from .graph import OUTPUT, Portable
 
-__all__ = ["describe", "label", "table_hash"]
+__all__ = ["UNITS", "describe", "facts_of", "label", "load", "table_hash", "write_facts"]
 
 PREFIX = "torchdof."
-_UNITS = {
+UNITS = {
     "image": "[B, {channels}, H, W] float32, linear light, >= 0, any range",
     "depth": "[B, 1, H, W] float32, metres along the optical axis, inf allowed; NaN, zero and negative pass sharp",
     "coc_px": "[B, 1, H, W] float32, radius in pixels, negative in front of the focus plane; NaN passes sharp",
     "focus_m": "[B] float32, metres",
     "f_number": "[B] float32, focal length over aperture diameter",
+    "near_m": "[B] float32, metres at which the nearest pixel is put",
+    "far_m": "[B] float32, metres at which the farthest pixel is put",
 }
 
 
@@ -33,8 +35,8 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
     options = {k: v for k, v in dof._options(table=False).items() if k != "check"}
     facts: dict[str, Any] = {
         "version": _version(),
-        "inputs": {v.name: _UNITS[v.name].format(channels=channels) for v in model.graph.input},
-        "output": {OUTPUT: _UNITS["image"].format(channels=channels)},
+        "inputs": {v.name: UNITS[v.name].format(channels=channels) for v in model.graph.input},
+        "output": {OUTPUT: UNITS["image"].format(channels=channels)},
         "camera": {k: getattr(dof.camera, k) for k in Camera.__dataclass_fields__},
         "table": {"name": dof.table.name, "family": dof.table.family, "unit": dof.table.unit}
         | {"sha256": table_hash(dof.table)},
@@ -43,9 +45,14 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
         "layers": len(portable.plan.nodes),
         "opset": opset,
     }
+    write_facts(model, facts)
+
+
+def write_facts(model: onnx.ModelProto, facts: dict[str, Any]) -> None:
+    """Replace a model's metadata."""
+    del model.metadata_props[:]
     for key, value in facts.items():
-        entry = model.metadata_props.add()
-        entry.key, entry.value = PREFIX + key, json.dumps(value)
+        model.metadata_props.add(key=PREFIX + key, value=json.dumps(value))
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from .cases import Case, cases
 from .graph import INPUTS, OUTPUT, Portable
 from .metadata import facts_of, load, table_hash
 
-__all__ = ["TOLERANCE", "Row", "Verification", "session", "verify"]
+__all__ = ["TOLERANCE", "Row", "Verification", "check_format", "session", "verify"]
 
 TOLERANCE = 1e-5
 """Accepted difference from eager PyTorch, relative to the largest light within a kernel's reach."""
@@ -116,7 +116,7 @@ def verify(path: str | os.PathLike[str], dof: DepthOfField, *, large: bool = Fal
     facts = facts_of(model, str(path))
     inputs = "depth" if "depth" in facts["inputs"] else "coc_px"
     portable = Portable(dof, inputs, facts["width"])
-    _check_format(model, os.fspath(path))
+    check_format(model, os.fspath(path))
     _check_origin(facts, dof)
     channels = _check_interface(model, inputs)
     runner = session(path)
@@ -182,7 +182,12 @@ def _bank(portable: Portable, like: Tensor) -> list[Tensor]:
     return portable.plan.kernels(portable.dof.table, size, like.dtype, like.device)
 
 
-def _check_format(model: onnx.ModelProto, path: str) -> None:
+def check_format(model: onnx.ModelProto, path: str) -> None:
+    """Refuse a file that is not valid, needs other than standard operators, or is not whole.
+
+    Raises:
+        ValueError: Saying which.
+    """
     try:
         onnx.checker.check_model(path, full_check=True)
         onnx.shape_inference.infer_shapes(model, check_type=True, strict_mode=True, data_prop=True)
