@@ -30,8 +30,8 @@ def split_edges(image: Tensor, coc_px: Tensor, edge_px: float = 1.0) -> tuple[Su
     """Splits every pixel at a depth edge into the surface in front and the one behind.
 
     The light of both is estimated from the neighbours that lie wholly on one of them; the cover is the share that
-    explains the pixel, held by the outline that the depth map draws where the two look alike. What neither explains goes
-    to the surface whose light is less certain, so that no light is lost or made.
+    explains the pixel, held by the outline that the depth map draws where the two look alike. What neither explains
+    goes to the surface whose light is less certain, so that no light is lost or made.
 
     Args:
         image: ``[B, C, H, W]``, linear light, >= 0.

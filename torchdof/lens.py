@@ -87,7 +87,9 @@ class _Sample(NamedTuple):
         # place of each share rho^2 among the tabulated ones, linear in between
         where = rho**2 * (radii.shape[0] - 1)
         low = where.floor().long().clamp(max=radii.shape[0] - 2)
-        return cls(rho[:, None] * directions, directions, torch.lerp(radii[low], radii[low + 1], (where - low)[:, None]))
+        return cls(
+            rho[:, None] * directions, directions, torch.lerp(radii[low], radii[low + 1], (where - low)[:, None])
+        )
 
 
 def _radii(table: BlurTable, channel: int, nodes: Tensor, width: int) -> Tensor:

@@ -35,8 +35,8 @@ class LensViews(NamedTuple):
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        known: ``[B, 1, H, W]``, share of the views in [0, 1] that saw a surface. Below 1 something hidden, or outside the
-            frame, would have to be known.
+        known: ``[B, 1, H, W]``, share of the views in [0, 1] that saw a surface. Below 1 something hidden, or outside
+            the frame, would have to be known.
     """
 
     image: Tensor
@@ -74,8 +74,8 @@ def lens_views(
         image: ``[B, C, H, W]``, linear light.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres, > 0, ``inf`` allowed.
         camera: The camera.
-        table: Blur measured from a lens; None takes the ideal disc. A view at radius ``rho`` of the lens shifts a surface
-            by the radius that holds the share ``rho^2`` of its kernel's light, so that any radial kernel comes out.
+        table: Blur measured from a lens; None takes the ideal disc. A view at radius ``rho`` of the lens shifts a
+            surface by the radius that holds the share ``rho^2`` of its kernel's light: any radial kernel comes out.
         views: Points of the lens, well spread. The picture converges as they grow; a blur of radius ``r`` wants about
             ``r^2`` of them.
         surfaces: Further surfaces, such as what is hidden: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
@@ -169,13 +169,17 @@ def _average(
     limit = _BRIGHT * stack[0][0].mean()
     plain = [(light.clamp(max=limit), coc, cover) for light, coc, cover in stack]
     squares = _squares(plain)
-    excess = torch.cat([(light - limit).clamp_min(0.0)[0].flatten(1).T[cover.flatten() > 0] for light, _, cover in stack])
+    excess = torch.cat(
+        [(light.double() - limit).clamp_min(0.0)[0].flatten(1).T[cover.flatten() > 0] for light, _, cover in stack]
+    )
     bright = excess.amax(-1).nonzero()[:, 0]
     extra = excess[bright] * squares.cover[bright, None]
 
     count, channels = height * width, extra.shape[-1]
     device = extra.device
-    total, seen = torch.zeros(count, channels, device=device), torch.zeros(count, device=device)
+    # In float64 the mean of equal views is exact: what is in focus comes back unchanged.
+    total = torch.zeros(count, channels, dtype=torch.float64, device=device)
+    seen = torch.zeros(count, dtype=torch.float64, device=device)
     dice = torch.rand(squares.cover.shape, generator=torch.Generator().manual_seed(0)).to(device)
     for view in range(lens.views):
         # A square that covers 30 % of its pixel is there in 30 % of the views.
@@ -191,8 +195,8 @@ def _average(
         seen += covered > 0
         if bright.numel():
             _draw_points(total, front, squares, bright, extra, lens, view, height, width)
-    image = (total / seen.clamp_min(1.0)[:, None]).clamp_min(0.0)
-    return image.T.reshape(1, channels, height, width), (seen / lens.views).reshape(1, 1, height, width)
+    image = (total / seen.clamp_min(1.0)[:, None]).clamp_min(0.0).float()
+    return image.T.reshape(1, channels, height, width), (seen / lens.views).float().reshape(1, 1, height, width)
 
 
 def _squares(stack: Sequence[tuple[Tensor, Tensor, Tensor]]) -> _Squares:
@@ -219,7 +223,7 @@ def _sides(values: Tensor, coc: Tensor, dim: int) -> tuple[Tensor, Tensor]:
 
 
 def _coc_slope(coc: Tensor) -> Tensor:
-    """The steeper of both sides, so that squares of a curved surface overlap rather than leave cracks: ``[2, H, W]``."""
+    """The steeper of both sides, so that squares of a curved surface overlap, not crack: ``[2, H, W]``."""
     slopes = [torch.where(b.abs() > a.abs(), b, a) for b, a in (_sides(coc, coc, dim) for dim in (-1, -2))]
     return torch.cat(slopes, 1)[0]
 
@@ -274,7 +278,7 @@ def _draw_points(
     height: int,
     width: int,
 ) -> None:
-    """Adds light far above the mean from all the points of the lens that are nearest to this view, as this view sees it.
+    """Adds light far above the mean from all points of the lens that are nearest to this view, as it sees it.
 
     A highlight of one pixel is one dot in each view; without more points its disc would be a pattern of dots.
     """
