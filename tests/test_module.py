@@ -1,0 +1,549 @@
+import io
+import math
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as functional
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
+from torchdof.plan import Plan
+
+Tolerances = dict[torch.dtype, Any]
+TYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
+WAYS: list[dict[str, Any]] = [
+    {"method": "layered", "occlusion": True},
+    {"method": "layered", "occlusion": False},
+    {"method": "fold", "occlusion": True},
+    {"method": "fold", "occlusion": False},
+]
+EVERY_WAY = pytest.mark.parametrize("way", WAYS, ids=["layered-over", "layered-sum", "fold-over", "fold-sum"])
+TABLES = {
+    "disc": BlurTable.disc(),
+    "gaussian": BlurTable.gaussian(),
+    "sato_j15": BlurTable.load("sato_j15"),
+    "fraction": BlurTable("disc", [-0.1, 0.2], {"radius": [0.12, 0.1]}, unit="fraction"),
+    "colours": BlurTable("disc", [1.0], {"radius": [[1.0], [1.1], [1.25]]}),
+}
+
+
+def constant_map(value: float, image: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    return torch.full((1, 1, *image.shape[-2:]), value, dtype=dtype)
+
+
+def scene(height: int = 12, width: int = 17, reach: float = 4.0, seed: int = 1) -> tuple[Tensor, Tensor]:
+    """A random image and a coc of slopes, steps and noise from -reach to reach."""
+    generator = torch.Generator().manual_seed(seed)
+    image = 4 * torch.rand(1, 3, height, width, generator=generator) ** 4
+    slope = torch.linspace(-1, 1, width).expand(height, width).clone()
+    slope[height // 3 : height // 2] = -0.9
+    slope[-2:] += 0.3 * torch.randn(2, width, generator=generator)
+    return image, reach * slope.clamp(-1, 1)[None, None]
+
+
+def convolved(image: Tensor, kernels: Tensor) -> Tensor:
+    """Image convolved with a kernel `[1 or C, k, k]`, over the part of the kernel inside the frame; float64."""
+    image = image.double()
+    kernels = kernels.expand(image.shape[1], -1, -1)[:, None]
+    light, weight = (
+        functional.conv2d(x, kernels, padding=kernels.shape[-1] // 2, groups=len(kernels))
+        for x in (image, torch.ones_like(image))
+    )
+    return light / weight
+
+
+def encoded(light: Tensor) -> Tensor:
+    """As a display shows it: the sRGB curve of what lies in [0, 1]."""
+    light = light.double().clamp(0, 1)
+    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp_min(1e-9) ** (1 / 2.4) - 0.055)
+
+
+def rms(first: Tensor, second: Tensor) -> float:
+    return float((encoded(first) - encoded(second)).square().mean().sqrt())
+
+
+# A plane
+
+
+@EVERY_WAY
+@pytest.mark.parametrize("coc", [0.501, -0.7, 1.0, -1.37, 2.5, 3.999, -7.3, 12.75])
+def test_a_plane_is_the_normalised_convolution_with_its_kernel(coc: float, way: dict[str, Any]) -> None:
+    image = 10 * torch.rand(1, 3, 14, 19) ** 4
+    out = blur_by_coc(image, constant_map(coc, image), **way)
+    kernels = TABLES["disc"].kernels(torch.tensor([coc], dtype=torch.float32), 19)[0]
+    assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("coc", [-2.6, 4.3])
+def test_a_plane_is_convolved_with_the_kernel_of_the_table(name: str, coc: float) -> None:
+    image = torch.rand(1, 3, 13, 16)
+    kernels = TABLES[name].kernels(torch.tensor([coc]), 16)[0]
+    for way in WAYS:
+        out = blur_by_coc(image, constant_map(coc, image), table=TABLES[name], **way)
+        assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("coc", [-17.21, 24.3, 44.44])
+def test_a_strongly_blurred_plane_is_the_normalised_convolution_at_any_size(coc: float) -> None:
+    image = 10 * torch.rand(1, 1, 90, 120) ** 4
+    out = blur_by_coc(image, constant_map(coc, image))
+    kernels = TABLES["disc"].kernels(torch.tensor([coc]), 120)[0]
+    assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
+
+
+def test_a_plane_in_depth_is_convolved_with_the_disc_of_the_thin_lens() -> None:
+    camera = Camera(focal_length_mm=85.0, f_number=2.0, focus_m=1.5, sensor_width_mm=4.0)
+    image, depth = torch.rand(1, 3, 15, 20), torch.full((1, 1, 15, 20), 6.0)
+    radius = 0.085 / 2.0 / 2 * (1.5 * 0.085 / (1.5 - 0.085)) / (0.004 / 20) * (1 / 1.5 - 1 / 6.0)
+    out = DepthOfField(camera)(image, depth)
+    assert 4 < radius < 20
+    kernels = BlurTable.disc().kernels(torch.tensor([radius], dtype=torch.float64), 20)[0]
+    assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
+
+
+def test_a_plane_equals_a_plain_loop_over_its_pixels(loops: ModuleType) -> None:
+    image = torch.rand(1, 2, 6, 7, dtype=torch.float64)
+    kernels = TABLES["disc"].kernels(torch.tensor([2.3], dtype=torch.float64), 7)[0]
+    expected = loops.normalised_convolution(image, kernels)
+    for way in WAYS:
+        out = blur_by_coc(image, constant_map(2.3, image, torch.float64), **way)
+        assert_close(out, expected, rtol=1e-10, atol=1e-12)
+
+
+# Focus
+
+
+@EVERY_WAY
+@pytest.mark.parametrize("dtype", TYPES)
+def test_in_focus_plane_is_returned_bit_exact(way: dict[str, Any], dtype: torch.dtype) -> None:
+    image = (torch.rand(2, 3, 7, 9) * 1000).to(dtype)
+    depth = torch.full((1, 1, 7, 9), 2.0, dtype=dtype)
+    assert torch.equal(DepthOfField(Camera(focus_m=2.0), **way)(image, depth), image)
+
+
+@EVERY_WAY
+def test_what_is_blurred_less_than_half_a_pixel_is_returned_bit_exact(way: dict[str, Any]) -> None:
+    image = torch.rand(1, 3, 7, 9)
+    coc = torch.rand(1, 1, 7, 9) - 0.5
+    assert torch.equal(blur_by_coc(image, coc, **way), image)
+
+
+def test_the_picture_of_a_scene_in_focus_is_not_the_image_itself() -> None:
+    image = torch.rand(1, 3, 5, 5)
+    out = blur_by_coc(image, constant_map(0.0, image))
+    out += 1.0
+    assert float(image.max()) <= 1.0
+
+
+def test_sharp_pixels_far_from_any_blur_are_untouched() -> None:
+    image, coc = torch.rand(1, 3, 9, 40), torch.zeros(1, 1, 9, 40)
+    coc[..., 30:] = 3.2
+    assert_close(blur_by_coc(image, coc)[..., :20], image[..., :20], rtol=1e-6, atol=0.0)
+
+
+def test_a_sharp_foreground_is_not_bled_upon_by_a_blurred_background() -> None:
+    image, coc = torch.zeros(1, 1, 9, 30), torch.zeros(1, 1, 9, 30)
+    image[..., 15:], coc[..., 15:] = 1.0, 5.0
+    kept = blur_by_coc(image, coc)
+    assert_close(kept[..., :15], image[..., :15], rtol=0.0, atol=1e-6)
+    assert float(blur_by_coc(image, coc, occlusion=False)[..., 14].max()) > 0.05  # as the paper's own algorithm does
+
+
+def test_a_blurred_foreground_spreads_over_a_sharp_background() -> None:
+    image, coc = torch.zeros(1, 1, 9, 30), torch.zeros(1, 1, 9, 30)
+    image[..., :15], coc[..., :15] = 1.0, -5.0
+    row = blur_by_coc(image, coc)[0, 0, 4]
+    assert 0.2 < float(row[15]) < 0.8 and float(row[17]) > 0.02
+    assert (row[:-1] >= row[1:] - 1e-6).all() and float(row[22:].max()) < 1e-6
+
+
+# Sums
+
+
+@EVERY_WAY
+@pytest.mark.parametrize("value", [1.0, 0.37, 1e4, 1e-6])
+@pytest.mark.parametrize("reach", [0.8, 5.0, 30.0])
+def test_a_constant_image_stays_constant_at_any_depth(way: dict[str, Any], value: float, reach: float) -> None:
+    image, coc = scene(reach=reach)
+    flat = torch.full_like(image, value)
+    assert_close(blur_by_coc(flat, coc, **way), flat, rtol=1e-6, atol=0.0)
+
+
+@EVERY_WAY
+def test_a_constant_image_stays_constant_where_every_pixel_has_its_own_depth(way: dict[str, Any]) -> None:
+    flat = torch.ones(1, 3, 11, 13)
+    assert_close(blur_by_coc(flat, 5 * torch.randn(1, 1, 11, 13), **way), flat, rtol=1e-6, atol=0.0)
+
+
+@EVERY_WAY
+@pytest.mark.parametrize("coc", [-3.3, 6.0])
+def test_a_highlight_keeps_its_energy(way: dict[str, Any], coc: float) -> None:
+    image = torch.full((1, 1, 41, 41), 0.1)
+    dark = image.clone()
+    image[..., 20, 20] = 5000.0
+    out, without = (blur_by_coc(x, constant_map(coc, image), **way).double() for x in (image, dark))
+    assert float((out - without).sum()) == pytest.approx(4999.9, rel=1e-5)
+
+
+def test_the_plain_sum_keeps_all_light_at_any_depths() -> None:
+    image, coc = torch.zeros(1, 3, 30, 34), scene(30, 34, reach=5.0)[1]
+    image[..., 8:22, 8:26] = 100 * torch.rand(3, 14, 18)
+    for method in ("layered", "fold"):
+        out = blur_by_coc(image, coc, occlusion=False, normalize=False, method=method)
+        assert_close(out.double().sum((-2, -1)), image.double().sum((-2, -1)), rtol=1e-5, atol=0.0)
+
+
+@EVERY_WAY
+def test_light_never_turns_negative_nor_brighter_than_the_brightest(way: dict[str, Any]) -> None:
+    image, coc = scene(reach=9.0)
+    out = blur_by_coc(image, coc, **way)
+    assert (out >= 0).all() and float(out.max()) <= float(image.max()) * (1 + 1e-6)
+
+
+def test_a_border_is_not_darkened() -> None:
+    image = torch.ones(1, 1, 12, 16)
+    out = blur_by_coc(image, constant_map(5.0, image))
+    assert_close(out, image, rtol=1e-6, atol=0.0)
+    assert float(blur_by_coc(image, constant_map(5.0, image), occlusion=False, normalize=False)[..., 0, 0]) < 0.5
+
+
+# Against the paper's renderer, a plain loop
+
+
+@pytest.mark.parametrize("normalize", [True, False])
+@pytest.mark.parametrize("method", ["layered", "fold"])
+@pytest.mark.parametrize("name", ["disc", "sato_j15"])
+def test_accumulating_billboards_equals_a_plain_loop_over_pixels(
+    name: str, method: Any, normalize: bool, loops: ModuleType
+) -> None:
+    image, coc = (x.double() for x in scene(7, 9, reach=2.6))
+    nodes = list(Plan.of_scene(coc, 1 / 255).nodes)
+    options: dict[str, Any] = {"occlusion": False, "normalize": normalize, "method": method}
+    out = blur_by_coc(image, coc, table=TABLES[name], **options)
+    assert_close(out, loops.accumulate(image, coc, TABLES[name], nodes, normalize), rtol=1e-10, atol=1e-12)
+
+
+def test_kernels_between_layers_are_within_the_tolerance_of_a_kernel_for_every_pixel(loops: ModuleType) -> None:
+    image = functional.interpolate(torch.rand(1, 1, 5, 6), (10, 12), mode="bilinear")
+    coc = torch.linspace(-4, 3, 120).reshape(1, 1, 10, 12)
+    exact = loops.accumulate(image, coc, TABLES["disc"])
+    for tolerance in (1 / 255, 1 / 60, 1 / 20):
+        assert rms(blur_by_coc(image, coc, occlusion=False, tolerance=tolerance), exact) <= tolerance
+
+
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_fold_and_layered_render_the_same_picture(occlusion: bool, tolerances: Tolerances) -> None:
+    image, coc = scene(reach=7.0)
+    for dtype in (torch.float32, torch.float64):
+        pair = [
+            blur_by_coc(image.to(dtype), coc.to(dtype), occlusion=occlusion, method=method)
+            for method in ("layered", "fold")
+        ]
+        assert_close(pair[0], pair[1], **tolerances[dtype])
+
+
+@pytest.mark.parametrize("way", WAYS[:2], ids=["over", "sum"])
+def test_a_looser_tolerance_stays_within_it(way: dict[str, Any]) -> None:
+    image, coc = scene(24, 32, reach=9.0)
+    image = functional.avg_pool2d(image, 3, 1, 1)
+    dense = blur_by_coc(image, coc, tolerance=0.0, **way)
+    for tolerance in (1 / 255, 1 / 60, 1 / 20):
+        assert rms(blur_by_coc(image, coc, tolerance=tolerance, **way), dense) <= tolerance
+
+
+# Symmetries
+
+
+@EVERY_WAY
+def test_flips_and_quarter_turns_commute_with_rendering(way: dict[str, Any]) -> None:
+    image, coc = scene(reach=6.0)
+    out = blur_by_coc(image, coc, **way)
+    for move in (lambda x: x.flip(-1), lambda x: x.flip(-2), lambda x: x.rot90(1, (-2, -1)), lambda x: x.mT):
+        assert_close(blur_by_coc(move(image), move(coc), **way), move(out), rtol=1e-6, atol=1e-6)
+
+
+@EVERY_WAY
+def test_light_scales_the_picture(way: dict[str, Any]) -> None:
+    image, coc = scene(reach=6.0)
+    assert_close(blur_by_coc(1024 * image, coc, **way), 1024 * blur_by_coc(image, coc, **way), rtol=1e-6, atol=0.0)
+
+
+@EVERY_WAY
+def test_channels_do_not_see_each_other(way: dict[str, Any]) -> None:
+    image, coc = scene(reach=6.0)
+    together = blur_by_coc(image, coc, **way)
+    for c in range(3):
+        assert_close(blur_by_coc(image[:, c : c + 1], coc, **way), together[:, c : c + 1], rtol=1e-6, atol=1e-7)
+
+
+def test_channels_may_be_blurred_by_kernels_of_their_own() -> None:
+    image, coc = scene(reach=5.0)
+    for way in WAYS:
+        together = blur_by_coc(image, coc, table=TABLES["colours"], **way)
+        for c, scale in enumerate((1.0, 1.1, 1.25)):
+            alone = BlurTable("disc", [1.0], {"radius": [scale]})
+            one = blur_by_coc(image[:, c : c + 1], coc, table=alone, **way)
+            assert_close(together[:, c : c + 1], one, rtol=1e-5, atol=1e-6)
+
+
+# Cameras and batches
+
+
+@EVERY_WAY
+def test_items_with_cameras_of_their_own_equal_each_alone(way: dict[str, Any]) -> None:
+    image = torch.rand(3, 2, 9, 12)
+    depth = 0.6 + 4 * torch.rand(3, 1, 9, 12)
+    focus, stops = torch.tensor([0.7, 1.5, math.inf]), torch.tensor([1.2, 1.8, 4.0])
+    focal, sensor = torch.tensor([50.0, 85.0, 35.0]), torch.tensor([1.0, 2.0, 0.8])
+    together = DepthOfField(Camera(focal, stops, focus, sensor), **way)(image, depth)
+    for i in range(3):
+        one = slice(i, i + 1)
+        camera = Camera(float(focal[i]), float(stops[i]), float(focus[i]), float(sensor[i]))
+        assert_close(together[one], DepthOfField(camera, **way)(image[one], depth[one]), rtol=1e-6, atol=1e-6)
+
+
+def test_one_depth_map_serves_the_whole_batch() -> None:
+    image, depth = torch.rand(2, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
+    dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=1.0))
+    assert_close(dof(image, depth), dof(image, depth.expand(2, -1, -1, -1)), rtol=0.0, atol=0.0)
+
+
+def test_focus_and_aperture_of_the_call_override_those_of_the_camera() -> None:
+    image, depth = torch.rand(2, 3, 9, 12), 0.6 + 4 * torch.rand(2, 1, 9, 12)
+    dof = DepthOfField(Camera(focus_m=1.0, f_number=2.0, sensor_width_mm=1.0))
+    expected = DepthOfField(Camera(focus_m=3.0, f_number=1.0, sensor_width_mm=1.0))(image, depth)
+    assert_close(dof(image, depth, focus_m=3.0, f_number=1.0), expected, rtol=0.0, atol=0.0)
+    tensors = dof(image, depth, focus_m=torch.tensor([3.0, 3.0]), f_number=torch.tensor([1.0, 1.0]))
+    assert_close(tensors, expected, rtol=1e-6, atol=1e-6)
+    assert dof.camera.focus_m == 1.0
+
+
+def test_the_functional_form_is_the_module() -> None:
+    image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
+    camera, table = Camera(sensor_width_mm=1.0), BlurTable.gaussian()
+    expected = DepthOfField(camera, table, method="fold", occlusion=False)(image, depth, 1.2, 1.7)
+    out = depth_of_field(image, depth, camera, table=table, focus_m=1.2, f_number=1.7, method="fold", occlusion=False)
+    assert torch.equal(out, expected)
+    coc = camera.replace(focus_m=1.2, f_number=1.7).coc_px(depth, 12)
+    assert torch.equal(blur_by_coc(image, coc, table=table, method="fold", occlusion=False), expected)
+
+
+def test_a_plan_made_once_serves_a_whole_shot() -> None:
+    image, depth = torch.rand(1, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
+    dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=1.0))
+    plan = dof.plan(image, depth)
+    assert_close(dof(image, depth, plan=plan), dof(image, depth), rtol=1e-6, atol=1e-6)
+    assert torch.isfinite(dof(image, depth / 3, plan=plan)).all()
+
+
+# Types, shapes, strides
+
+
+@EVERY_WAY
+@pytest.mark.parametrize("dtype", TYPES)
+def test_the_result_has_the_type_of_the_image_and_its_precision(
+    way: dict[str, Any], dtype: torch.dtype, tolerances: Tolerances
+) -> None:
+    image, coc = scene(reach=5.0)
+    image = image.to(dtype)
+    out = blur_by_coc(image, coc, **way)
+    assert out.dtype == dtype and out.shape == image.shape
+    limits = dict(tolerances[dtype]) if dtype.itemsize == 2 else tolerances[torch.float32]
+    limits = {**limits, "rtol": limits["rtol"] + 1e-5}
+    assert_close(out.double(), blur_by_coc(image.double(), coc.double(), **way), **limits)
+
+
+@EVERY_WAY
+def test_double_precision_is_kept_throughout(way: dict[str, Any]) -> None:
+    image, coc = (x.double() for x in scene(reach=5.0))
+    out = blur_by_coc(image, coc, **way)
+    single = blur_by_coc(image.float(), coc.float(), **way)
+    assert_close(single.double(), out, rtol=1e-5, atol=1e-6)
+    assert_close(blur_by_coc(image.float(), coc, **way), out.float(), rtol=1e-6, atol=1e-7)
+    assert not torch.equal(single.double(), out)
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from([(1, 1), (1, 7), (8, 1), (3, 5), (6, 9), (2, 2)]),
+    st.integers(1, 2),
+    st.integers(1, 5),
+    st.sampled_from(TYPES),
+    st.sampled_from([0.0, 0.6, 2.0, 11.0]),
+    st.sampled_from(WAYS),
+    st.sampled_from(["plain", "channels_last", "transposed", "every other", "expanded"]),
+)
+def test_any_shape_type_and_stride_gives_the_picture_of_a_plain_tensor(
+    size: tuple[int, int], batch: int, channels: int, dtype: torch.dtype, reach: float, way: dict[str, Any], layout: str
+) -> None:
+    image = torch.rand(batch, channels, *size).to(dtype)
+    coc = reach * torch.randn(batch, 1, *size)
+    if layout == "channels_last":
+        image = image.contiguous(memory_format=torch.channels_last)
+    elif layout == "transposed":
+        image, coc = image.mT.contiguous().mT, coc.mT.contiguous().mT
+    elif layout == "every other":
+        image = image.repeat_interleave(2, -1)[..., ::2]
+    elif layout == "expanded":
+        image = image[:, :1].expand(-1, channels, -1, -1)
+    out = blur_by_coc(image, coc, **way)
+    assert out.shape == image.shape and out.dtype == dtype
+    assert torch.equal(out, blur_by_coc(image.clone(memory_format=torch.contiguous_format), coc.contiguous(), **way))
+    assert torch.isfinite(out).all()
+    low, high = (float(f(image.double())) for f in (torch.min, torch.max))
+    assert low * 0.99 - 1e-6 <= float(out.double().min()) and float(out.double().max()) <= high * 1.01 + 1e-6
+
+
+@EVERY_WAY
+def test_inputs_are_left_as_they_were(way: dict[str, Any]) -> None:
+    image, coc = scene()
+    kept = image.clone(), coc.clone()
+    blur_by_coc(image, coc, **way)
+    assert torch.equal(image, kept[0]) and torch.equal(coc, kept[1])
+
+
+# The module as a module
+
+
+def test_the_configuration_travels_with_the_state_dict() -> None:
+    camera = Camera(85.0, torch.tensor([1.4, 2.0]), 1.2, 24.0, focus_breathing=False)
+    dof = DepthOfField(camera, BlurTable.load("sato_j15"), 1 / 100, False, False, "fold", 20.0, False)
+    stored = io.BytesIO()
+    torch.save(dof.state_dict(), stored)
+    stored.seek(0)
+    other = DepthOfField(Camera())
+    other.load_state_dict(torch.load(stored, weights_only=True))
+    assert repr(other) == repr(dof)
+    image, depth = torch.rand(2, 3, 9, 12), 0.6 + 4 * torch.rand(2, 1, 9, 12)
+    assert torch.equal(other(image, depth), dof(image, depth))
+
+
+def test_a_module_can_be_moved_copied_and_put_in_a_sequence() -> None:
+    model = torch.nn.ModuleList([DepthOfField(Camera())]).to(torch.float64).eval()
+    image, depth = torch.rand(1, 3, 5, 6), torch.full((1, 1, 5, 6), 3.0)
+    assert model[0](image, depth).dtype == torch.float32
+    assert list(model.parameters()) == []
+
+
+def test_repr_tells_camera_table_and_options() -> None:
+    text = repr(DepthOfField(Camera(35.0, 1.4, 0.8), BlurTable.load("sato_j15"), method="fold"))
+    assert text.startswith("DepthOfField(")
+    for part in (
+        "35 mm, f/1.4, focus 0.8 m",
+        "'sato_j15', ring",
+        "tolerance=0.0039",
+        "method='fold'",
+        "occlusion=True",
+    ):
+        assert part in text
+
+
+# Compiled
+
+COMPILED: dict[str, Any] = {"max_coc_px": 3.0, "tolerance": 1 / 60}
+
+
+def compiled_case() -> tuple[Camera, Tensor, Tensor]:
+    torch.manual_seed(3)
+    camera = Camera(focus_m=1.5, f_number=2.0, sensor_width_mm=1.0)
+    return camera, torch.rand(1, 3, 10, 14), 1.0 + 2 * torch.rand(1, 1, 10, 14)
+
+
+@pytest.mark.parametrize(
+    ("backend", "way"),
+    [
+        ("eager", WAYS[0]),
+        ("eager", WAYS[1]),
+        ("eager", WAYS[3]),
+        pytest.param("inductor", WAYS[0], marks=pytest.mark.hard),
+    ],
+)
+def test_compiled_without_a_break_equals_eager(backend: str, way: dict[str, Any]) -> None:
+    torch.compiler.reset()
+    camera, image, depth = compiled_case()
+    dof = DepthOfField(camera, **COMPILED, **way)
+    fast = torch.compile(dof, fullgraph=True, backend=backend)(image, depth)
+    assert not torch.equal(fast, image)
+    still = dof(image, depth, plan=Plan.all(COMPILED["max_coc_px"], COMPILED["tolerance"]))
+    assert_close(fast, still, rtol=1e-5, atol=1e-6)
+    assert rms(fast, dof(image, depth)) <= 2 * COMPILED["tolerance"]
+
+
+# Refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"image": torch.rand(3, 4, 5)}, r"image must be \[B, C, H, W\].*got \[3, 4, 5\]; did you forget the batch"),
+        (
+            {"image": torch.zeros(1, 3, 4, 5, dtype=torch.uint8)},
+            "image must be floating point.*torch.uint8; decode",
+        ),
+        ({"image": [[1.0]]}, "image must be a tensor .*got list"),
+        ({"image": torch.rand(1, 3, 0, 5)}, "image must have at least one pixel"),
+        ({"depth": torch.ones(1, 4, 5)}, r"depth must be \[1, 1, 4, 5\].*did you forget the channel dimension"),
+        ({"depth": torch.ones(1, 1, 5, 4)}, r"depth must be \[1, 1, 4, 5\].* got \[1, 1, 5, 4\]"),
+        ({"depth": torch.ones(2, 1, 4, 5)}, r"depth must be \[1, 1, 4, 5\].* got \[2, 1, 4, 5\]"),
+        ({"depth": torch.ones(1, 3, 4, 5)}, r"depth must be \[1, 1, 4, 5\].* got \[1, 3, 4, 5\]"),
+        ({"depth": torch.ones(1, 1, 4, 5, dtype=torch.int64)}, "depth must be .*floating point, got a torch.int64"),
+        ({"depth": 2.0}, "depth must be .*got float"),
+        ({"depth": torch.ones(1, 1, 4, 5, device="meta")}, "depth must be on the image's device cpu, got meta"),
+        ({"depth": torch.zeros(1, 1, 4, 5)}, "depth must be > 0 .* 20 of 20 pixels .*fill the holes"),
+        ({"depth": torch.full((1, 1, 4, 5), math.nan)}, "depth must be > 0"),
+        ({"image": torch.full((1, 3, 4, 5), math.nan)}, "image must be finite, got 60 of 60"),
+        ({"image": torch.full((1, 3, 4, 5), math.inf)}, "image must be finite"),
+        ({"focus_m": 0.01}, "focus_m must be longer than the focal length"),
+        ({"f_number": -1.0}, "f_number must be positive"),
+        ({"focus_m": torch.tensor([1.0, 2.0])}, r"must be \[1, 1, 4, 5\].* got \[2, 1, 4, 5\]"),
+    ],
+)
+def test_wrong_input_is_refused_in_one_sentence(changes: dict[str, Any], message: str) -> None:
+    arguments: dict[str, Any] = {"image": torch.rand(1, 3, 4, 5), "depth": torch.ones(1, 1, 4, 5), **changes}
+    with pytest.raises(ValueError, match=message):
+        DepthOfField(Camera())(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"camera": 50.0}, "camera must be a torchdof.Camera, got float"),
+        ({"table": "disc"}, "table must be a torchdof.BlurTable, got str; read a file with .load()"),
+        ({"tolerance": -0.1}, r"tolerance must be a number in \[0, 1\)"),
+        ({"tolerance": 1.0}, "tolerance must be"),
+        ({"tolerance": math.nan}, "tolerance must be"),
+        ({"tolerance": True}, "tolerance must be"),
+        ({"method": "scatter"}, "method must be 'layered' or 'fold', got 'scatter'"),
+        ({"normalize": False}, "normalize=False is the plain sum of occlusion=False"),
+        ({"max_coc_px": 0.5}, "max_coc_px must be a radius above 0.5 pixels"),
+        ({"max_coc_px": math.inf}, "max_coc_px must be"),
+        ({"max_coc_px": math.nan}, "max_coc_px must be"),
+    ],
+)
+def test_a_wrong_option_is_refused_by_name(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}"):
+        DepthOfField(**{"camera": Camera(), **options})
+
+
+@pytest.mark.parametrize(
+    ("coc", "message"),
+    [
+        (torch.full((1, 1, 4, 5), math.nan), "coc_px must be finite, got 20 of 20"),
+        (torch.full((1, 1, 4, 5), -math.inf), "coc_px must be finite"),
+        (torch.zeros(4, 5), r"coc_px must be \[1, 1, 4, 5\].* in pixels"),
+    ],
+)
+def test_a_wrong_coc_is_refused(coc: Tensor, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        blur_by_coc(torch.rand(1, 3, 4, 5), coc)
+
+
+def test_a_table_of_other_channels_than_the_image_is_refused() -> None:
+    with pytest.raises(ValueError, match="the table blurs 3 channels, the image has 1"):
+        blur_by_coc(torch.rand(1, 1, 4, 5), torch.zeros(1, 1, 4, 5), table=TABLES["colours"])

@@ -1,0 +1,71 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchdof.plan import Plan, spacing
+
+TOLERANCE = st.sampled_from([0.0, 1 / 1000, 1 / 255, 1 / 60, 1 / 20, 0.5])
+
+
+def coc_map(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64).reshape(1, 1, 1, -1)
+
+
+def largest_gaps(plan: Plan) -> list[tuple[float, float]]:
+    """Each gap between layers with the place of its inner end."""
+    pairs = zip(plan.nodes, plan.nodes[1:], strict=False)
+    return [(high - low, min(abs(low), abs(high))) for low, high in pairs]
+
+
+def test_a_plane_gets_one_layer_at_its_own_coc() -> None:
+    assert Plan.of_scene(coc_map(3.37, 3.37), 1 / 255).coc_px == pytest.approx((3.37,))
+    assert Plan.of_scene(coc_map(-3.37), 1 / 255).coc_px == pytest.approx((-3.37,))
+
+
+def test_a_scene_in_focus_gets_the_one_sharp_layer() -> None:
+    assert Plan.of_scene(coc_map(-0.5, 0.0, 0.31, 0.5), 1 / 255).nodes == (0.0,)
+
+
+@given(st.lists(st.floats(-300.0, 300.0), min_size=1, max_size=5), TOLERANCE)
+def test_layers_increase_and_span_the_scene(coc: list[float], tolerance: float) -> None:
+    scene = torch.tensor(coc, dtype=torch.float64).reshape(1, 1, 1, -1).expand(1, 1, 200, -1)
+    plan = Plan.of_scene(scene, tolerance)
+    blur = [math.copysign(max(abs(c) - 0.5, 0.0), c) for c in coc]
+    assert all(low < high for low, high in zip(plan.nodes, plan.nodes[1:], strict=False))
+    assert plan.nodes[0] == pytest.approx(min(blur), abs=1e-9) and plan.nodes[-1] == pytest.approx(max(blur), abs=1e-9)
+    if min(blur) < 0 < max(blur):
+        assert 0.0 in plan.nodes  # what is in focus passes through one sharp layer
+
+
+@given(st.floats(0.6, 200.0), TOLERANCE)
+def test_gaps_between_layers_keep_to_the_spacing_of_the_tolerance(reach: float, tolerance: float) -> None:
+    for plan in (Plan.of_scene(coc_map(-reach, reach), tolerance), Plan.all(reach, tolerance)):
+        for gap, inner in largest_gaps(plan):
+            assert gap <= spacing(inner, tolerance) + 0.3 * spacing(inner + gap, tolerance) + 1e-9
+
+
+def test_layers_lie_farther_apart_for_a_looser_tolerance_and_a_larger_blur() -> None:
+    counts = [len(Plan.all(60.0, tolerance).nodes) for tolerance in (0.0, 1 / 255, 1 / 60, 1 / 20)]
+    assert counts == sorted(counts, reverse=True) and len(set(counts)) > 2
+    assert spacing(0.0, 1 / 255) < spacing(10.0, 1 / 255) < spacing(50.0, 1 / 255)
+
+
+def test_the_plan_of_every_scene_reaches_its_radius_on_both_sides() -> None:
+    plan = Plan.all(12.0, 1 / 255)
+    assert plan.coc_px[0] == pytest.approx(-12.0) and plan.coc_px[-1] == pytest.approx(12.0)
+    assert [-x for x in reversed(plan.nodes)] == list(plan.nodes) and 0.0 in plan.nodes
+
+
+def test_layers_for_gradients_do_not_move_with_the_scene() -> None:
+    first, second = (Plan.still(coc_map(-3.0, reach), 1 / 255) for reach in (5.1, 5.1001))
+    assert first.nodes == second.nodes
+    assert first.nodes[0] <= -2.5 and first.nodes[-1] >= 4.6
+
+
+def test_a_bad_coc_does_not_plan() -> None:
+    assert Plan.of_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255).nodes[-1] == pytest.approx(2.5)
+    reaching = Plan.of_scene(coc_map(-math.inf, math.inf), 1 / 20)
+    assert all(math.isfinite(x) for x in reaching.nodes)
