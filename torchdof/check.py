@@ -1,33 +1,52 @@
 """Checks at the public boundary: what was expected, what came, what to do."""
 
+import dataclasses
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from .table import BlurTable
 
-__all__ = ["image_and_coc", "image_and_depth", "options"]
+__all__ = ["Border", "Method", "Options", "image_and_coc", "image_and_depth"]
+
+Method = Literal["layered", "fold"]
+Border = Literal["normalize", "extend"]
 
 
-def options(
-    table: BlurTable, tolerance: float, occlusion: bool, normalize: bool, method: str, max_coc_px: float
-) -> None:
-    """Refuse options of a rendering that make no sense.
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Options of a rendering; their meaning is told at :class:`torchdof.DepthOfField`.
 
     Raises:
-        ValueError: Naming the option.
+        ValueError: Naming the option that makes no sense.
     """
-    if not isinstance(table, BlurTable):
-        raise ValueError(f"table must be a torchdof.BlurTable, got {type(table).__name__}; read a file with .load()")
-    if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < 1:
-        raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, got {tolerance!r}")
-    if method not in ("layered", "fold"):
-        raise ValueError(f"method must be 'layered' or 'fold', got {method!r}")
-    if occlusion and not normalize:
-        raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
-    if not 0.5 < max_coc_px < math.inf:
-        raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {max_coc_px!r}")
+
+    table: BlurTable
+    tolerance: float
+    occlusion: bool
+    normalize: bool
+    method: Method
+    border: Border
+    max_coc_px: float
+    check: bool
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.table, BlurTable):
+            got = type(self.table).__name__
+            raise ValueError(f"table must be a torchdof.BlurTable, got {got}; read a file with BlurTable.load()")
+        tolerance = self.tolerance
+        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < 1:
+            raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, got {tolerance!r}")
+        if self.method not in ("layered", "fold"):
+            raise ValueError(f"method must be 'layered' or 'fold', got {self.method!r}")
+        if self.border not in ("normalize", "extend"):
+            raise ValueError(f"border must be 'normalize' or 'extend', got {self.border!r}")
+        if self.occlusion and not self.normalize:
+            raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
+        if not 0.5 < self.max_coc_px < math.inf:
+            raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {self.max_coc_px!r}")
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:

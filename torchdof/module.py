@@ -1,19 +1,21 @@
 """Depth of field as a module and as functions: the chain of the other rooms and nothing else."""
 
-from typing import Any, Literal
+import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from . import background, composite, layers
 from . import check as checks
-from . import composite, layers, spread
 from .camera import Camera
+from .check import Border, Method, Options
+from .frame import Frame, Sample
 from .plan import Plan
+from .spread import layers_by_conv, layers_by_fold
 from .table import BlurTable
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
-
-Method = Literal["layered", "fold"]
 
 
 class DepthOfField(nn.Module):
@@ -22,12 +24,14 @@ class DepthOfField(nn.Module):
     Args:
         camera: The camera; its focus and f-number can be overridden in each call.
         table: Blur measured from a lens; None takes the ideal disc.
-        tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and
-            full resolution. 0 asks for that rendering itself.
+        tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
+            and full resolution. 0 asks for that rendering itself.
         occlusion: True composites layers far to near, so that blurred foregrounds cover what is behind and sharp ones
             are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
         normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.
         method: ``"layered"`` spreads layers by convolution (fast); ``"fold"`` by the paper's literal scatter.
+        border: ``"normalize"`` counts only light that was seen: what is outside the frame is unknown and weighs
+            nothing. ``"extend"`` continues the light at the frame's border outwards, as if it were known.
         max_coc_px: Largest radius that a static plan (compiled, exported) covers; larger ones are rendered with it.
         check: Look for NaN and non-positive depths and non-finite light before rendering, and refuse them. False skips
             that (and its cost); a pixel with a bad depth then passes through sharp and touches nothing else.
@@ -53,6 +57,7 @@ class DepthOfField(nn.Module):
         occlusion: bool = True,
         normalize: bool = True,
         method: Method = "layered",
+        border: Border = "normalize",
         max_coc_px: float = 64.0,
         check: bool = True,
     ) -> None:
@@ -60,10 +65,10 @@ class DepthOfField(nn.Module):
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
         table = BlurTable.disc() if table is None else table
-        checks.options(table, tolerance, occlusion, normalize, method, max_coc_px)
+        Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)  # says what is wrong
         self.camera, self.table = camera, table
         self.tolerance, self.occlusion, self.normalize = float(tolerance), bool(occlusion), bool(normalize)
-        self.method, self.max_coc_px, self.check = method, float(max_coc_px), bool(check)
+        self.method, self.border, self.max_coc_px, self.check = method, border, float(max_coc_px), bool(check)
 
     def forward(
         self,
@@ -135,7 +140,7 @@ class DepthOfField(nn.Module):
         return f"{self.camera!r},\n{self.table!r},\n{options}"
 
     def _options(self, table: bool = True) -> dict[str, Any]:
-        names = ("table", "tolerance", "occlusion", "normalize", "method", "max_coc_px", "check")
+        names = ("table", "tolerance", "occlusion", "normalize", "method", "border", "max_coc_px", "check")
         return {name: getattr(self, name) for name in names[0 if table else 1 :]}
 
 
@@ -185,6 +190,7 @@ def blur_by_coc(
     occlusion: bool = True,
     normalize: bool = True,
     method: Method = "layered",
+    border: Border = "normalize",
     max_coc_px: float = 64.0,
     check: bool = True,
     plan: Plan | None = None,
@@ -199,6 +205,7 @@ def blur_by_coc(
         occlusion: As in :class:`DepthOfField`.
         normalize: As in :class:`DepthOfField`.
         method: As in :class:`DepthOfField`.
+        border: As in :class:`DepthOfField`.
         max_coc_px: As in :class:`DepthOfField`.
         check: As in :class:`DepthOfField`; a bad coc is NaN.
         plan: Layers to render with; None plans for this image.
@@ -215,50 +222,65 @@ def blur_by_coc(
         torch.Size([1, 3, 8, 12])
     """
     table = BlurTable.disc() if table is None else table
-    checks.options(table, tolerance, occlusion, normalize, method, max_coc_px)
+    options = Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)
     checks.image_and_coc(image, coc_px, table, values=check)
-    wide = image.dtype if image.dtype in (torch.float32, torch.float64) else torch.float32
-    wide = torch.promote_types(wide, coc_px.dtype) if coc_px.dtype == torch.float64 else wide
+    wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     light, coc = image.to(wide), coc_px.to(wide).expand(image.shape[0], -1, -1, -1)
-    traced = torch.compiler.is_compiling() or torch.compiler.is_exporting()
-    still = traced or plan is not None or (torch.is_grad_enabled() and coc_px.requires_grad)
-    if still:
-        if plan is None:
-            plan = Plan.all(max_coc_px, tolerance) if traced else Plan.still(coc, tolerance)
-        out = _render(light, coc, plan, table, occlusion, normalize, method, check)
-    else:
-        # each item has its own layers, as it would have alone
-        items = [
-            _render(light[i : i + 1], coc[i : i + 1], Plan.of_scene(coc[i : i + 1], tolerance), table, occlusion,
-                    normalize, method, check)
-            for i in range(image.shape[0])
-        ]  # fmt: skip
-        out = items[0] if len(items) == 1 else torch.cat(items)
-    return out.to(image.dtype)
+    if plan is None and _traced():
+        plan = Plan.all(max_coc_px, tolerance)
+    elif plan is None and torch.is_grad_enabled() and coc_px.requires_grad:
+        plan = Plan.still(coc, tolerance)
+    if plan is not None:
+        return _render(light, coc, plan, options).to(image.dtype)
+    # each item has its own layers, as it would have alone
+    pairs = zip(light.split(1), coc.split(1), strict=True)
+    items = [_render(one, its_coc, Plan.of_scene(its_coc, tolerance), options) for one, its_coc in pairs]
+    return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
 
 
-def _render(
-    light: Tensor,
-    coc: Tensor,
-    plan: Plan,
-    table: BlurTable,
-    occlusion: bool,
-    normalize: bool,
-    method: Method,
-    check: bool,
-) -> Tensor:
+def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
     if plan.nodes == (0.0,):
         return light.clone()
-    valid = None
-    if not check:
-        valid = torch.isfinite(coc)
-        coc = torch.where(valid, coc, 0.0)
-    x = layers.blur_axis(coc).clamp(plan.nodes[0], plan.nodes[-1])
-    bank = plan.kernels(table, light.shape[-2:], light.dtype, light.device)
-    sample = (light, x, None if valid is None else valid.to(light.dtype))
-    scatter = spread.conv if method == "layered" else spread.fold
-    if occlusion:
-        out = composite.over([sample], plan.nodes, bank, scatter)
+    image, valid = light, None
+    if not options.check:
+        valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
+        coc, light = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0)
+    weight = None if valid is None else valid.to(light.dtype)
+    layered = options.method == "layered"
+    blurs = plan.blurs(options.table, light.shape[-2:], light.dtype, light.device, coarse=layered)
+    surfaces = [(light, coc, weight)]
+    if options.occlusion and len(plan.nodes) > 1:
+        surfaces = _surfaces(light, coc, weight, plan)
+    first, last = plan.nodes[0], plan.nodes[-1]
+    samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
+    moves = torch.is_grad_enabled() and (light.requires_grad or coc.requires_grad)
+    frame = Frame(
+        samples,
+        margin=max(blur.halo for blur in blurs),
+        align=max(blur.scale for blur in blurs),
+        tiled=layered and not _traced() and not moves and light.shape[0] == 1,
+        extend=options.border == "extend",
+    )
+    spread = layers_by_conv if layered else layers_by_fold
+    if options.occlusion:
+        out = composite.over(frame, plan, blurs, spread)
     else:
-        out = composite.accumulate([sample], plan.nodes, bank, scatter, normalize)
-    return out if valid is None else torch.where(valid, out, light)
+        out = composite.accumulate(frame, plan, blurs, spread, options.normalize)
+    return out if valid is None else torch.where(valid, out, image)
+
+
+def _surfaces(
+    light: Tensor, coc: Tensor, weight: Tensor | None, plan: Plan
+) -> list[tuple[Tensor, Tensor, Tensor | None]]:
+    """What each pixel shows and hides: its own surface, and the second one of mixed pixels or behind a blurred one."""
+    own, other, other_coc, share = background.split_mixed(light, coc, weight)
+    levels = max(1, math.ceil(math.log2(max(abs(c) for c in plan.coc_px))) + 1)
+    seen = 1.0 - share
+    other, other_coc, share = background.fill_hidden(own, coc, other, other_coc, share, weight, min(levels, 7))
+    if weight is not None:
+        seen, share = seen * weight, share * weight
+    return [(own, coc, seen), (other, other_coc, share)]
+
+
+def _traced() -> bool:
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()

@@ -10,10 +10,12 @@ from torch import Tensor
 from .layers import blur_axis, from_blur_axis
 from .table import BlurTable
 
-__all__ = ["Plan"]
+__all__ = ["Blur", "Plan"]
 
 _FINEST_SPACING = 0.5
 _SPACING = 5.0
+_COARSE_RADIUS = 4.0  # a layer of this radius is blurred at full resolution, of twice of it at half, at 1/255
+_COARSEST = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,22 +68,53 @@ class Plan:
         """Signed coc of the layers, near to far."""
         return tuple(from_blur_axis(x) for x in self.nodes)
 
-    def kernels(
-        self, table: BlurTable, size: tuple[int, int], dtype: torch.dtype, device: torch.device
-    ) -> list[Tensor]:
-        """Kernel of each layer, ``[channels, k, k]``, for a frame of ``size`` (height, width) and no larger than it needs.
+    def blurs(
+        self, table: BlurTable, size: tuple[int, int], dtype: torch.dtype, device: torch.device, coarse: bool
+    ) -> "list[Blur]":
+        """Kernel and resolution of each layer, for a frame of ``size`` (height, width).
 
         Traced code holds the kernels as constants, so a table that is tied to the width of the image ties it as well.
         """
         width = 1 if table.unit == "relative" else int(size[1])
+        scales = [self._scale(coc) if coarse else 1 for coc in self.coc_px]
         if torch.compiler.is_compiling():
-            sizes = _constant_sizes(table, self.coc_px, width)
-            flat = (
-                _constant_bank(table, self.coc_px, width).to(device, dtype).split([s[0] * s[1] * s[2] for s in sizes])
-            )
-            return [kernel.reshape(shape) for kernel, shape in zip(flat, sizes, strict=True)]
-        largest = 2 * max(size) - 1
-        return [_cut(_kernel(table, coc, width), largest).to(device, dtype) for coc in self.coc_px]
+            shapes = _constant_shapes(table, self.coc_px, width, tuple(scales))
+            flat = _constant_bank(table, self.coc_px, width, tuple(scales)).to(device, dtype)
+            parts = flat.split([shape[0] * shape[1] * shape[2] for shape in shapes])
+            bank = [kernel.reshape(shape) for kernel, shape in zip(parts, shapes, strict=True)]
+        else:
+            largest = 2 * max(size) - 1
+            bank = [_kernel(table, c, width, s) for c, s in zip(self.coc_px, scales, strict=True)]
+            bank = [_cut(kernel, largest).to(device, dtype) for kernel in bank]
+        return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+
+    def _scale(self, coc_px: float) -> int:
+        """Resolution a layer is blurred at: every ``scale``-th pixel, a power of two."""
+        free = abs(coc_px) / _COARSE_RADIUS * math.sqrt(self.tolerance * 255.0)
+        return 2 ** min(_COARSEST, max(0, math.floor(math.log2(free)))) if free >= 2 else 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Blur:
+    """How one layer is scattered.
+
+    Args:
+        kernel: ``[1 or C, k, k]``, in pixels of the layer's resolution.
+        scale: The layer is spread at every ``scale``-th pixel.
+    """
+
+    kernel: Tensor
+    scale: int
+
+    @property
+    def half(self) -> int:
+        """Pixels of the layer's resolution that the kernel reaches to each side."""
+        return self.kernel.shape[-1] // 2
+
+    @property
+    def halo(self) -> int:
+        """Pixels of the image around a window that the layer needs."""
+        return self.half if self.scale == 1 else self.scale * (self.half + 1)
 
 
 def spacing(x: float, tolerance: float) -> float:
@@ -111,19 +144,29 @@ def _span(coc_px: Tensor) -> tuple[float, float]:
 
 
 @functools.lru_cache(maxsize=512)
-def _kernel(table: BlurTable, coc_px: float, width: int) -> Tensor:
-    return table.kernels(torch.tensor([coc_px], dtype=torch.float64), width)[0]
+def _kernel(table: BlurTable, coc_px: float, width: int, scale: int) -> Tensor:
+    coc = torch.tensor([coc_px / scale], dtype=torch.float64)
+    kernel = table.kernels(coc, width / scale)[0]
+    if scale > 1:
+        # averaging, interpolation and the coarser pixel blur as well: leave that much out, by second moments
+        axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
+        variance = float((kernel.mean(0).sum(0) * axis**2).sum()) - 1 / 12
+        shrink = math.sqrt(max(0.25, 1 - (1 / 3 - 1 / (12 * scale**2)) / variance))
+        kernel = table.kernels(coc * shrink, width / scale)[0]
+    return kernel
 
 
 # one constant each: a compiled graph cannot hold several results of one such function
 @torch.compiler.assume_constant_result
-def _constant_sizes(table: BlurTable, coc_px: tuple[float, ...], width: int) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(_kernel(table, coc, width).shape) for coc in coc_px)
+def _constant_shapes(
+    table: BlurTable, coc_px: tuple[float, ...], width: int, scales: tuple[int, ...]
+) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(_kernel(table, c, width, s).shape) for c, s in zip(coc_px, scales, strict=True))
 
 
 @torch.compiler.assume_constant_result
-def _constant_bank(table: BlurTable, coc_px: tuple[float, ...], width: int) -> Tensor:
-    return torch.cat([_kernel(table, coc, width).flatten() for coc in coc_px])
+def _constant_bank(table: BlurTable, coc_px: tuple[float, ...], width: int, scales: tuple[int, ...]) -> Tensor:
+    return torch.cat([_kernel(table, c, width, s).flatten() for c, s in zip(coc_px, scales, strict=True)])
 
 
 def _cut(kernel: Tensor, largest: int) -> Tensor:

@@ -4,11 +4,18 @@
 one isotropic kernel is a convolution with it. Light scattered over the frame's border is lost, nothing comes in.
 """
 
+from collections.abc import Callable, Sequence
+
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-__all__ = ["conv", "fold"]
+from .plan import Blur
+
+__all__ = ["Spread", "conv", "fold", "layers_by_conv", "layers_by_fold"]
+
+Spread = Callable[[Tensor, Sequence[tuple[Blur, int]], int], Tensor]
+"""``(light [B, C, H + 2 halo, W + 2 halo], [(blur, channels), ...], halo) -> [B, C, H, W]``: layers side by side."""
 
 _COLUMN_BYTES = 256 * 2**20
 _DIRECT_TAPS = 71 * 71
@@ -65,7 +72,7 @@ def fold(light: Tensor, kernels: Tensor, shares: Tensor | None = None) -> Tensor
     return total[:, :, half : half + height]
 
 
-def conv(light: Tensor, kernels: Tensor) -> Tensor:
+def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     """The same scatter with one kernel a channel, by convolution.
 
     Small kernels are applied directly, 16 channels at a time in ``channels_last``. Large ones go through a Fourier
@@ -74,9 +81,10 @@ def conv(light: Tensor, kernels: Tensor) -> Tensor:
     Args:
         light: ``[B, C, H, W]``.
         kernels: ``[C, k, k]``, symmetric under a half turn, k odd.
+        halo: Pixels on each side that scatter light into the result but are not part of it.
 
     Returns:
-        ``[B, C, H, W]``. Differentiable in both.
+        ``[B, C, H - 2 halo, W - 2 halo]``. Differentiable in both.
 
     Raises:
         ValueError: If the shapes do not fit.
@@ -89,23 +97,52 @@ def conv(light: Tensor, kernels: Tensor) -> Tensor:
         True
     """
     _check(light, kernels)
-    size = kernels.shape[-1]
-    if size == 1:
+    half = kernels.shape[-1] // 2
+    if halo > half:
+        spare = halo - half
+        light = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare]
+        halo = half
+    if half == 0:
         return light * kernels[:, 0, 0, None, None]
-    if size * size > _DIRECT_TAPS and not (torch.compiler.is_compiling() or torch.compiler.is_exporting()):
-        return _fourier(light, kernels)
-    batch, channels, height, width = light.shape
-    if channels % _PACK:
-        spare = _PACK - channels % _PACK
-        light = functional.pad(light, (0, 0, 0, 0, 0, spare))
-        kernels = functional.pad(kernels, (0, 0, 0, 0, 0, spare))
-    out = functional.conv2d(
-        light.contiguous(memory_format=torch.channels_last),
-        kernels.unsqueeze(1),
-        padding=size // 2,
-        groups=kernels.shape[0],
-    )
-    return out[:, :channels]
+    if (2 * half + 1) ** 2 > _DIRECT_TAPS and not (torch.compiler.is_compiling() or torch.compiler.is_exporting()):
+        return _fourier(light, kernels)[..., halo : light.shape[-2] - halo, halo : light.shape[-1] - halo]
+    batch, channels = light.shape[:2]
+    together = _PACK // channels if batch > 1 and channels <= _PACK // 2 else 1
+    packed = light
+    if together > 1:  # items as channels of one convolution
+        packed = functional.pad(packed, (0, 0, 0, 0, 0, 0, 0, (-batch) % together))
+        packed = packed.reshape(-1, together * channels, *light.shape[-2:])
+    spare = (-packed.shape[1]) % _PACK
+    packed = functional.pad(packed, (0, 0, 0, 0, 0, spare)).contiguous(memory_format=torch.channels_last)
+    weights = functional.pad(kernels.repeat(together, 1, 1), (0, 0, 0, 0, 0, spare)).unsqueeze(1)
+    out = functional.conv2d(packed, weights, padding=half - halo, groups=packed.shape[1])[:, : together * channels]
+    return out.reshape(-1, channels, *out.shape[-2:])[:batch] if together > 1 else out
+
+
+def layers_by_conv(light: Tensor, blurs: Sequence[tuple[Blur, int]], halo: int) -> Tensor:
+    """Scatter layers side by side, by convolution and each at its resolution (one for all of them)."""
+    scale, kernels = blurs[0][0].scale, _side_by_side(blurs)
+    if scale == 1:
+        return conv(light, kernels, halo)
+    half = kernels.shape[-1] // 2
+    spare = halo - scale * (half + 1)
+    light = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare]
+    coarse = conv(functional.avg_pool2d(light, scale), kernels, half)
+    fine = functional.interpolate(coarse, scale_factor=float(scale), mode="bilinear", align_corners=False)
+    return fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
+
+
+def layers_by_fold(light: Tensor, blurs: Sequence[tuple[Blur, int]], halo: int) -> Tensor:
+    """Scatter layers side by side, literally; at full resolution."""
+    spreaded = fold(light, _side_by_side(blurs))
+    return spreaded[..., halo : spreaded.shape[-2] - halo, halo : spreaded.shape[-1] - halo]
+
+
+def _side_by_side(blurs: Sequence[tuple[Blur, int]]) -> Tensor:
+    half = max(blur.half for blur, _ in blurs)
+    kernels = [functional.pad(blur.kernel, (half - blur.half,) * 4) for blur, _ in blurs]
+    # a kernel for each channel: the same one, or one colour after the other in each part of the layer
+    return torch.cat([k.repeat(channels // k.shape[0], 1, 1) for k, (_, channels) in zip(kernels, blurs, strict=True)])
 
 
 def _fourier(light: Tensor, kernels: Tensor) -> Tensor:

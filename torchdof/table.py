@@ -141,7 +141,7 @@ class BlurTable:
         """Parameters at the nodes, ``[channels, N]`` (``values``: ``[channels, N, P]``), in the table's unit."""
         return dict(self._params)
 
-    def params(self, coc_px: Tensor, width: int) -> dict[str, Tensor]:
+    def params(self, coc_px: Tensor, width: float) -> dict[str, Tensor]:
         """Kernel parameters at a signed coc.
 
         Args:
@@ -164,7 +164,7 @@ class BlurTable:
                 mixed[name] = mixed[name] * scale
         return mixed
 
-    def kernels(self, coc_px: Tensor, width: int, size: int | None = None) -> Tensor:
+    def kernels(self, coc_px: Tensor, width: float, size: int | None = None) -> Tensor:
         """Pixel-integrated kernels at a signed coc.
 
         A blur below the resolution of a pixel passes light through unchanged: for ``|coc_px| <= 0.5`` the kernel is a
@@ -191,7 +191,7 @@ class BlurTable:
         centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
         return torch.lerp(centre, kernels, share)
 
-    def reach_px(self, coc_px: float, width: int) -> float:
+    def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
         both = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
         return kernel.support(self.family, self.params(both, width))
@@ -323,7 +323,7 @@ class BlurTable:
         colours = f", {self.channels} channels" if self.channels > 1 else ""
         return f"BlurTable({self.name or 'unnamed'!r}, {self.family}, {nodes}{colours})"
 
-    def _px_per_unit(self, width: int) -> float:
+    def _px_per_unit(self, width: float) -> float:
         if self.unit == "relative":
             return 1.0
         return float(width) if self.sensor_width_mm is None else width / self.sensor_width_mm

@@ -1,0 +1,252 @@
+"""What one image hides: the second surface of mixed pixels, and the background behind blurred foregrounds.
+
+A sharp image is anti-aliased, its depth is not. Along every depth edge pixels carry the light of two surfaces and the
+depth of one; blurred with that depth alone, a bright emitter draws a wrong ring and a foreground a fringe. Such pixels
+are split between their surfaces (:func:`split_mixed`), without touching texture within a surface.
+
+Where a foreground blurs, what is behind it shows through, and no pixel of the image holds it. A hidden sample, filled
+from the farther surfaces around (:func:`fill_hidden`), stands in with a weight so small that it speaks only where nothing
+visible does.
+
+Both give the second sample of a pixel: its light, coc and weight. Work is done at the pixels that need it; compiled
+code, which cannot choose them, does it at all.
+"""
+
+import math
+from collections.abc import Iterator
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+__all__ = ["fill_hidden", "split_mixed"]
+
+HIDDEN_WEIGHT = 0.003
+"""Weight of a hidden sample against 1 of a visible one."""
+
+_NEVER_PX = 1e9  # a coc that no pixel has
+_EDGE_PX = 1.0  # difference in coc of neighbours from which on they may be two surfaces
+_BEHIND_PX = 2.0  # a hidden surface lies at least so much farther, in coc
+_REACH = 2  # pixels around a mixed pixel that tell what its two surfaces look like
+_FALL = 0.7  # weight of a level of the pyramid against the finer one before
+_UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
+_TRUST = 4.0  # how much local contrast discredits a split
+
+
+def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Split pixels at depth edges between the surface they are attributed to and the one across the edge.
+
+    With F and B the light of the two surfaces near the pixel, the share of F in a pixel is the least-squares solution of
+    ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on that surface)
+    and drawn towards no split at all where the contrast of the two is small against the texture of each. The light of
+    the two parts sums to the pixel's.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        coc_px: ``[B, 1, H, W]``, signed.
+        valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
+
+    Returns:
+        ``(own, other, other_coc_px, share)``: light of the pixel's own surface and of the other ``[B, C, H, W]``, the
+        other's coc and the share of the pixel that it covers, in [0, 1/2], ``[B, 1, H, W]``; 0 away from edges.
+    """
+    if valid is None:
+        low, high = -functional.max_pool2d(-coc_px, 3, 1, 1), functional.max_pool2d(coc_px, 3, 1, 1)
+        edge = ((high - low) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
+    else:
+        low = -functional.max_pool2d(torch.where(valid > 0, -coc_px, -_NEVER_PX), 3, 1, 1)
+        high = functional.max_pool2d(torch.where(valid > 0, coc_px, -_NEVER_PX), 3, 1, 1)
+        edge = ((high - low) / _EDGE_PX - 1.0).clamp(0.0, 1.0) * valid
+    at = _positions(edge > 0)
+    near, far, here = (_pick(t, at)[0] for t in (low, high, coc_px))
+    colour = _pick(light, at)
+    gap = (far - near).clamp_min(1e-6)
+    clean = (1.0 - edge + _UNCLEAN) if valid is None else (1.0 - edge + _UNCLEAN) * valid
+
+    def weights() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        around = zip(_around(light, at), _around(coc_px, at), _around(clean, at), _distances(), strict=True)
+        for its_light, its_coc, its_clean, squared in around:
+            weight = its_clean[0] * math.exp(-squared / 4.5)
+            nearness = (far - its_coc[0]) / gap
+            yield its_light, weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
+
+    behind, behind_spread = _mean((seen, w) for seen, _, w in weights())
+    # a thin foreground has no clean pixel: trust the one that differs most from what is behind
+    differs = [(seen, w, w * ((seen - behind) ** 2).sum(0) + 1e-12) for seen, w, _ in weights()]
+    pure = sum(w for _, w, _ in differs)
+    front, front_spread = _mean((seen, torch.where(pure > 20 * _UNCLEAN, w, v)) for seen, w, v in differs)
+
+    contrast = front - behind
+    strength = (contrast**2).sum(0)
+    share = ((colour - behind) * contrast).sum(0) / strength.clamp_min(1e-12)
+    is_near = here - near < far - here
+    fitted = share.clamp(0.0, 1.0)
+    misfit = ((colour - behind - fitted * contrast) ** 2).sum(0)
+    trust = strength / (strength + 4e-4 + _TRUST * (behind_spread + front_spread + misfit))
+    other = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * trust * _pick(edge, at)[0]
+    own_pure, other_pure = torch.where(is_near, front, behind), torch.where(is_near, behind, front)
+    rest = colour - (1.0 - other) * own_pure - other * other_pure
+    norm = other**2 + (1.0 - other) ** 2
+    other_light = (other_pure + rest * other / norm).clamp_min(0.0)
+    # the own part takes what the other leaves, so that no light is lost
+    own_light = (colour - other * other_light) / (1.0 - other)
+    return (
+        _put(light, at, own_light),
+        _put(torch.zeros_like(light), at, other_light),
+        _put(coc_px, at, torch.where(is_near, far, near)),
+        _put(torch.zeros_like(coc_px), at, other),
+    )
+
+
+def fill_hidden(
+    light: Tensor,
+    coc_px: Tensor,
+    other_light: Tensor,
+    other_coc_px: Tensor,
+    share: Tensor,
+    valid: Tensor | None,
+    levels: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Light and coc of what lies behind blurred surfaces, from the farthest surfaces around them.
+
+    A pyramid averages at each step only the farthest of four children. A pixel takes the mean of the levels that show
+    something behind it, finer ones first, and of the four samples around it there only those that do; it looks no farther
+    than its own blur reaches, for deeper inside nothing of what is hidden can show.
+
+    Args:
+        light: Own light of each pixel ``[B, C, H, W]``.
+        coc_px: Its signed coc ``[B, 1, H, W]``.
+        other_light: Light of the second surface of mixed pixels.
+        other_coc_px: Its coc.
+        share: Its share, 0 where a pixel is not mixed.
+        valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
+        levels: Levels of the pyramid; the widest look is ``2 ** levels`` pixels.
+
+    Returns:
+        The second sample, mixed or hidden: light, coc and weight (0 where there is none).
+    """
+    height, width = coc_px.shape[-2:]
+    mixed = (share > 0.05) & (other_coc_px > coc_px)
+    depth = torch.where(mixed, other_coc_px, coc_px)
+    colour = torch.where(mixed, other_light, light)
+    weight = torch.where(mixed, share, 1.0 - share)
+    if valid is not None:
+        depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid
+    step = 2**levels
+    extra = (0, (-width) % step, 0, (-height) % step)
+    depth, colour, weight = (functional.pad(t, extra, mode="replicate") for t in (depth, colour, weight))
+    at = _positions(_may_hide(coc_px, depth, share, levels, (height, width)))
+    here = _pick(coc_px, at)[0]
+    reach = here.abs()
+    row, column = at // width % height, at % width
+    item = at // (width * height)
+    total = torch.zeros_like(here)
+    seen_light, seen_coc = _pick(light, at), here
+    for level in range(1, levels + 1):
+        colour, depth, weight = _farthest(colour, depth, weight)
+        behind_light, behind_coc, any_behind = _behind(colour, depth, weight, item, row, column, here, 2**level)
+        vote = torch.where(any_behind & (2.0 ** (level - 2) <= reach), _FALL**level, 0.0)
+        total = total + vote
+        part = vote / total.clamp_min(1e-9)
+        seen_light, seen_coc = (
+            seen_light + (behind_light - seen_light) * part,
+            seen_coc + (behind_coc - seen_coc) * part,
+        )
+    hidden = _put(torch.zeros_like(share), at, torch.where(total > 0, HIDDEN_WEIGHT, 0.0).to(share.dtype))
+    free = (share < HIDDEN_WEIGHT) & (hidden > 0)
+    return (
+        torch.where(free, _put(other_light, at, seen_light), other_light),
+        torch.where(free, _put(other_coc_px, at, seen_coc), other_coc_px),
+        torch.where(free, hidden, share),
+    )
+
+
+def _may_hide(coc: Tensor, farthest: Tensor, share: Tensor, levels: int, size: tuple[int, int]) -> Tensor:
+    """Pixels that are blurred and have something farther within reach of the pyramid."""
+    cell = 2 ** min(levels, 3)
+    cells = functional.max_pool2d(farthest, cell)
+    around = max(1, 2**levels // cell)
+    cells = functional.max_pool2d(functional.pad(cells, (around,) * 4, mode="replicate"), 2 * around + 1, 1)
+    farther = functional.interpolate(cells, scale_factor=cell, mode="nearest")[..., : size[0], : size[1]]
+    return (farther > coc + _BEHIND_PX) & (coc.abs() > 0.5) & (share < HIDDEN_WEIGHT)
+
+
+def _farthest(colour: Tensor, depth: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """One step of the pyramid: of each four children, the mean of those that are farthest."""
+    children = functional.pixel_unshuffle(depth, 2)  # [B, 4, H/2, W/2]
+    counts = functional.pixel_unshuffle(weight, 2) * (children > children.amax(1, keepdim=True) - _BEHIND_PX)
+    total = counts.sum(1, keepdim=True)
+    some = total.clamp_min(1e-9)
+    colours = functional.pixel_unshuffle(colour, 2).unflatten(1, (colour.shape[1], 4))
+    colour = (colours * counts.unsqueeze(1)).sum(2) / some
+    depth = torch.where(total > 0, (children * counts).sum(1, keepdim=True) / some, -_NEVER_PX)
+    return colour, depth, total / 4
+
+
+def _behind(
+    colour: Tensor, depth: Tensor, weight: Tensor, item: Tensor, row: Tensor, column: Tensor, here: Tensor, step: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Bilinear sample of a level at fine positions, of the samples behind each position only."""
+    height, width = depth.shape[-2:]
+    y, x = (row + 0.5) / step - 0.5, (column + 0.5) / step - 0.5
+    top, left = y.floor(), x.floor()
+    colour, depth, weight = (t.transpose(0, 1).flatten(1) for t in (colour, depth, weight))
+    light = coc = total = torch.zeros_like(here)
+    for down in (0, 1):
+        for right in (0, 1):
+            r = (top.long() + down).clamp(0, height - 1)
+            c = (left.long() + right).clamp(0, width - 1)
+            where = (item * height + r) * width + c
+            share = (1 - (y - top - down).abs()) * (1 - (x - left - right).abs())
+            its_coc = depth[0, where]
+            share = share * weight[0, where] * (its_coc > here + _BEHIND_PX)
+            light, coc, total = light + colour[:, where] * share, coc + its_coc * share, total + share
+    enough = total > 1e-4
+    total = torch.where(enough, total, 1.0)
+    return light / total, coc / total, enough
+
+
+def _mean(weighted: Iterator[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Weighted mean of colours ``[C, P]`` and their variance, summed over colours, ``[P]``."""
+    first = second = total = torch.zeros(())
+    for colour, weight in weighted:
+        first, second, total = first + colour * weight, second + colour**2 * weight, total + weight
+    total = torch.as_tensor(total).clamp_min(1e-12)
+    mean = first / total
+    return mean, (second / total - mean**2).clamp_min(0.0).sum(0)
+
+
+def _positions(wanted: Tensor) -> Tensor:
+    """Flat indices of the wanted pixels of ``[B, 1, H, W]``; all of them while compiling, which needs fixed shapes."""
+    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        return torch.arange(wanted.numel(), device=wanted.device)
+    return wanted.flatten().nonzero()[:, 0]
+
+
+def _pick(values: Tensor, at: Tensor) -> Tensor:
+    """``[B, C, H, W]`` -> ``[C, P]``."""
+    return values.transpose(0, 1).flatten(1)[:, at]
+
+
+def _put(values: Tensor, at: Tensor, new: Tensor) -> Tensor:
+    """A copy of ``values`` with what :func:`_pick` would take replaced."""
+    batch, channels, height, width = values.shape
+    flat = values.transpose(0, 1).flatten(1)
+    flat = flat.index_copy(1, at, new.reshape(channels, -1).to(values.dtype))
+    return flat.reshape(channels, batch, height, width).transpose(0, 1)
+
+
+def _distances() -> list[int]:
+    reach = range(-_REACH, _REACH + 1)
+    return [dy * dy + dx * dx for dy in reach for dx in reach]
+
+
+def _around(values: Tensor, at: Tensor) -> Iterator[Tensor]:
+    """The pixels around each position, one offset after the other, in the order of :func:`_distances`."""
+    height, width = values.shape[-2:]
+    row, column, item = at // width % height, at % width, at // (width * height)
+    flat = values.transpose(0, 1).flatten(1)
+    for dy in range(-_REACH, _REACH + 1):
+        for dx in range(-_REACH, _REACH + 1):
+            where = ((row + dy).clamp(0, height - 1) + item * height) * width + (column + dx).clamp(0, width - 1)
+            yield flat[:, where]

@@ -1,0 +1,207 @@
+"""The frame and its border, whole or in tiles: what the layers read from and are laid onto.
+
+Tiles keep work where it is needed: a layer is computed only in tiles that its light can reach. While gradients are
+recorded or code is traced, the whole frame is one window.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .layers import share_at_or_behind
+from .plan import Blur, Plan
+
+__all__ = ["Frame", "Sample", "Window"]
+
+TILE = 64
+_CELL = 16  # occupancy is known in cells of this many pixels
+_AT_ONCE = 96  # tiles computed together
+_CHANNELS = 16  # channels that are spread together
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """One surface a pixel.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        x: Its place on the blur axis (:mod:`torchdof.layers`), ``[B, 1, H, W]``.
+        weight: ``[B, 1, H, W]``; None is 1.
+    """
+
+    light: Tensor
+    x: Tensor
+    weight: Tensor | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """A part of the frame with the halo that a kernel needs, or several such parts as a batch."""
+
+    samples: Sequence[Sample]
+    known: Tensor | None
+
+    def terms(self, nodes: Sequence[float], k: int, with_room: bool) -> list[Tensor]:
+        """What layer k scatters: light, share, and with ``with_room`` the share at or behind it and the seen share."""
+        light = share = room = None
+        for sample in self.samples:
+            here = share_at_or_behind(sample.x, nodes, k)
+            mine = here - share_at_or_behind(sample.x, nodes, k + 1)
+            if sample.weight is not None:
+                here, mine = here * sample.weight, mine * sample.weight
+            light = sample.light * mine if light is None else torch.addcmul(light, sample.light, mine)
+            share, room = (mine, here) if share is None or room is None else (share + mine, room + here)
+        if light is None or share is None or room is None:
+            raise ValueError("a window needs at least one sample")
+        if not with_room:
+            return [light, share if self.known is None else share * self.known]
+        return [light, share, room] if self.known is None else [light, share, room, share * self.known]
+
+
+class Frame:
+    """Surfaces of an image, continued over its border by what lies there; light outside is 0 and unknown.
+
+    Args:
+        samples: Surfaces a pixel, all of one size.
+        margin: Pixels that the widest kernel reaches beyond a pixel.
+        align: The frame is continued to a multiple of this.
+        tiled: Cut the frame (of one item) into tiles; False keeps it as one window.
+        extend: Continue light over the border as well, as if it were known.
+    """
+
+    def __init__(self, samples: Sequence[Sample], margin: int, align: int, tiled: bool, extend: bool) -> None:
+        self.size = samples[0].light.shape[-2:]
+        self.margin, self.tiled = margin, tiled
+        align = max(align, TILE) if tiled else align
+        self.area = tuple(n + (-n) % align for n in self.size)
+        ends = (margin, margin + self.area[1] - self.size[1], margin, margin + self.area[0] - self.size[0])
+        self.samples = [
+            Sample(
+                functional.pad(s.light, ends, mode="replicate") if extend else functional.pad(s.light, ends),
+                functional.pad(s.x, ends, mode="replicate"),
+                None if s.weight is None else functional.pad(s.weight, ends, mode="replicate"),
+            )
+            for s in samples
+        ]
+        self.known = None if extend else functional.pad(torch.ones_like(samples[0].x[:1]), ends)
+        self._occupied: list[Tensor] = []
+
+    def canvas(self) -> tuple[Tensor, Tensor]:
+        """Nothing yet: light and coverage to lay layers on."""
+        light = self.samples[0].light
+        if self.tiled:
+            count = self.area[0] // TILE * (self.area[1] // TILE)
+            return light.new_zeros(count, light.shape[1], TILE, TILE), light.new_zeros(count, 1, TILE, TILE)
+        return light.new_zeros(light.shape[0], light.shape[1], *self.area), light.new_zeros(
+            light.shape[0], 1, *self.area
+        )
+
+    def image(self, canvas: Tensor) -> Tensor:
+        """The image on a canvas, ``[B, C, H, W]``."""
+        if self.tiled:
+            rows, columns = self.area[0] // TILE, self.area[1] // TILE
+            canvas = canvas.unflatten(0, (rows, columns)).permute(2, 0, 3, 1, 4).reshape(1, -1, *self.area)
+        return canvas[..., : self.size[0], : self.size[1]]
+
+    def at(self, scattered: Tensor, places: Tensor | None) -> Tensor:
+        """What was scattered in a window, as tiles where the canvas is made of tiles."""
+        if places is None or scattered.shape[-2:] == (TILE, TILE):
+            return scattered
+        tiles = scattered[0].unfold(1, TILE, TILE).unfold(2, TILE, TILE).permute(1, 2, 0, 3, 4)
+        return tiles.flatten(0, 1)[places]
+
+    def groups(self, plan: Plan, blurs: Sequence[Blur]) -> list[list[int]]:
+        """Layers that are spread together, far to near: in a whole frame as many as fill the channels."""
+        order = list(reversed(range(len(plan.nodes))))
+        if self.tiled:
+            self._occupied = self._occupancy(plan, blurs)
+            return [[k] for k in order if bool(self._occupied[k].any())]
+        if not _traced():
+            order = [k for k in order if self._any_share(plan, k)]
+        each = (self.samples[0].light.shape[1] + 3) if blurs[0].kernel.shape[0] == 1 else _CHANNELS
+        groups: list[list[int]] = []
+        for k in order:
+            last = groups[-1] if groups else []
+            fits = last and (len(last) + 1) * each <= _CHANNELS and blurs[k].scale == blurs[last[0]].scale
+            widths = [blurs[j].kernel.shape[-1] for j in [*last, k]]
+            if fits and max(widths) ** 2 <= 2 * min(widths) ** 2:
+                last.append(k)
+            else:
+                groups.append([k])
+        return groups
+
+    def windows(self, group: Sequence[int], halo: int) -> Iterator[tuple[Tensor | None, Window]]:
+        """Windows in which a group's light falls, with a halo of so many pixels, and their places on the canvas."""
+        if not self.tiled:
+            yield None, self._window(halo, None, True)
+            return
+        places = self._occupied[group[0]].flatten().nonzero()[:, 0]
+        rows, columns = self.area[0] // TILE, self.area[1] // TILE
+        row, column = places // columns, places % columns
+        inside = (row * TILE >= halo) & (column * TILE >= halo)
+        inside &= ((row + 1) * TILE + halo <= self.size[0]) & ((column + 1) * TILE + halo <= self.size[1])
+        spans_frame = len(places) * (TILE + 2 * halo) ** 2 > (self.area[0] + 2 * halo) * (self.area[1] + 2 * halo)
+        if spans_frame or halo > TILE:
+            yield places, self._window(halo, None, True)
+            return
+        for border in (False, True):
+            chosen = places[inside != border]
+            for some in chosen.split(_AT_ONCE) if len(chosen) else ():
+                yield some, self._window(halo, some, border)
+
+    def _window(self, halo: int, places: Tensor | None, known: bool) -> Window:
+        samples = []
+        for s in self.samples:
+            weight = None if s.weight is None else self._cut(s.weight, halo, places)
+            samples.append(Sample(self._cut(s.light, halo, places), self._cut(s.x, halo, places), weight))
+        seen = self._cut(self.known, halo, places) if known and self.known is not None else None
+        return Window(samples, seen)
+
+    def _cut(self, values: Tensor, halo: int, places: Tensor | None) -> Tensor:
+        start = self.margin - halo
+        values = values[..., start : start + self.area[0] + 2 * halo, start : start + self.area[1] + 2 * halo]
+        if places is None:
+            return values
+        columns = self.area[1] // TILE
+        views = values[0].unfold(1, TILE + 2 * halo, TILE).unfold(2, TILE + 2 * halo, TILE)  # [C, rows, columns, t, t]
+        return views.permute(1, 2, 0, 3, 4)[places // columns, places % columns]
+
+    def _any_share(self, plan: Plan, k: int) -> bool:
+        low = plan.nodes[k - 1] if k else -torch.inf
+        high = plan.nodes[k + 1] if k + 1 < len(plan.nodes) else torch.inf
+        return any(bool(((s.x > low) & (s.x < high)).any()) for s in self.samples)
+
+    def _occupancy(self, plan: Plan, blurs: Sequence[Blur]) -> list[Tensor]:
+        """For each layer, the tiles that its light can reach: ``[rows, columns]``."""
+        height, width = self.area
+        rows, columns = height // _CELL, width // _CELL
+        nodes = torch.tensor(plan.nodes, device=self.samples[0].x.device, dtype=self.samples[0].x.dtype)
+        count = len(plan.nodes)
+        present = torch.zeros(rows * columns * count, device=nodes.device)
+        cell = (torch.arange(height) // _CELL * columns)[:, None] + (torch.arange(width) // _CELL)[None, :]
+        cell = cell.to(nodes.device)
+        m = self.margin
+        for s in self.samples:
+            x = s.x[0, 0, m : m + height, m : m + width]
+            below = (torch.bucketize(x.contiguous(), nodes, right=True) - 1).clamp(0, count - 1)
+            at = cell * count + below
+            above = at + (x > nodes[below])
+            if s.weight is not None:
+                there = s.weight[0, 0, m : m + height, m : m + width] > 0
+                at, above = at[there], above[there]
+            present[at.flatten()] = 1.0
+            present[above.flatten().clamp(max=present.numel() - 1)] = 1.0
+        cells = present.unflatten(0, (rows, columns, count)).permute(2, 0, 1)
+        occupied = []
+        for layer, blur in zip(cells, blurs, strict=True):
+            reach = -(-blur.halo // _CELL)
+            wide = functional.max_pool2d(layer[None, None], 2 * reach + 1, 1, reach)
+            occupied.append(functional.max_pool2d(wide, TILE // _CELL)[0, 0] > 0)
+        return occupied
+
+
+def _traced() -> bool:
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
