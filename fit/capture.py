@@ -341,7 +341,7 @@ def _windows(still: Array, moved: Array, first: Dot, second: Dot, files: tuple[s
     half = int(math.ceil(_MARGIN * needed)) + 8
     room = min(min(_room(still, first), _room(moved, second)), half)
     if room < needed:
-        worse = 0 if _room(still, first) < _room(moved, second) else 1
+        worse = 0 if _room(still, first) < first.reach + 2 else 1
         raise WindowError(
             f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame's edge is {room} px away",
             file=files[worse],

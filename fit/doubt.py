@@ -57,9 +57,22 @@ def asymmetry_of(pair: Forward, solution: Solution) -> float:
 
 
 def doubt_forward(
-    pair: Forward, solution: Solution, fit: BlurFit, files: tuple[str | None, str | None], stacklevel: int = 4
+    pair: Forward,
+    solution: Solution,
+    fit: BlurFit,
+    files: tuple[str | None, str | None],
+    freest: BlurFit,
+    stacklevel: int = 4,
 ) -> None:
     """Raise or warn about everything that makes a fit less than it looks.
+
+    Args:
+        pair: the pictures.
+        solution: what was found.
+        fit: the same, as it will be returned.
+        files: names of the two pictures.
+        freest: the fit whose residual is held against the noise.
+        stacklevel: where warnings point.
 
     Raises:
         FitError: the fit has no gain (the pictures have nothing in common).
@@ -80,17 +93,14 @@ def doubt_forward(
     if outside > _OUTSIDE_DOUBTED:
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {_size(pair)}; cut a larger one"
         warn(WindowWarning(text, file=file, number=outside), stacklevel)
-    if fit.residual > _MATTERS and fit.residual_over_noise > _FAR_ABOVE:
-        warn(
-            ResidualWarning(
-                f"the residual is {100 * fit.residual:.1f} %, {fit.residual_over_noise:.1f} times the noise; is the "
-                "image linear, not sRGB encoded, and is it a single white dot? "
-                + (f"family {fit.family!r} may be too simple" if fit.family != "radial" else ""),
-                file=file,
-                number=fit.residual_over_noise,
-            ),
-            stacklevel,
+    ratio = freest.residual_over_noise
+    if freest.residual > _MATTERS and ratio > _FAR_ABOVE:
+        text = (
+            f"the residual is {100 * freest.residual:.1f} %, {ratio:.1f} times the noise; is the image linear, not sRGB "
+            "encoded, a single white dot, and not a strong JPEG?"
         )
+        text += f" Family {freest.family!r} may be too simple" if freest.family != "radial" else ""
+        warn(ResidualWarning(text, file=file, number=ratio), stacklevel)
     change = fit.magnification / pair.magnification
     if abs(np.log(change)) > _MAGNIFIED:
         text = (
@@ -105,7 +115,7 @@ def doubt_forward(
         )
         warn(AsymmetryWarning(text, file=file, number=fit.asymmetry), stacklevel)
     if solution.family != "radial":
-        _doubt_parameters(pair, solution, fit, file, stacklevel + 1)
+        _doubt_parameters(pair, solution, file, stacklevel + 1)
 
 
 def doubt_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
@@ -140,9 +150,7 @@ def _outside(pair: Forward, solution: Solution) -> float:
     return 1 - inside / total if total > 0 else 1.0
 
 
-def _doubt_parameters(
-    pair: Forward, solution: Solution, fit: BlurFit, file: str | None, stacklevel: int
-) -> None:
+def _doubt_parameters(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:
     low, high = pair.bounds(solution.names)
     for name, least, most in zip(solution.names, low, high, strict=True):
         value = solution.params.get(name, solution.moves.get(name, 0.0))
@@ -157,11 +165,28 @@ def _doubt_parameters(
                 continue  # the exponent of a tilt that is not there
             text = f"{name} ended on its bound {float(value):.4g}; it is only a limit"
             warn(BoundaryWarning(text, file=file, number=float(value)), stacklevel)
-    size = {"gaussian": "sigma", "ring": "sigma", "disc": "radius", "softm": "radius"}[solution.family]
-    value, error = float(fit.params[size]), float(fit.stderr[size])  # type: ignore[arg-type]
-    if not error < 0.5 * value:
-        text = f"{size} = {value:.3g} +- {error:.2g} px is not determined: too little blur, or too much noise"
-        warn(FlatProfileWarning(text, file=file, number=error / value if value else np.inf), stacklevel)
+    size, error = _size_of_blur(pair, solution)
+    if not error < 0.5 * size:
+        text = f"the blur's rms radius of {size:.3g} +- {error:.2g} px is not determined: too little blur, or too much noise"
+        warn(FlatProfileWarning(text, file=file, number=error / size if size else np.inf), stacklevel)
+
+
+def _size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
+    """The kernel's rms radius and its standard error, px: single parameters may trade with each other, this does not."""
+    shape = list(solution.params)
+    steps = {n: 1e-3 * max(abs(float(solution.params[n])), 0.1) for n in shape}
+    given = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
+    for i, n in enumerate(shape):
+        given[n][i + 1] += steps[n]
+    kernels = pair.kernels(solution.family, given)
+    away = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
+    rms = np.sqrt((kernels * (away[:, None] ** 2 + away[None, :] ** 2)).sum((1, 2)))
+    slope = np.array([(rms[i + 1] - rms[0]) / steps[n] for i, n in enumerate(shape)])
+    index = [solution.names.index(n) for n in shape]
+    covariance = solution.covariance[np.ix_(index, index)]
+    known = np.isfinite(np.diag(covariance))
+    variance = slope[known] @ covariance[np.ix_(known, known)] @ slope[known]
+    return float(rms[0]), float(np.sqrt(max(variance, 0.0))) if known.any() else np.inf
 
 
 def _size(pair: Forward) -> str:

@@ -14,15 +14,15 @@ import torch
 
 from torchdof.kernel import FAMILIES, render, support
 
-from .dot import Dot
+from .dot import Dot, noise_of
 from .gaussian import inverse
 from .result import Array
 from .solve import best_of
 from .source import Source
 
-__all__ = ["Forward", "Solution"]
+__all__ = ["ALL_MOVES", "Forward", "Solution"]
 
-_MOVES = ("dx", "dy", "magnification")
+ALL_MOVES = ("dx", "dy", "magnification")
 _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
 
 
@@ -52,7 +52,9 @@ class Forward:
         data_dot: where the blurred dot is.
         magnification: size of the blurred picture's dot over the sharp one's, as expected.
         fit_moves: which of displacement and magnification are fitted.
+        held_magnification: the one to use where it is not fitted, and to start from; None takes the expected one.
         start: kernel parameters to start from beside the moments, by family.
+        prior: expected value and standard deviation of kernel parameters, as if measured elsewhere.
     """
 
     source: Source
@@ -60,8 +62,10 @@ class Forward:
     used: Array
     data_dot: Dot
     magnification: float = 1.0
-    fit_moves: tuple[str, ...] = _MOVES
+    fit_moves: tuple[str, ...] = ALL_MOVES
+    held_magnification: float | None = None
     start: dict[str, dict[str, float]] = field(default_factory=dict)
+    prior: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Prepare the window the source is drawn in and the size of the Fourier grid."""
@@ -126,17 +130,21 @@ class Forward:
         starts = [self._start(names, s) for s in self._seeds(family)]
         if family in self.start:
             starts.insert(0, self._start(names, self.start[family]))
+        if self.prior:
+            # what is expected leads to its own branch; the moments' would be pulled away from theirs
+            starts = [*starts[: family in self.start], self._start(names, {n: m for n, (m, _) in self.prior.items()})]
+        scale, expected, pull = self._prior_rows(names)
 
         def model(_: Array, *p: float) -> Array:
             shaped = self._shaped(family, names, np.asarray(p))
-            return self._project(shaped)[0] / self.unit
+            return np.concatenate([self._project(shaped)[0] / self.unit, pull @ np.asarray(p)])
 
         def jacobian(_: Array, *p: float) -> Array:
-            return self._jacobian(family, names, np.asarray(p)) / self.unit
+            return np.concatenate([self._jacobian(family, names, np.asarray(p)) / self.unit, pull])
 
         found = best_of(
             model,
-            self.values / self.unit,
+            np.concatenate([self.values / self.unit, expected]),
             starts,
             (low, high),
             jacobian=jacobian,
@@ -159,16 +167,32 @@ class Forward:
             background=background,
             model=full.reshape(self.data.shape),
             names=names,
-            covariance=self.covariance(slopes, residual, kernel, gain, self.moves(params)),
+            covariance=self.covariance(slopes, residual, kernel, gain, self.moves(params), pull * scale),
             squares=float(residual @ residual),
         )
 
     def moves(self, params: dict[str, float]) -> dict[str, float]:
         """The moves among fitted parameters, the fixed ones filled in."""
-        return {n: params.get(n, self.magnification if n == "magnification" else 0.0) for n in _MOVES}
+        held = self.magnification if self.held_magnification is None else self.held_magnification
+        return {n: params.get(n, held if n == "magnification" else 0.0) for n in ALL_MOVES}
+
+    def _prior_rows(self, names: tuple[str, ...]) -> tuple[float, Array, Array]:
+        """The prior as further data: levels per unit of the fit, what is expected `[k]`, and its slopes `[k, p]`."""
+        rows = [(i, *self.prior[n]) for i, n in enumerate(names) if n in self.prior]
+        noise = max(noise_of(self.data), 1e-5 * self.unit) / self.unit
+        pull = np.zeros((len(rows), len(names)))
+        for k, (i, _, deviation) in enumerate(rows):
+            pull[k, i] = noise / deviation
+        return self.unit, np.array([noise * mean / deviation for _, mean, deviation in rows]), pull
 
     def covariance(
-        self, jacobian: Array, residual: Array, kernel: Array, gain: float, moves: dict[str, float]
+        self,
+        jacobian: Array,
+        residual: Array,
+        kernel: Array,
+        gain: float,
+        moves: dict[str, float],
+        prior: Array | None = None,
     ) -> Array:
         """Covariance of the parameters under both pictures' noise (a sandwich).
 
@@ -176,7 +200,8 @@ class Forward:
         passes through the kernel and is then alike in neighbouring pixels, which is what makes naive errors too small.
         An ideal dot brings the errors of its radius and softness instead.
         """
-        bread = inverse(jacobian.T @ jacobian)
+        known_before = 0.0 if prior is None else prior.T @ prior
+        bread = inverse(jacobian.T @ jacobian + known_before)
         known = np.isfinite(np.diag(bread))
         bread = np.where(np.outer(known, known), bread, 0.0)
         n, p = jacobian.shape
@@ -184,7 +209,7 @@ class Forward:
         through = (gain * self.source.noise) ** 2
         if through > 0:
             own = np.maximum(own - through * float(np.sum(kernel**2)), 0.1 * own)
-        meat = jacobian.T @ (own[:, None] * jacobian)
+        meat = jacobian.T @ (own[:, None] * jacobian) + known_before
         if through > 0:
             meat = meat + through * self._source_scores(jacobian, kernel)
         covariance = bread @ meat @ bread

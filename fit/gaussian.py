@@ -27,6 +27,7 @@ _BOUNDS = {
     "b": (-1.0, 20.0),
     "m": (0.5, 12.0),
 }
+_BENT = 8.0
 _STARTS: dict[str, list[list[float]]] = {
     "gaussian": [[1.0, 0.2], [1.0, 0.5], [1.0, 1.5]],
     "ring": [[1.0, 0.05, 0.3], [1.0, 0.5, 0.2], [1.0, 0.1, 1.0]],
@@ -83,7 +84,7 @@ def fit_profile(
     unit, peak = float(radii.max()), float(np.abs(values).max())
     x, y = radii[order] / unit, values[order] / peak
     noise = _noise(y)
-    _refuse_flat(y, noise)
+    _refuse_flat(x, y, noise)
     if family == "radial":
         params, covariance, names, curve = _fit_radial(x, y, knots)
     elif family == "disc":
@@ -150,16 +151,17 @@ def _noise(y: Array) -> float:
     return float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
 
 
-def _refuse_flat(y: Array, noise: float) -> None:
-    step = max(1, y.size // 6)
-    means = np.array([y[i : i + step].mean() for i in range(0, y.size - step + 1, step)])
-    variation = float(np.ptp(means))
-    # the range of k means of pure noise stays below 4.5 of their deviation
-    allowed = max(4.5 * noise / np.sqrt(step), 1e-7)
-    if variation <= allowed:
+def _refuse_flat(x: Array, y: Array, noise: float) -> None:
+    level = y - y.mean()
+    bent = np.stack([np.ones_like(x), x, x * x], axis=1)
+    rest = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
+    explained, left = float(level @ level - rest @ rest), float(rest @ rest)
+    variation = float(np.sqrt(max(explained, 0.0) / y.size))
+    # Fisher's test of a parabola against a constant: 8 is one chance in 1500
+    if variation < 1e-8 or explained / 2 < _BENT * left / (y.size - 3):
         raise FlatProfileError(
-            f"the profile is flat: it varies by {variation:.3g} of its peak, which its noise ({noise:.3g}) explains; "
-            "sample farther out, or move the paper farther from focus",
+            f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
+            "farther out, or move the paper farther from focus",
             number=variation / noise if noise > 0 else 0.0,
         )
 
@@ -279,11 +281,11 @@ def _doubt(fit: BlurFit, unit: float) -> None:
         value, error = float(fit.params[name]), float(fit.stderr[name])
         # a ring whose peak is at the centre has an r_c of 0 +- something: judged against the width
         whole = max(value, float(fit.params.get("sigma", 0.0)) if name == "r_c" else 0.0)
-        if not error < whole:
+        if not error < 0.25 * whole:
             warn(
                 FlatProfileWarning(
-                    f"the profile is too flat to fix {name} = {value:.4g} +- {error:.2g}; sample farther out, "
-                    "or use family='gaussian'",
+                    f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g} +- "
+                    f"{error:.2g}; sample farther out, or try another family",
                     number=error / whole if whole else np.inf,
                 ),
                 stacklevel=4,

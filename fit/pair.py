@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -15,7 +16,7 @@ from .clipped import used_pixels
 from .dot import find_dot, noise_of
 from .doubt import EXPLAINED, asymmetry_of, doubt_forward, doubt_linearity, signal_pixels
 from .edge import soft_edge
-from .forward import Forward, Solution
+from .forward import ALL_MOVES, Forward, Solution
 from .gaussian import fit_profile
 from .problems import FitError, NonFiniteError, NotInFocusWarning, SaturatedWarning, warn
 from .profile import blur_strength
@@ -30,6 +31,7 @@ Model = Literal["forward", "ratio"]
 SourceKind = Literal["auto", "image", "dot"]
 
 _SMALLEST_WINDOW = 15
+_AS_GOOD = 2e-3
 _SOFT = 1.5  # px: an edge softer than this is not in focus
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
@@ -46,6 +48,7 @@ def fit_pair(
     fit_magnification: bool | None = None,
     white: float | None = None,
     start: BlurFit | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
     knots: int | None = None,
     files: tuple[str | None, str | None] = (None, None),
 ) -> BlurFit:
@@ -72,6 +75,8 @@ def fit_pair(
             one by more than 3.5 standard errors. Where it is held, the standard errors take it as known.
         white: level at and above which a pixel is clipped; None looks for a plateau.
         start: a fit of a similar pair, to start from (several distances of one lens).
+        prior: expected value and standard deviation of parameters of `family`, known from elsewhere (the neighbouring
+            distances), in px; the result is what both the pictures and it allow, and so are its standard errors.
         knots: number of values of a "radial" profile; None takes two a pixel.
         files: names of the two pictures, for errors and warnings.
 
@@ -116,20 +121,20 @@ def fit_pair(
     pair = _prepare(still, data, source, magnification, white, files)
     if start is not None and start.family in FAMILIES:
         pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
+    pair.prior = dict(prior or {})
     held = _held(pair, fit_magnification, sharp is None)
-    solutions = {f: pair.solve(f) for f in (COST[:-1] if family in ("auto", "radial") else (family,))}
-    if held is None and _needs_magnification(pair, solutions):
-        pair.fit_moves = ("dx", "dy", "magnification")
-        solutions = {f: pair.solve(f) for f in solutions}
     why, psnr = "", {}
     if family in ("auto", "radial"):
-        likeliest = min(solutions.values(), key=lambda s: s.squares)
-        solutions["radial"] = solve_radial(pair, likeliest, _reach(pair, solutions["softm"]), knots)
+        solutions = {"radial": _solve_radial(pair, held, knots)}
         if family == "auto":
-            kernels = {f: pair.kernels(f, _lists(s))[0] for f, s in solutions.items()}
-            family, why, psnr = choose(kernels, {f: _bic(pair, s) for f, s in solutions.items()}, accuracy_db)
+            family, why, psnr = _choose(pair, solutions, accuracy_db)
+    else:
+        solutions = {family: pair.solve(family)}
+        if held is None and _improves(pair, solutions[family], free := _with_magnification(pair).solve(family)):
+            pair.fit_moves, solutions[family] = ALL_MOVES, free
     fit = _finish(pair, solutions[family], why)
-    doubt_forward(pair, solutions[family], fit, files)
+    # a family that was chosen for being cheap is not to blame for what the free profile explains
+    doubt_forward(pair, solutions[family], fit, files, _finish(pair, solutions["radial"], "") if why else fit)
     return replace(fit, psnr=psnr)
 
 
@@ -197,7 +202,9 @@ def _prepare(
             ),
             stacklevel=4,
         )
-    explained = edge.misfit < EXPLAINED and edge.radius > 2 * edge.softness
+    # a spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified
+    close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
+    explained = close and edge.radius > 2 * edge.softness
     if clipped or source == "dot" or (source == "auto" and explained):
         return Forward(IdealDot.of(dot, edge), data, used, data_dot, magnification)
     return Forward(PictureOfDot.of(still, dot), data, used, data_dot, magnification)
@@ -206,19 +213,47 @@ def _prepare(
 def _held(pair: Forward, fit_magnification: bool | None, point: bool) -> bool | None:
     """Whether the magnification is settled before the fit: a point has none."""
     held = True if point else None if fit_magnification is None else not fit_magnification
-    pair.fit_moves = ("dx", "dy", "magnification") if held is False else ("dx", "dy")
+    pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
     return held
 
 
-def _needs_magnification(pair: Forward, solutions: dict[str, Solution]) -> bool:
-    family = min(solutions, key=lambda f: solutions[f].squares)
-    held = solutions[family]
-    free = Forward(pair.source, pair.data, pair.used, pair.data_dot, pair.magnification)
-    free.start[family] = {k: float(v) for k, v in held.params.items()}
-    squares = free.solve(family).squares
+def _with_magnification(pair: Forward) -> Forward:
+    return replace(pair, fit_moves=ALL_MOVES)
+
+
+def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
+    """Whether a fitted magnification explains the pictures significantly better than the expected one."""
     # the scale of chi squared: what remains, or the rounding of a spline where there is no noise
-    floor = max(squares / pair.values.size, (1e-4 * pair.unit) ** 2)
-    return (held.squares - squares) / floor > _SIGNIFICANT
+    floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
+    return (held.squares - free.squares) / floor > _SIGNIFICANT
+
+
+def _solve_radial(pair: Forward, held: bool | None, knots: int | None) -> Solution:
+    """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`."""
+    soft = pair.solve("softm")
+    reach = _reach(pair, soft)
+    found = solve_radial(pair, soft, reach, knots)
+    if held is None:
+        free = solve_radial(_with_magnification(pair), found, reach, knots)
+        if _improves(pair, found, free):
+            pair.fit_moves, found = ALL_MOVES, free
+    pair.held_magnification = found.moves["magnification"]
+    return found
+
+
+def _choose(
+    pair: Forward, solutions: dict[str, Solution], accuracy_db: float
+) -> tuple[str, str, dict[str, float]]:
+    """Fit every family at the free profile's magnification and choose; the chosen one's is then fitted with it."""
+    fit_moves, pair.fit_moves = pair.fit_moves, ("dx", "dy")
+    solutions |= {f: pair.solve(f) for f in COST[:-1]}
+    kernels = {f: pair.kernels(f, _lists(s))[0] for f, s in solutions.items()}
+    family, why, psnr = choose(kernels, {f: _bic(pair, s) for f, s in solutions.items()}, accuracy_db)
+    pair.fit_moves = fit_moves
+    if family != "radial" and fit_moves == ALL_MOVES:
+        pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
+        solutions[family] = pair.solve(family)
+    return family, why, psnr
 
 
 def _reach(pair: Forward, soft: Solution) -> float:

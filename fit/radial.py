@@ -39,7 +39,7 @@ def solve_radial(pair: Forward, seed: Solution, radius: float, knots: int | None
     hats = render("radial", {"values": torch.eye(count, dtype=torch.float64), "radius": radius}, 2 * half + 1).numpy()
     mass = hat_mass(count, radius)
     moves = dict(seed.moves)
-    for _ in range(3):
+    for _ in range(10):
         columns = mass[:, None] * pair.convolve(pair.moved_source(moves), hats)  # [knots, pixels]
         weights, smooth, free = _non_negative(columns, pair.values)
         gain = float(mass @ weights)
@@ -55,7 +55,7 @@ def solve_radial(pair: Forward, seed: Solution, radius: float, knots: int | None
         limit = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}
         for name, change in zip(pair.fit_moves, step, strict=True):
             moves[name] += float(np.clip(change, -limit[name], limit[name]))
-        if np.all(np.abs(step) < 1e-3):
+        if np.all(np.abs(step) < 3e-4):
             break
     full = np.full(pair.flat.shape, np.nan)
     full[pair.flat] = fitted

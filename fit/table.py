@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,15 +18,15 @@ from torchdof.kernel import FAMILIES, LENGTHS, profile, support
 from .capture import Capture, Captures
 from .choose import COST
 from .pair import fit_pair
-from .problems import ExposureWarning, FitError, SingleDistanceWarning, warn
+from .problems import ExposureWarning, FitError, FitWarning, SingleDistanceWarning, warn
 from .result import Array, BlurFit
 from .scale import signed_coc
-from .smooth import smoothed
 
 __all__ = ["TableFit", "fit_captures", "fit_table"]
 
 _KNOTS = 33
 _EXPOSED = 1.3
+_SWEEPS = 2
 
 
 @dataclass(frozen=True)
@@ -85,14 +86,14 @@ def fit_captures(
     second moment, by least squares over all distances.
 
     Each fit starts from its outer neighbour's, scaled by geometry, from both ends towards focus, and leaves that
-    branch only where the pictures clearly ask for it. Then the parameters are smoothed over depth as far as the fits'
-    own covariances allow (not those of `radial`, which are smoothed over r).
+    branch only where the pictures clearly ask for it. Then all are fitted once more, each loosely expecting what lies on
+    the line between its neighbours (not those of `radial`, which are smoothed over r).
 
     Args:
         captures: pairs at increasing distances.
         family: "auto" takes the cheapest family that is enough at every distance; or one of the families.
         accuracy_db: what "auto" asks for, see `fit_pair`.
-        smooth: whether to smooth over depth.
+        smooth: whether neighbouring distances inform each other.
         progress: called with (done, all, what) after each fit.
         command: recorded in the table's provenance.
 
@@ -113,9 +114,8 @@ def fit_captures(
     if family == "auto":
         family, why = _choose(pairs, captures.focus_m, accuracy_db, progress, total)
         done = len(pairs)
-    order = _towards_focus([p.distance_m for p in pairs], captures.focus_m)
     fits: dict[int, BlurFit] = {}
-    for i, before in order:
+    for i, before in _towards_focus([p.distance_m for p in pairs], captures.focus_m):
         start = _scaled(fits[before], pairs[before], pairs[i], captures.focus_m) if before is not None else None
         pair = pairs[i]
         fits[i] = _fit(pair, captures.focus_m, family, start)
@@ -123,9 +123,11 @@ def fit_captures(
         done += 1
         if progress:
             progress(done, total, f"{pair.distance_m:g} m")
+    if smooth and family != "radial":
+        fits = _together(pairs, captures.focus_m, family, fits)
     ordered = [fits[i] for i in range(len(pairs))]
     coc_px, scale = _keys(captures, ordered)
-    params = _nodes(ordered, np.array(coc_px), family, smooth)
+    params = _nodes(ordered, family)
     if len(pairs) == 1:
         text = (
             f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
@@ -161,7 +163,12 @@ def _choose(
 
 
 def _fit(
-    pair: Capture, focus_m: float, family: str, start: BlurFit | None, accuracy_db: float = 45.0
+    pair: Capture,
+    focus_m: float,
+    family: str,
+    start: BlurFit | None,
+    accuracy_db: float = 45.0,
+    prior: dict[str, tuple[float, float]] | None = None,
 ) -> BlurFit:
     return fit_pair(
         pair.sharp,
@@ -171,6 +178,7 @@ def _fit(
         magnification=focus_m / pair.distance_m,
         white=pair.white,
         start=start,
+        prior=prior,
         knots=_KNOTS if family == "radial" else None,
         files=pair.files,
     )
@@ -225,19 +233,54 @@ def rms_radius(fit: BlurFit) -> float:
     return float(np.sqrt((f * r**3).sum() / (f * r).sum()))
 
 
-def _nodes(fits: list[BlurFit], coc_px: Array, family: str, smooth: bool) -> dict[str, Array]:
+def _together(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
+    """Fit every pair once more, expecting what its neighbours on the same side of focus say.
+
+    Parameters that trade with each other (a rim's height and its steepness) are thus told alike at all distances,
+    while what the pictures determine stays as they say: the expectation is loose.
+    """
+    place = np.array([1 / focus_m - 1 / p.distance_m for p in pairs])
+    fits = dict(fits)
+    for _ in range(_SWEEPS):
+        for i in sorted(fits, key=lambda k: -abs(place[k])):
+            sides = [k for k in fits if place[k] * place[i] > 0]
+            lower = [k for k in sides if abs(place[k]) < abs(place[i])]
+            upper = [k for k in sides if abs(place[k]) > abs(place[i])]
+            inner = max(lower, key=lambda k: abs(place[k]), default=None)
+            outer = min(upper, key=lambda k: abs(place[k]), default=None)
+            if outer is None and inner is None:
+                continue
+            prior = {n: _expected(n, i, inner, outer, place, fits) for n in FAMILIES[family]}
+            with warnings.catch_warnings():
+                # the first fit of this pair has said it
+                warnings.simplefilter("ignore", FitWarning)
+                fits[i] = _fit(pairs[i], focus_m, family, fits[i], prior=prior)
+    return fits
+
+
+def _expected(
+    name: str, i: int, inner: int | None, outer: int | None, place: Array, fits: dict[int, BlurFit]
+) -> tuple[float, float]:
+    """Value and standard deviation expected of a parameter: on the line between the neighbours, as the table has it."""
+    length = name in LENGTHS
+    if inner is None or outer is None:
+        only = outer if inner is None else inner
+        value = float(fits[only].params[name]) * (abs(place[i] / place[only]) if length else 1.0)  # type: ignore[index]
+        loose = 3.0
+    else:
+        share = (place[i] - place[inner]) / (place[outer] - place[inner])
+        value = float((1 - share) * fits[inner].params[name] + share * fits[outer].params[name])
+        loose = 1.0
+    size = max(float(fits[i].params[n]) for n in fits[i].params if n in LENGTHS)
+    deviation = {"b": 0.1, "m": 0.3}.get(name, 0.05 * size + 0.05)
+    return value, loose * deviation
+
+
+def _nodes(fits: list[BlurFit], family: str) -> dict[str, Array]:
     """Parameters at the nodes in px: `[n]`, "values" `[n, knots]`."""
     if family == "radial":
         return _radial_nodes(fits)
-    names = FAMILIES[family]
-    values = np.array([[float(f.params[n]) for n in names] for f in fits])
-    if smooth:
-        # lengths themselves, not over the coc: they are what the table interpolates in straight lines
-        index = [[f.names.index(n) for n in names] for f in fits]
-        errors = np.stack([f.covariance[np.ix_(i, i)] for f, i in zip(fits, index, strict=True)])
-        values = _by_side(coc_px, values, errors)
-    low = {"b": -1.0}
-    return {n: np.maximum(values[:, k], low.get(n, 0.0)) for k, n in enumerate(names)}
+    return {n: np.array([float(f.params[n]) for f in fits]) for n in FAMILIES[family]}
 
 
 def _radial_nodes(fits: list[BlurFit]) -> dict[str, Array]:
@@ -245,14 +288,6 @@ def _radial_nodes(fits: list[BlurFit]) -> dict[str, Array]:
     radius = np.array([float(f.params["radius"]) for f in fits])
     values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
     return {"values": values, "radius": radius}
-
-
-def _by_side(coc_px: Array, values: Array, errors: Array) -> Array:
-    result = values.copy()
-    for side in (coc_px < 0, coc_px > 0):
-        if side.any():
-            result[side] = smoothed(coc_px[side], values[side], errors[side])
-    return result
 
 
 def _table(

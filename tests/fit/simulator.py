@@ -114,3 +114,40 @@ def _through_jpeg(picture: np.ndarray, quality: int) -> np.ndarray:
     stored = io.BytesIO()
     Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(stored, "jpeg", quality=quality)
     return np.asarray(Image.open(stored), dtype=np.float64) / 255
+
+
+def write_captures(folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=(), **harm):
+    """A folder of 16-bit sRGB PNGs with its capture.toml: the dot in the frame's centre, and wherever `grid` says.
+
+    `kernel(distance)` gives (family, params); `camera` is a `Simulator` whose window is ignored.
+    """
+    from dataclasses import replace
+
+    import torch
+
+    from torchdof.files import Picture, write_image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    places = grid or [(0.0, 0.0)]
+    shots = []
+    for i, distance in enumerate([focus_m, *distances]):
+        m = focus_m / distance
+        light = np.zeros((height, width))
+        for x, y in places:
+            square = draw_dot(max(width, height) + 1, camera.dot_radius * m, (x * m, y * m), oversample=8)
+            light += _centre(square, height, width)
+        if distance != focus_m:
+            light = blur(light, *kernel(distance))
+        picture = replace(camera, **harm).record(camera.level * light, np.random.default_rng(100 + i))
+        name = f"{round(distance * 1000):04d}mm.png"
+        pixels = torch.from_numpy(np.repeat(picture[None, None], 3, 1)).float()
+        write_image(folder / name, Picture(pixels), transfer="srgb", sample="16")
+        shots.append(f'[[shot]]\nfile = "{name}"\ndistance_m = {distance}\n' if i else f'sharp = "{name}"')
+    text = [f"focus_m = {focus_m}", shots[0], camera_fields, *shots[1:]]
+    (folder / "capture.toml").write_text("\n".join(text))
+    return folder
+
+
+def _centre(square: np.ndarray, height: int, width: int) -> np.ndarray:
+    top, left = (square.shape[0] - height) // 2, (square.shape[1] - width) // 2
+    return square[top : top + height, left : left + width]
