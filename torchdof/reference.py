@@ -17,9 +17,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from . import background
 from . import check as checks
 from .camera import Camera
-from .edges import split_edges
 from .lens import Lens
 from .table import BlurTable
 
@@ -80,7 +80,7 @@ def lens_views(
             ``r^2`` of them.
         surfaces: Further surfaces, such as what is hidden: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
             and depth like ``depth``.
-        mixed_edges: Split pixels that hold two surfaces (:func:`torchdof.edges.split_edges`).
+        mixed_edges: Split pixels that hold two surfaces (:func:`torchdof.background.split_mixed`).
 
     Returns:
         Image and the known share, in the image's dtype; pixels that no view knows are those of ``image``.
@@ -144,8 +144,7 @@ def lens_views_by_coc(
         seen = (image[item : item + 1].float(), coc_px.expand(batch, -1, -1, -1)[item : item + 1].float())
         stack = [(*seen, torch.ones_like(seen[1]))]
         if mixed_edges:
-            front, back = split_edges(*seen)
-            stack = [(front.light, front.coc_px, front.cover), (back.light, back.coc_px, back.cover)]
+            stack = _split(*seen)
         for rgba, coc in surfaces:
             cover = rgba[item : item + 1, -1:].float().clamp(0.0, 1.0)
             colour = rgba[item : item + 1, :-1].float() / cover.clamp_min(1e-6)
@@ -160,6 +159,19 @@ def lens_views_by_coc(
         images.append(torch.where(known > 0, average, seen[0]))
         shares.append(known)
     return LensViews(torch.cat(images).to(image.dtype), torch.cat(shares).to(image.dtype))
+
+
+def _split(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Light, coc and cover of the surface in front, and of the one behind it where a pixel holds two."""
+    own, other, other_coc, share = background.split_mixed(image, coc)
+    mixed = share > 1e-3
+    in_front, behind = mixed & (other_coc < coc), mixed & (other_coc >= coc)
+    front = torch.where(in_front, other, torch.where(behind, own, image))
+    cover = torch.where(in_front, share, torch.where(behind, 1.0 - share, 1.0))
+    return [
+        (front, torch.where(in_front, other_coc, coc), cover),
+        (torch.where(in_front, own, other), torch.where(in_front, coc, other_coc), mixed.to(image.dtype)),
+    ]
 
 
 def _average(
@@ -179,7 +191,7 @@ def _average(
     device = extra.device
     # In float64 the mean of equal views is exact: what is in focus comes back unchanged.
     total = torch.zeros(count, channels, dtype=torch.float64, device=device)
-    seen = torch.zeros(count, dtype=torch.float64, device=device)
+    glare, seen = torch.zeros_like(total), torch.zeros(count, dtype=torch.float64, device=device)
     dice = torch.rand(squares.cover.shape, generator=torch.Generator().manual_seed(0)).to(device)
     for view in range(lens.views):
         # A square that covers 30 % of its pixel is there in 30 % of the views.
@@ -194,8 +206,9 @@ def _average(
         total += drawn / covered.clamp_min(1.0)[:, None]
         seen += covered > 0
         if bright.numel():
-            _draw_points(total, front, squares, bright, extra, lens, view, height, width)
-    image = (total / seen.clamp_min(1.0)[:, None]).clamp_min(0.0).float()
+            _draw_points(glare, front, squares, bright, extra, lens, view, height, width)
+    # What is unknown looks like what is known, except for highlights: they are not made up.
+    image = (total / seen.clamp_min(1.0)[:, None] + glare / lens.views).clamp_min(0.0).float()
     return image.T.reshape(1, channels, height, width), (seen / lens.views).float().reshape(1, 1, height, width)
 
 
@@ -268,7 +281,7 @@ def _draw(
 
 
 def _draw_points(
-    total: Tensor,
+    glare: Tensor,
     front: Tensor,
     squares: _Squares,
     bright: Tensor,
@@ -288,4 +301,4 @@ def _draw_points(
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         target = (row * width + column).long()[inside]
         visible = coc[inside] <= front[target] + _SAME_DEPTH_PX
-        total.index_add_(0, target[visible], light[inside][visible] / lens.points_per_view)
+        glare.index_add_(0, target[visible], light[inside][visible] / lens.points_per_view)

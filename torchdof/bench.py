@@ -1,0 +1,253 @@
+"""``torchdof bench``: how close to the truth each renderer comes, as a table and as pictures."""
+
+import contextlib
+import csv
+import dataclasses
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import torch.nn.functional as functional
+import typer
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from . import metrics
+from .files import Picture, whole_file, write_image
+from .module import DepthOfField
+from .reference import lens_views
+from .scenes import Scene, read_scenes
+from .table import BlurTable
+from .transfer import decode
+
+__all__ = ["Score", "bench", "ikoma", "measure", "renderers"]
+
+Renderer = Callable[[Scene], Tensor]
+
+_TILE_PX = 128
+_ERROR_GAIN = 4.0
+_MEASURES = {
+    "psnr_display": "PSNR in dB, display-encoded (clipped to [0, 1], sRGB curve), peak 1",
+    "psnr_linear": "PSNR in dB, linear light, peak 1",
+    "ssim": "SSIM, display-encoded",
+    "flip": "mean FLIP, display-encoded (less is better)",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """What one renderer reached on one scene; ``flip`` is NaN where it cannot be computed."""
+
+    scene: str
+    renderer: str
+    psnr_display: float
+    psnr_linear: float
+    ssim: float
+    flip: float
+
+
+def renderers(views: int = 256) -> dict[str, Renderer]:
+    """What is compared, by name, as functions of a scene; the disc as kernel, every renderer at its finest.
+
+    Args:
+        views: Points on the lens that the reference renderer sees the scene from.
+
+    Example:
+        >>> list(renderers())
+        ['untouched', 'scatter', 'ikoma', 'torchdof', 'reference']
+    """
+
+    def layered(**options: bool) -> Renderer:
+        return lambda scene: DepthOfField(scene.camera, tolerance=0, **options)(scene.image, scene.depth)
+
+    return {
+        "untouched": lambda scene: scene.image,
+        "scatter": layered(occlusion=False),
+        "ikoma": ikoma,
+        "torchdof": layered(),
+        "reference": lambda scene: lens_views(scene.image, scene.depth, scene.camera, views=views).image,
+    }
+
+
+def ikoma(scene: Scene, spacing_px: float = 0.75) -> Tensor:
+    """The formula that torchdof builds on, as published: nothing hidden, no mixed pixels, dense layers, exact discs.
+
+    The frame is continued outwards as it is at its border; where a hole is left the rest is scaled up.
+
+    Args:
+        scene: The scene.
+        spacing_px: Largest distance between layers, in circle of confusion.
+
+    Returns:
+        ``[1, C, H, W]``, linear light.
+
+    Reference:
+        Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
+    """
+    coc = scene.coc_px.double()
+    low, high = float(coc.min()), float(coc.max())
+    nodes = torch.linspace(low, high, 2 + int((high - low) / spacing_px), dtype=torch.float64)
+    place = (coc - low) / max(high - low, 1e-9) * (len(nodes) - 1)
+    kernels = BlurTable.disc().kernels(nodes, coc.shape[-1])[:, 0]
+    half = kernels.shape[-1] // 2
+    light, place = (functional.pad(x, (half,) * 4, mode="replicate") for x in (scene.image.double(), place))
+    size = (light.shape[-2] + 2 * half, light.shape[-1] + 2 * half)
+    out, room = torch.zeros_like(scene.image, dtype=torch.float64), torch.zeros_like(place)
+    covered = torch.zeros_like(coc)
+    for k in reversed(range(len(nodes))):  # far to near
+        share = (1.0 - (place - k).abs()).clamp_min(0.0)
+        room = room + share
+        stack = torch.cat([light * share, share, room], 1)
+        spectrum = torch.fft.rfft2(stack, size) * torch.fft.rfft2(kernels[k], size)
+        blurred = torch.fft.irfft2(spectrum, size)[..., 2 * half : size[0] - 2 * half, 2 * half : size[1] - 2 * half]
+        seen = blurred[:, -1:].clamp_min(1e-6)
+        left = 1.0 - (blurred[:, -2:-1] / seen).clamp(0.0, 1.0)
+        out = blurred[:, :-2].clamp_min(0.0) / seen + left * out
+        covered = 1.0 - left + left * covered
+    return (out / covered.clamp_min(1e-6)).to(scene.image.dtype)
+
+
+def measure(name: str, image: Tensor, scene: Scene, margin_px: int = 0) -> Score:
+    """Compares a rendering with the scene's truth.
+
+    Args:
+        name: Name of the renderer.
+        image: ``[1, C, H, W]``, linear light.
+        scene: The scene.
+        margin_px: Border that is left out.
+
+    Returns:
+        The score.
+
+    Raises:
+        ValueError: If the margin leaves nothing, or the shapes differ.
+    """
+    height, width = scene.truth.shape[-2:]
+    if not 0 <= margin_px < min(height, width) // 2 - 5:
+        raise ValueError(
+            f"a margin of {margin_px} pixels leaves too little of {width} x {height}; compare whole frames"
+        )
+    image, truth = (functional.pad(x, (-margin_px,) * 4) for x in (image, scene.truth))
+    shown, wanted = metrics.display(image), metrics.display(truth)
+    flip = metrics.flip(shown, wanted) if metrics.has_flip() and shown.shape[1] == 3 else math.nan
+    psnrs = metrics.psnr(shown, wanted), metrics.psnr(image, truth)
+    return Score(scene.name, name, *psnrs, metrics.ssim(shown, wanted), flip)
+
+
+def bench(
+    truth: Annotated[
+        Path,
+        typer.Option(
+            "--truth",
+            help="Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for accuracy.csv, accuracy.md and accuracy.png.")],
+    views: Annotated[int, typer.Option(help="Points on the lens for the reference renderer.", min=1)] = 256,
+    inner: Annotated[
+        bool, typer.Option("--inner", help="Leave out the border that light from outside the frame reaches.")
+    ] = False,
+) -> None:
+    """Measure the accuracy of torchdof and of simpler renderers against scenes whose depth of field is known.
+
+    The picture shows, for each scene, the place where torchdof is farthest from the truth: sharp, truth, each renderer
+    with its error below it, four times enlarged.
+    """
+    if not out.is_dir():
+        raise FileNotFoundError(f"{out}: there is no such folder; make it first")
+    console = Console(stderr=True)
+    scenes = list(read_scenes(truth))
+    compared = renderers(views)
+    scores, rows = [], []
+    for scene in track(scenes, "scenes", console=console, transient=True, disable=not console.is_terminal):
+        images = {name: render(scene) for name, render in compared.items()}
+        scores += [measure(name, image, scene, scene.margin_px * inner) for name, image in images.items()]
+        rows.append(_worst(scene, images))
+    names = list(compared)
+    text = _markdown(scores, names, [scene.name for scene in scenes], views, inner)
+    sheet = Picture(torch.cat(rows, 2), transfer="srgb", sample="8")
+    with contextlib.ExitStack() as files:  # all of them or none
+        csv_file, md_file, png_file = (
+            files.enter_context(whole_file(out / f"accuracy.{s}")) for s in ("csv", "md", "png")
+        )
+        csv_file.write_text(_csv(scores), encoding="utf-8")
+        md_file.write_text(text, encoding="utf-8")
+        write_image(png_file, sheet)
+    _show(scores, names, [scene.name for scene in scenes])
+
+
+def _csv(scores: Iterable[Score]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([field.name for field in dataclasses.fields(Score)])
+    writer.writerows(
+        [f"{value:.6g}" if isinstance(value, float) else value for value in dataclasses.astuple(score)]
+        for score in scores
+    )
+    return text.getvalue()
+
+
+def _cells(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str], what: str) -> list[list[str]]:
+    """Rows of a table, a scene each, and their mean."""
+    found: Mapping[tuple[str, str], float] = {(s.scene, s.renderer): getattr(s, what) for s in scores}
+    digits = 2 if what.startswith("psnr") else 4
+    rows = [[scene, *(f"{found[scene, name]:.{digits}f}" for name in names)] for scene in scenes]
+    means = [sum(found[scene, name] for scene in scenes) / len(scenes) for name in names]
+    return [*rows, ["mean", *(f"{mean:.{digits}f}" for mean in means)]]
+
+
+def _markdown(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str], views: int, inner: bool) -> str:
+    where = "the frame without the border that light from outside reaches" if inner else "the whole frame"
+    parts = ["# Accuracy against the truth\n", f"Over {where}; the reference renderer with {views} views.\n"]
+    for what, meaning in _MEASURES.items():
+        if all(math.isnan(getattr(score, what)) for score in scores):
+            continue
+        lines = [["scene", *names], ["---"] * (len(names) + 1), *_cells(scores, names, scenes, what)]
+        parts += [f"## {meaning}\n", *("| " + " | ".join(line) + " |" for line in lines), ""]
+    parts += [
+        "## accuracy.png\n",
+        f"A row a scene, in the order above: {_TILE_PX} pixels around the place where torchdof is worst. From the "
+        f"left: sharp, truth, {', '.join(names)}; below each, its error in the display-encoded picture times "
+        f"{_ERROR_GAIN:g}.",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _show(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str]) -> None:
+    table = Table(title=_MEASURES["psnr_display"])
+    for column in ("scene", *names):
+        table.add_column(column, justify="left" if column == "scene" else "right")
+    *rows, mean = _cells(scores, names, scenes, "psnr_display")
+    for row in rows:
+        table.add_row(*row)
+    table.add_section()
+    table.add_row(*mean)
+    Console().print(table)
+
+
+def _worst(scene: Scene, images: Mapping[str, Tensor]) -> Tensor:
+    """The surroundings of the worst pixels of torchdof: ``[1, 3, 2 tile, n tile]``, linear light."""
+    truth = metrics.display(scene.truth)
+    error = (metrics.display(images["torchdof"]) - truth).square().mean(1, keepdim=True)
+    error = functional.avg_pool2d(error, 9, 1, 4)
+    height, width = error.shape[-2:]
+    row, column = divmod(int(error.argmax()), width)
+    top = min(max(row - _TILE_PX // 2, 0), max(height - _TILE_PX, 0))
+    left = min(max(column - _TILE_PX // 2, 0), max(width - _TILE_PX, 0))
+
+    def tile(image: Tensor) -> Tensor:
+        part = image[:, :3, top : top + _TILE_PX, left : left + _TILE_PX].expand(-1, 3, -1, -1)
+        return functional.pad(part, (0, _TILE_PX - part.shape[-1], 0, _TILE_PX - part.shape[-2]))
+
+    def difference(image: Tensor) -> Tensor:
+        return (_ERROR_GAIN * (metrics.display(image) - truth).abs()).clamp(0.0, 1.0)
+
+    pictures = [scene.image, scene.truth, *images.values()]
+    upper = torch.cat([metrics.display(tile(image)) for image in pictures], 3)
+    lower = torch.cat([tile(difference(image)) for image in pictures], 3)
+    return decode(torch.cat([upper, lower], 2), "srgb", has_alpha=False, straight=False)
