@@ -22,7 +22,8 @@ def run(*arguments: object):
 
 def test_ikoma_renders_two_planes_focused_on_the_near_one() -> None:
     planes = [Plane(2.0, waves(1, (0.6, 0.3, 0.2)), posts(40, 15)), Plane(6.0, waves(2))]
-    scene = plane_scene(planes, CAMERA, (60, 96), samples=256)
+    camera = camera_of(200.0, 96, aperture_radius_m=0.1, focus_m=2.0)
+    scene = plane_scene(planes, camera, (60, 96), samples=512)
     out = metrics.display(bench.ikoma(scene))
     assert metrics.psnr(metrics.display(scene.image), metrics.display(scene.truth), scene.inner) < 32
     assert metrics.psnr(out, metrics.display(scene.truth), scene.inner) > 36
@@ -41,6 +42,11 @@ def test_measure_leaves_the_margin_out() -> None:
     scene = Scene("flat", truth, truth[:, :1], CAMERA, truth)
     assert bench.measure("a", image, scene, margin_px=3).psnr_linear == math.inf
     assert bench.measure("a", image, scene, margin_px=2).psnr_linear < 40
+    known = truth[:, :1] == 0.5
+    known[..., :2, :] = False
+    whole, partly = bench.measure("a", image, scene, 1), bench.measure("a", image, scene, 1, known)
+    assert math.isnan(whole.psnr_known)
+    assert partly.psnr_known > partly.psnr_display > 20
     with pytest.raises(ValueError, match="leaves too little of 50 x 40"):
         bench.measure("a", image, scene, margin_px=20)
 
@@ -54,8 +60,9 @@ def test_bench_writes_a_table_and_a_picture(tmp_path: Path) -> None:
     assert sorted(p.name for p in out.iterdir()) == ["accuracy.csv", "accuracy.md", "accuracy.png"]
     with (out / "accuracy.csv").open() as file:
         rows = {row["renderer"]: row for row in csv.DictReader(file)}
-    assert list(rows) == list(bench.renderers())
+    assert list(rows) == [*bench.renderers(), "reference"]
     scene = next(read_scenes(scenes))
+    assert float(rows["reference"]["psnr_known"]) > float(rows["ikoma"]["psnr_known"]) + 1
     score = bench.measure("untouched", scene.image, scene)
     assert float(rows["untouched"]["psnr_display"]) == pytest.approx(score.psnr_display, rel=1e-5)
     assert float(rows["torchdof"]["psnr_display"]) > float(rows["untouched"]["psnr_display"]) + 10

@@ -33,6 +33,7 @@ _TILE_PX = 128
 _ERROR_GAIN = 4.0
 _MEASURES = {
     "psnr_display": "PSNR in dB, display-encoded (clipped to [0, 1], sRGB curve), peak 1",
+    "psnr_known": "the same where nothing hidden is uncovered: where every view of the reference sees a surface",
     "psnr_linear": "PSNR in dB, linear light, peak 1",
     "ssim": "SSIM, display-encoded",
     "flip": "mean FLIP, display-encoded (less is better)",
@@ -41,25 +42,23 @@ _MEASURES = {
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """What one renderer reached on one scene; ``flip`` is NaN where it cannot be computed."""
+    """What one renderer reached on one scene; NaN is what cannot be computed."""
 
     scene: str
     renderer: str
     psnr_display: float
+    psnr_known: float
     psnr_linear: float
     ssim: float
     flip: float
 
 
-def renderers(views: int = 256) -> dict[str, Renderer]:
-    """What is compared, by name, as functions of a scene; the disc as kernel, every renderer at its finest.
-
-    Args:
-        views: Points on the lens that the reference renderer sees the scene from.
+def renderers() -> dict[str, Renderer]:
+    """What is compared with the reference, by name, as functions of a scene; disc kernels, each at its finest.
 
     Example:
         >>> list(renderers())
-        ['untouched', 'scatter', 'ikoma', 'torchdof', 'reference']
+        ['untouched', 'scatter', 'ikoma', 'torchdof']
     """
 
     def layered(**options: bool) -> Renderer:
@@ -70,7 +69,6 @@ def renderers(views: int = 256) -> dict[str, Renderer]:
         "scatter": layered(occlusion=False),
         "ikoma": ikoma,
         "torchdof": layered(),
-        "reference": lambda scene: lens_views(scene.image, scene.depth, scene.camera, views=views).image,
     }
 
 
@@ -112,7 +110,7 @@ def ikoma(scene: Scene, spacing_px: float = 0.75) -> Tensor:
     return (out / covered.clamp_min(1e-6)).to(scene.image.dtype)
 
 
-def measure(name: str, image: Tensor, scene: Scene, margin_px: int = 0) -> Score:
+def measure(name: str, image: Tensor, scene: Scene, margin_px: int = 0, known: Tensor | None = None) -> Score:
     """Compares a rendering with the scene's truth.
 
     Args:
@@ -120,6 +118,7 @@ def measure(name: str, image: Tensor, scene: Scene, margin_px: int = 0) -> Score
         image: ``[1, C, H, W]``, linear light.
         scene: The scene.
         margin_px: Border that is left out.
+        known: Pixels ``[1, 1, H, W]`` (bool) that ``psnr_known`` is taken over; None: none.
 
     Returns:
         The score.
@@ -135,8 +134,11 @@ def measure(name: str, image: Tensor, scene: Scene, margin_px: int = 0) -> Score
     image, truth = (functional.pad(x, (-margin_px,) * 4) for x in (image, scene.truth))
     shown, wanted = metrics.display(image), metrics.display(truth)
     flip = metrics.flip(shown, wanted) if metrics.has_flip() and shown.shape[1] == 3 else math.nan
-    psnrs = metrics.psnr(shown, wanted), metrics.psnr(image, truth)
-    return Score(scene.name, name, *psnrs, metrics.ssim(shown, wanted), flip)
+    whole, linear, partly = metrics.psnr(shown, wanted), metrics.psnr(image, truth), math.nan
+    if known is not None:
+        known = functional.pad(known, (-margin_px,) * 4)
+        partly = metrics.psnr(shown, wanted, known) if bool(known.any()) else math.nan
+    return Score(scene.name, name, whole, partly, linear, metrics.ssim(shown, wanted), flip)
 
 
 def bench(
@@ -162,13 +164,16 @@ def bench(
         raise FileNotFoundError(f"{out}: there is no such folder; make it first")
     console = Console(stderr=True)
     scenes = list(read_scenes(truth))
-    compared = renderers(views)
+    compared = renderers()
     scores, rows = [], []
     for scene in track(scenes, "scenes", console=console, transient=True, disable=not console.is_terminal):
         images = {name: render(scene) for name, render in compared.items()}
-        scores += [measure(name, image, scene, scene.margin_px * inner) for name, image in images.items()]
+        seen = lens_views(scene.image, scene.depth, scene.camera, views=views)
+        images["reference"] = seen.image
+        margin, known = scene.margin_px * inner, seen.known == 1
+        scores += [measure(name, image, scene, margin, known) for name, image in images.items()]
         rows.append(_worst(scene, images))
-    names = list(compared)
+    names = [*compared, "reference"]
     text = _markdown(scores, names, [scene.name for scene in scenes], views, inner)
     sheet = Picture(torch.cat(rows, 2), transfer="srgb", sample="8")
     with contextlib.ExitStack() as files:  # all of them or none
