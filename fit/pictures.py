@@ -40,7 +40,7 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         raise FitError("this fit carries no samples to draw")
     figure, axes = _figure(5.4, 3.6)
     forward = fit.model == "forward"
-    axes.plot(*fit.samples, ".", color=_DATA, markersize=2.5 if forward else 4, label="measured", zorder=1)
+    axes.plot(*fit.samples, ".", color=_DATA, markersize=2.5 if forward else 4, label="samples" if not forward else "pixels", zorder=1)
     if forward:
         r, level = _averaged(*fit.curve)
         axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)

@@ -1,0 +1,157 @@
+"""The figures of Sato, Dobashi and Yamamoto (J-15), from their Table 1 and from a simulated capture.
+
+Usage: python examples/paper.py --out out
+
+First the shipped table ``sato_j15``: its curve, its blur texture, a blurred quad. Then the paper's own experiment with a
+lens prescription in the place of the camera: a white dot on black paper, in focus at 0.20 m, photographed there and at
+0.50 m; read back from the files, fitted both ways (the paper's ratio and the forward model), made a table, and rendered.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import torchdof
+from torchdof.files import Picture, write_image
+from torchdof.fit import BlurFit, blur_strength, fit_captures, fit_pair, fit_profile, read_captures
+from torchdof.fit.lens import Lens
+from torchdof.fit.pictures import picture_of_fit, picture_of_quad, picture_of_table, picture_of_texture
+from torchdof.fit.spot import Spot, focus_sensor, point_spread
+
+FOCUS_M, PAPER_M = 0.20, 0.50  # where the dot is in focus, and where it is photographed out of focus
+WIDTH, HEIGHT, SENSOR_MM = 480, 360, 9.0  # the middle of a 36 mm sensor of 1920 pixels
+DOT_RADIUS_MM, F_NUMBER = 1.5, 16.0
+NOISE, WHITE = 0.003, 0.8
+
+
+def main() -> None:
+    """Draw everything."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
+    parser.add_argument("--lens", default="double_gauss_50mm", help="prescription: a file or the name of a shipped one")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    draw_table_1(arguments.out)
+    draw_experiment(arguments.out, Lens.read(arguments.lens).with_f_number(F_NUMBER))
+
+
+def draw_table_1(out: Path) -> None:
+    """Figures 2 to 4 from the numbers of Table 1; the paper's own samples are not published."""
+    table = torchdof.BlurTable.load("sato_j15")
+    sigma, r_c = (float(table.node_params[k][0, 0]) for k in ("sigma", "r_c"))
+    strength = 0.0 if table.strength is None else float(table.strength[0])
+    r = np.linspace(0, 8e-3, 81)
+    fit = fit_profile(r, strength * np.exp(-((r - r_c) ** 2) / (2 * sigma**2)))
+    picture_of_fit(fit, unit="m on the paper", title="eq. (1) with Table 1").savefig(out / "sato_fig2.png")
+    width, field_m = 512, 0.2  # a quad of 80 mm at 0.50 m in a field of 200 mm
+    coc_px = float(table.coc[0]) / field_m * width
+    picture_of_texture(table, coc_px, width).savefig(out / "sato_fig3.png")
+    sharp = quad(width, width, 0.08 / field_m * width)
+    coc = torch.full((1, 1, width, width), coc_px)
+    blurred = torchdof.blur_by_coc(sharp[None, None], coc, table=table)
+    picture_of_quad(sharp.numpy(), blurred[0, 0].numpy(), "a quad at 0.50 m, focus at 0.20 m: sato_j15").savefig(
+        out / "sato_fig4.png"
+    )
+    print(f"sato_j15: N = {fit.params['N']:.5g}, r_c = {fit.params['r_c']:.5g} m, sigma = {fit.params['sigma']:.5g} m")
+
+
+def draw_experiment(out: Path, lens: Lens) -> None:
+    """The paper's experiment, all the way to Fig. 4."""
+    folder = out / "capture"
+    spot = photograph(folder, lens)
+    (captures,) = read_captures(folder)
+    (pair,) = captures.pairs
+
+    ratio = fit_pair(pair.sharp, pair.blurred, model="ratio")
+    picture_of_fit(ratio, title="the paper's ratio, eq. (1)").savefig(out / "traced_fig2_ratio.png")
+    say("the paper's ratio, which measures the dot and the kernel together", ratio)
+    print(f"  from {blur_strength(pair.sharp, pair.blurred)[0].size} samples along 36 spokes")
+
+    result = fit_captures(captures, command="examples/paper.py")
+    (forward,) = result.fits
+    picture_of_fit(forward).savefig(out / "traced_fig2_forward.png")
+    say("the forward model, which measures the kernel", forward)
+
+    table = result.table
+    table.save(out / "traced.json")
+    picture_of_table(table).savefig(out / "traced_table.png")
+    (coc_px,) = result.coc_px
+    picture_of_texture(table, coc_px, WIDTH).savefig(out / "traced_fig3.png")
+
+    camera = torchdof.Camera(
+        focal_length_mm=lens.paraxial().focal_length, f_number=F_NUMBER, focus_m=FOCUS_M, sensor_width_mm=SENSOR_MM
+    )
+    dof = torchdof.DepthOfField(camera, table, occlusion=False)
+    sharp = quad(WIDTH, HEIGHT, 150)
+    depth = torch.full((1, 1, HEIGHT, WIDTH), PAPER_M)
+    blurred = dof(sharp[None, None], depth)[0, 0].numpy()
+    truth = blur(sharp.numpy(), spot)
+    title = f"a quad at {PAPER_M} m, focus at {FOCUS_M} m: {table.name}"
+    picture_of_quad(sharp.numpy(), blurred, title).savefig(out / "traced_fig4.png")
+    inner = slice(60, -60), slice(60, -60)
+    error = float(np.mean((blurred - truth)[inner] ** 2))
+    print(f"quad against the traced spot itself: {-10 * np.log10(error):.1f} dB")
+
+
+def photograph(folder: Path, lens: Lens) -> Spot:
+    """Two photographs of the dot with their capture.toml; returns the traced spot at the paper's second place."""
+    folder.mkdir(parents=True, exist_ok=True)
+    sensor = focus_sensor(lens, FOCUS_M)
+    focal = lens.paraxial().focal_length
+    image_mm = FOCUS_M * focal / (FOCUS_M - focal / 1000)  # image distance
+    rng = np.random.default_rng(15)
+    for distance in (FOCUS_M, PAPER_M):
+        spot = point_spread(lens, distance, sensor, rays=200_000)
+        radius_px = DOT_RADIUS_MM * image_mm / (1000 * distance) * WIDTH / SENSOR_MM
+        light = WHITE * blur(disc(radius_px), spot) + 0.02
+        pixels = torch.from_numpy(light + rng.normal(0, NOISE, light.shape)).float()
+        write_image(
+            folder / f"{1000 * distance:.0f}mm.png",
+            Picture(pixels.expand(1, 3, -1, -1)),
+            transfer="srgb",
+            sample="16",
+        )
+    (folder / "capture.toml").write_text(
+        f'focus_m = {FOCUS_M}\nsharp = "{1000 * FOCUS_M:.0f}mm.png"\nfocal_length_mm = {focal:.4f}\n'
+        f'f_number = {F_NUMBER}\nsensor_width_mm = {SENSOR_MM}\nname = "{lens.name} at 0.20 m"\n'
+        f'[[shot]]\nfile = "{1000 * PAPER_M:.0f}mm.png"\ndistance_m = {PAPER_M}\n',
+        encoding="utf-8",
+    )
+    return spot
+
+
+def blur(picture: np.ndarray, spot: Spot) -> np.ndarray:
+    """The picture as the lens spreads it: rays collected by the pixels of a square that holds the spot."""
+    from scipy.signal import fftconvolve
+
+    scale = WIDTH / SENSOR_MM
+    half = int(np.ceil(spot.radius * scale)) + 1
+    edges = np.arange(-half, half + 2) - 0.5
+    kernel, _, _ = np.histogram2d(spot.y * scale, spot.x * scale, bins=(edges, edges), weights=spot.weight)
+    return np.asarray(fftconvolve(picture, kernel / kernel.sum(), mode="same"))
+
+
+def disc(radius_px: float, fine: int = 8) -> np.ndarray:
+    """The white dot in the middle of the frame."""
+    y, x = ((np.arange(n * fine) + 0.5) / fine - n / 2 for n in (HEIGHT, WIDTH))
+    inside = np.hypot(y[:, None], x[None, :]) <= radius_px
+    return np.asarray(inside.reshape(HEIGHT, fine, WIDTH, fine).mean((1, 3)))
+
+
+def quad(width: int, height: int, side: float) -> torch.Tensor:
+    """A white quad in the middle of a black frame."""
+    picture = torch.zeros(height, width)
+    top, left = round((height - side) / 2), round((width - side) / 2)
+    picture[top : height - top, left : width - left] = 1.0
+    return picture
+
+
+def say(what: str, fit: BlurFit) -> None:
+    """Print a fit."""
+    print(f"{what}:\n{fit.summary()}")
+
+
+if __name__ == "__main__":
+    main()
