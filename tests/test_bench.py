@@ -55,7 +55,7 @@ def test_bench_writes_a_table_and_a_picture(tmp_path: Path) -> None:
     scenes, out = tmp_path / "scenes", tmp_path / "out"
     shutil.copytree(DATA / "room", scenes / "room")
     out.mkdir()
-    result = run("--truth", scenes, "--out", out, "--views", 16)
+    result = run("--truth", scenes, "--out", out, "--views", 128)
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in out.iterdir()) == ["accuracy.csv", "accuracy.md", "accuracy.png"]
     with (out / "accuracy.csv").open() as file:
