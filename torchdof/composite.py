@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from .frame import Frame
 from .plan import Blur, Plan
-from .spread import Spread
+from .spread import Spread, fold
 
-__all__ = ["accumulate", "over"]
+__all__ = ["accumulate", "accumulate_once", "over"]
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 
@@ -77,6 +78,38 @@ def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, norm
         else:
             total[tiles] += light
             weight[tiles] += share
+    if normalize:
+        total = torch.where(weight > _LEAST, total / weight.clamp_min(_LEAST), 0.0)
+    return frame.image(total)
+
+
+def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool) -> Tensor:
+    """The same scatter as :func:`accumulate`, as the paper does it: one pass, in which each pixel has its own kernel.
+
+    Args:
+        frame: The surface seen in each pixel; not tiled.
+        plan: Where the layers are; a pixel's kernel is interpolated between the nodes around its coc.
+        blurs: Kernel of each layer, at full resolution.
+        normalize: As in :func:`accumulate`.
+
+    Returns:
+        ``[B, C, H, W]``.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and accumulate.
+    """
+    halo = frame.margin
+    ((_, window),) = frame.windows([0], halo)
+    terms = [window.terms(plan.nodes, k, with_room=True)[1] for k in range(len(plan.nodes))]
+    kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
+    light = window.samples[0].light
+    known = torch.ones_like(light) if window.known is None else window.known.expand_as(light)
+    if kernels.shape[1] == 1:
+        scattered = fold(torch.cat([light, known[:, :1]], 1), kernels, torch.cat(terms, 1))
+    else:
+        scattered = fold(torch.cat([light, known], 1), kernels.repeat(1, 2, 1, 1), torch.cat(terms, 1))
+    scattered = scattered[..., halo : scattered.shape[-2] - halo, halo : scattered.shape[-1] - halo]
+    total, weight = scattered[:, : light.shape[1]], scattered[:, light.shape[1] :]
     if normalize:
         total = torch.where(weight > _LEAST, total / weight.clamp_min(_LEAST), 0.0)
     return frame.image(total)

@@ -264,6 +264,8 @@ def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
     spread = layers_by_conv if layered else layers_by_fold
     if options.occlusion:
         out = composite.over(frame, plan, blurs, spread)
+    elif options.method == "fold":
+        out = composite.accumulate_once(frame, plan, blurs, options.normalize)
     else:
         out = composite.accumulate(frame, plan, blurs, spread, options.normalize)
     return out if valid is None else torch.where(valid, out, image)
