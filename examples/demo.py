@@ -53,7 +53,7 @@ def main() -> None:
             camera = torchdof.Camera.from_fov(fov_x_deg, APERTURE_RADIUS_M, focus_m)
             dof = torchdof.DepthOfField(camera)
             start = time.perf_counter()
-            with torch.inference_mode():
+            with torch.no_grad():
                 blurred = dof(picture.pixels, depth)
             seconds = time.perf_counter() - start
             coc_px = camera.coc_px(depth, width)

@@ -187,7 +187,7 @@ def render_frame(
         table = _with_alpha(settings.table) if picture.has_alpha else settings.table
         how: dict[str, Any] = {"table": table, "tolerance": settings.tolerance}
         how |= {"occlusion": settings.occlusion, "method": settings.method}
-        with torch.inference_mode():
+        with torch.no_grad():
             blurred = (
                 blur_by_coc(pixels, coc_px, **how) if camera is None else depth_of_field(pixels, values, camera, **how)
             )

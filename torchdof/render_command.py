@@ -243,7 +243,8 @@ def _progress() -> Iterator[Progress]:
     """A bar on standard error, where that is a terminal."""
     columns = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
     columns += [TimeElapsedColumn(), TimeRemainingColumn()]
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True) as progress:
+    progress = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True)
+    with contextlib.nullcontext() if progress.disable else progress:
         yield progress
 
 
