@@ -165,8 +165,10 @@ def point_spread(
         share = (np.arange(rays) + 0.5) / rays
         x, y = np.zeros(rays), high[1] * np.sqrt(share)
         if math.isfinite(object_mm):
-            cosine = 1.0 - share * (1.0 - 1.0 / math.hypot(1.0, high[1] / point.distance))
-            y = point.distance * np.tan(np.arccos(cosine))
+            # 1 - cosine, without the cancellation that a far object would suffer
+            secant = math.hypot(1.0, high[1] / point.distance)
+            fall = share * (high[1] / point.distance) ** 2 / (secant * (1.0 + secant))
+            y = point.distance * np.sqrt(fall * (2.0 - fall)) / (1.0 - fall)
     else:
         side = max(4, round(math.sqrt(rays)))
         steps = (np.arange(side) + 0.5) / side

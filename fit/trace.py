@@ -97,7 +97,7 @@ def trace_table(
         raise ValueError(f"nearest_m must be nearer than the focus at {focus_m} m, got {nearest_m}")
     count = rays or (50_000 if field_mm else 2_000)
     call = (
-        f"Lens.read({lens.name!r}), f_number={f_number:g}, focus_m={focus_m:g}, nearest_m={nearest_m:g}, "
+        f"Lens.read({lens.name!r}), f_number={f_number!r}, focus_m={focus_m!r}, nearest_m={nearest_m!r}, "
         f"nodes={nodes}, family={family!r}, points={points}, focus={focus!r}, reference={reference!r}, "
         f"field_mm={field_mm:g}, wavelengths_um={wavelengths_um}, sensor_width_mm={sensor_width_mm:g}, "
         f"width_px={width_px}, rays={count}"
