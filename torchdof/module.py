@@ -224,27 +224,36 @@ def blur_by_coc(
     table = BlurTable.disc() if table is None else table
     options = Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)
     checks.image_and_coc(image, coc_px, table, values=check)
+    if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
+        with torch.autocast(image.device.type, enabled=False):
+            return _blur(image, coc_px, plan, options)
+    return _blur(image, coc_px, plan, options)
+
+
+def _blur(image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options) -> Tensor:
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     light, coc = image.to(wide), coc_px.to(wide).expand(image.shape[0], -1, -1, -1)
     if plan is None and _traced():
-        plan = Plan.all(max_coc_px, tolerance)
+        plan = Plan.all(options.max_coc_px, options.tolerance)
     elif plan is None and torch.is_grad_enabled() and coc_px.requires_grad:
-        plan = Plan.still(coc, tolerance)
+        plan = Plan.still(coc, options.tolerance)
     if plan is not None:
         return _render(light, coc, plan, options).to(image.dtype)
     # each item has its own layers, as it would have alone
     pairs = zip(light.split(1), coc.split(1), strict=True)
-    items = [_render(one, its_coc, Plan.of_scene(its_coc, tolerance), options) for one, its_coc in pairs]
+    items = [_render(one, its_coc, Plan.of_scene(its_coc, options.tolerance), options) for one, its_coc in pairs]
     return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
 
 
 def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
     if plan.nodes == (0.0,):
-        return light.clone()
+        # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
+        return light + 0.0 * torch.nan_to_num(coc) if torch.is_grad_enabled() and coc.requires_grad else light.clone()
     image, valid = light, None
     if not options.check:
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
         coc, light = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0)
+    coc = coc.clamp(plan.coc_px[0], plan.coc_px[-1])  # beyond, blurs are alike; differences of huge ones would cancel
     weight = None if valid is None else valid.to(light.dtype)
     layered = options.method == "layered"
     blurs = plan.blurs(options.table, light.shape[-2:], light.dtype, light.device, coarse=layered)

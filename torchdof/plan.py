@@ -76,6 +76,7 @@ class Plan:
         Traced code holds the kernels as constants, so a table that is tied to the width of the image ties it as well.
         """
         width = 1 if table.unit == "relative" else int(size[1])
+        coarse = coarse and len(self.nodes) > 1  # a plane is exact
         scales = [self._scale(coc) if coarse else 1 for coc in self.coc_px]
         if torch.compiler.is_compiling():
             shapes = _constant_shapes(table, self.coc_px, width, tuple(scales))
