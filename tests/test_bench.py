@@ -55,19 +55,20 @@ def test_bench_writes_a_table_and_a_picture(tmp_path: Path) -> None:
     scenes, out = tmp_path / "scenes", tmp_path / "out"
     shutil.copytree(DATA / "room", scenes / "room")
     out.mkdir()
-    result = run("--truth", scenes, "--out", out, "--views", 128)
+    result = run("--truth", scenes, "--out", out, "--views", 128, "--views", 4)
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in out.iterdir()) == ["accuracy.csv", "accuracy.md", "accuracy.png"]
     with (out / "accuracy.csv").open() as file:
         rows = {row["renderer"]: row for row in csv.DictReader(file)}
-    assert list(rows) == [*bench.renderers(), "reference"]
+    assert list(rows) == [*bench.renderers(), "reference 4", "reference 128"]
     scene = next(read_scenes(scenes))
-    assert float(rows["reference"]["psnr_known"]) > float(rows["ikoma"]["psnr_known"]) + 1
+    assert float(rows["reference 128"]["psnr_known"]) > float(rows["ikoma"]["psnr_known"]) + 1
+    assert float(rows["reference 128"]["psnr_known"]) > float(rows["reference 4"]["psnr_known"]) + 3
     score = bench.measure("untouched", scene.image, scene)
     assert float(rows["untouched"]["psnr_display"]) == pytest.approx(score.psnr_display, rel=1e-5)
     assert float(rows["torchdof"]["psnr_display"]) > float(rows["untouched"]["psnr_display"]) + 10
     assert f"| room/1 | {score.psnr_display:.2f} |" in (out / "accuracy.md").read_text()
-    assert read_image(out / "accuracy.png").pixels.shape == (1, 3, 2 * 128, 7 * 128)
+    assert read_image(out / "accuracy.png").pixels.shape == (1, 3, 2 * 128, 8 * 128)
 
 
 def test_bench_without_scenes_writes_nothing(tmp_path: Path) -> None:

@@ -150,7 +150,10 @@ def bench(
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for accuracy.csv, accuracy.md and accuracy.png.")],
-    views: Annotated[int, typer.Option(help="Points on the lens for the reference renderer.", min=1)] = 256,
+    views: Annotated[
+        list[int] | None,
+        typer.Option(help="Points on the lens for the reference renderer; repeat it to see how it converges.", min=1),
+    ] = None,
     inner: Annotated[
         bool, typer.Option("--inner", help="Leave out the border that light from outside the frame reaches.")
     ] = False,
@@ -164,17 +167,20 @@ def bench(
         raise FileNotFoundError(f"{out}: there is no such folder; make it first")
     console = Console(stderr=True)
     scenes = list(read_scenes(truth))
-    compared = renderers()
+    compared, counts = renderers(), sorted(set(views or [256]))
+    reference = {n: f"reference {n}" for n in counts}
     scores, rows = [], []
     for scene in track(scenes, "scenes", console=console, transient=True, disable=not console.is_terminal):
         images = {name: render(scene) for name, render in compared.items()}
-        seen = lens_views(scene.image, scene.depth, scene.camera, views=views)
-        images["reference"] = seen.image
-        margin, known = scene.margin_px * inner, seen.known == 1
+        known = torch.ones_like(scene.depth, dtype=torch.bool)
+        for count, name in reference.items():
+            images[name], share = lens_views(scene.image, scene.depth, scene.camera, views=count)
+            known &= share == 1
+        margin = scene.margin_px * inner
         scores += [measure(name, image, scene, margin, known) for name, image in images.items()]
         rows.append(_worst(scene, images))
-    names = [*compared, "reference"]
-    text = _markdown(scores, names, [scene.name for scene in scenes], views, inner)
+    names = [*compared, *reference.values()]
+    text = _markdown(scores, names, [scene.name for scene in scenes], inner)
     sheet = Picture(torch.cat(rows, 2), transfer="srgb", sample="8")
     with contextlib.ExitStack() as files:  # all of them or none
         csv_file, md_file, png_file = (
@@ -206,9 +212,12 @@ def _cells(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str],
     return [*rows, ["mean", *(f"{mean:.{digits}f}" for mean in means)]]
 
 
-def _markdown(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str], views: int, inner: bool) -> str:
+def _markdown(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str], inner: bool) -> str:
     where = "the frame without the border that light from outside reaches" if inner else "the whole frame"
-    parts = ["# Accuracy against the truth\n", f"Over {where}; the reference renderer with {views} views.\n"]
+    parts = [
+        "# Accuracy against the truth\n",
+        f"Over {where}. The reference renderer averages as many views through the lens as its name says.\n",
+    ]
     for what, meaning in _MEASURES.items():
         if all(math.isnan(getattr(score, what)) for score in scores):
             continue
