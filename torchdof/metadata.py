@@ -8,7 +8,14 @@ __all__ = ["camera_facts", "kept_metadata"]
 
 # Facts about how one file was stored, which are wrong for the next.
 _STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgbe:", "thumbnail", "Exif:ExifVersion")
-_STORAGE_NAMES = ("name", "planarconfig", "textureformat", "Exif:FlashPixVersion", "CompressionQuality", "Exif:ColorSpace")
+_STORAGE_NAMES = (
+    "name",
+    "planarconfig",
+    "textureformat",
+    "Exif:FlashPixVersion",
+    "CompressionQuality",
+    "Exif:ColorSpace",
+)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 
 
