@@ -172,9 +172,9 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
                         neighbour = values[left + 1 if left == i else left]
                         pull -= mine * (1 - mine) * (sample.gram @ neighbour)
             values[i] = _non_negative(nodes[i], gram, pull, nodes[i].histogram)
-    radius = np.array([node.radius for node in nodes]) * tracer.pixel
+    radii = np.array([node.radius for node in nodes]) * tracer.pixel
     residual = np.array([tracer.relative(n.error(v)) for n, v in zip(nodes, values, strict=True)])
-    return {"values": np.stack(values), "radius": radius}, residual
+    return {"values": np.stack(values), "radius": radii}, residual
 
 
 def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
@@ -187,11 +187,11 @@ def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[di
             r, light, seen = tracer.traced(places[i])
             params, error = fit_shape(family, tracer.frequency, tracer.weight, seen, r, light, before)
             before, fitted[i] = (params, float(r.max())), (params, tracer.relative(error))
-    params = {
+    columns = {
         key: np.array([fitted[i][0][key] for i in range(len(places))]) * (tracer.pixel if key in LENGTHS else 1.0)
         for key in FAMILIES[family]
     }
-    return params, np.array([fitted[i][1] for i in range(len(places))])
+    return columns, np.array([fitted[i][1] for i in range(len(places))])
 
 
 def _non_negative(node: Sample, gram: Array, pull: Array, prior: Array) -> Array:

@@ -59,7 +59,7 @@ def trace_rays(
         >>> lens = Lens.read("double_gauss_50mm")
         >>> rays = trace_rays(lens, np.array([[0.0], [0.001], [-10.0]]), np.array([[0.0], [0.0], [1.0]]))
         >>> sensor = lens.vertices[-1] + lens.paraxial().back_focal
-        >>> abs(rays.at(sensor)[1][0]) < 1e-9
+        >>> bool(abs(rays.at(sensor)[1][0]) < 1e-9)
         True
     """
     position, direction = (np.asarray(v, dtype=np.float64) for v in (position, direction))

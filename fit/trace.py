@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -103,7 +104,7 @@ def trace_table(
         f"width_px={width_px}, rays={count}"
     )
 
-    def spot(coc: float, wavelength_um: float | None) -> Spot:
+    def spot(wavelength_um: float | None, coc: float) -> Spot:
         z_m = _distance_m(coc, focal, f_number, focus_m)
         return point_spread(
             stopped,
@@ -116,14 +117,14 @@ def trace_table(
             meridional=field_mm == 0.0,
         )
 
-    ends = (signed_coc_mm(z, focal, f_number, focus_m) for z in (nearest_m, math.inf))
+    near, far = (signed_coc_mm(z, focal, f_number, focus_m) for z in (nearest_m, math.inf))
     pixel = sensor_width_mm / width_px
-    tracer = Tracer(lambda coc: spot(coc, None), points, pixel)
-    places = place_nodes(tracer, *ends, nodes)
+    tracer = Tracer(partial(spot, None), points, pixel)
+    places = place_nodes(tracer, near, far, nodes)
     fitted = []
     for wavelength in wavelengths_um or (None,):
         if wavelength is not None:
-            tracer = Tracer(lambda coc, at=wavelength: spot(coc, at), points, pixel)
+            tracer = Tracer(partial(spot, wavelength), points, pixel)
         fitted.append(fit_radial(tracer, places) if family == "radial" else fit_shapes(tracer, places, family))
     params = {key: [_rounded(one[0][key]) for one in fitted] for key in FAMILIES[family]}
     residual = np.sqrt(np.mean([one[1] ** 2 for one in fitted], axis=0))
