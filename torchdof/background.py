@@ -5,21 +5,23 @@ depth of one; blurred with that depth alone, a bright emitter draws a wrong ring
 are split between their surfaces (:func:`split_mixed`), without touching texture within a surface.
 
 Where a foreground blurs, what is behind it shows through, and no pixel of the image holds it. A hidden sample, filled
-from the farther surfaces around (:func:`fill_hidden`), stands in with a weight so small that it speaks only where nothing
+from the farther surfaces around (:func:`fill_hidden`), stands in with a weight so small that it speaks only where
+nothing
 visible does.
 
-Both give the second sample of a pixel: its light, coc and weight. Work is done at the pixels that need it; compiled
-code, which cannot choose them, does it at all.
+Both give the second sample of a pixel: its light, coc and weight. Work is done at the pixels that need it. Their number
+depends on the data, which compiled graphs do not allow for, so these call :func:`surfaces` as one opaque operator.
 """
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-__all__ = ["fill_hidden", "split_mixed"]
+__all__ = ["fill_hidden", "split_mixed", "surfaces"]
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample against 1 of a visible one."""
@@ -33,10 +35,33 @@ _UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
 _TRUST = 4.0  # how much local contrast discredits a split
 
 
+def surfaces(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What each pixel shows and hides.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        coc_px: ``[B, 1, H, W]``, signed.
+        valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
+        levels: As in :func:`fill_hidden`.
+
+    Returns:
+        Light ``[B, C, H, W]`` and weight ``[B, 1, H, W]`` of each pixel's own surface; light, coc and weight of its
+        second
+        one, which is mixed into the pixel or hidden behind it.
+    """
+    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        own, seen, other, other_coc, share = _surfaces_operator(light, coc_px, valid, levels)
+        return own, seen, other, other_coc, share
+    return _surfaces(light, coc_px, valid, levels)
+
+
 def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Split pixels at depth edges between the surface they are attributed to and the one across the edge.
 
-    With F and B the light of the two surfaces near the pixel, the share of F in a pixel is the least-squares solution of
+    With F and B the light of the two surfaces near the pixel, the share of F in a pixel is the least-squares
+    solution of
     ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on that surface)
     and drawn towards no split at all where the contrast of the two is small against the texture of each. The light of
     the two parts sums to the pixel's.
@@ -110,7 +135,8 @@ def fill_hidden(
     """Light and coc of what lies behind blurred surfaces, from the farthest surfaces around them.
 
     A pyramid averages at each step only the farthest of four children. A pixel takes the mean of the levels that show
-    something behind it, finer ones first, and of the four samples around it there only those that do; it looks no farther
+    something behind it, finer ones first, and of the four samples around it there only those that do; it looks no
+    farther
     than its own blur reaches, for deeper inside nothing of what is hidden can show.
 
     Args:
@@ -159,6 +185,49 @@ def fill_hidden(
         torch.where(free, _put(other_coc_px, at, seen_coc), other_coc_px),
         torch.where(free, hidden, share),
     )
+
+
+def _surfaces(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    own, other, other_coc, share = split_mixed(light, coc_px, valid)
+    seen = 1.0 - share
+    other, other_coc, share = fill_hidden(own, coc_px, other, other_coc, share, valid, levels)
+    if valid is not None:
+        seen, share = seen * valid, share * valid
+    return own, seen, other, other_coc, share
+
+
+@torch.library.custom_op("torchdof::surfaces", mutates_args=())
+def _surfaces_operator(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    own, seen, other, other_coc, share = _surfaces(light, coc_px, valid, levels)
+    return own.contiguous(), seen.contiguous(), other.contiguous(), other_coc.contiguous(), share.contiguous()
+
+
+@_surfaces_operator.register_fake
+def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -> tuple[Tensor, ...]:
+    colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
+    return colour, single, torch.empty_like(colour), torch.empty_like(single), torch.empty_like(single)
+
+
+def _remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    light, coc_px, valid, context.levels = inputs
+    context.save_for_backward(light, coc_px, valid)
+
+
+def _backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+    light, coc_px, valid = context.saved_tensors
+    with torch.enable_grad():
+        light, coc_px = light.detach().requires_grad_(), coc_px.detach().requires_grad_()
+        outputs = _surfaces(light, coc_px, valid, context.levels)
+        wanted = [(o, g) for o, g in zip(outputs, gradients, strict=True) if o.requires_grad]
+        back = torch.autograd.grad([o for o, _ in wanted], [light, coc_px], [g for _, g in wanted], allow_unused=True)
+    return (*back, None, None)
+
+
+_surfaces_operator.register_autograd(_backward, setup_context=_remember)
 
 
 def _may_hide(coc: Tensor, farthest: Tensor, share: Tensor, levels: int, size: tuple[int, int]) -> Tensor:
@@ -217,9 +286,7 @@ def _mean(weighted: Iterator[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
 
 
 def _positions(wanted: Tensor) -> Tensor:
-    """Flat indices of the wanted pixels of ``[B, 1, H, W]``; all of them while compiling, which needs fixed shapes."""
-    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-        return torch.arange(wanted.numel(), device=wanted.device)
+    """Flat indices of the wanted pixels of ``[B, 1, H, W]``."""
     return wanted.flatten().nonzero()[:, 0]
 
 

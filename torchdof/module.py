@@ -259,7 +259,9 @@ def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
     blurs = plan.blurs(options.table, light.shape[-2:], light.dtype, light.device, coarse=layered)
     surfaces = [(light, coc, weight)]
     if options.occlusion and len(plan.nodes) > 1:
-        surfaces = _surfaces(light, coc, weight, plan)
+        levels = math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1
+        own, seen, other, other_coc, share = background.surfaces(light, coc, weight, min(levels, 7))
+        surfaces = [(own, coc, seen), (other, other_coc, share)]
     first, last = plan.nodes[0], plan.nodes[-1]
     samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
     moves = torch.is_grad_enabled() and (light.requires_grad or coc.requires_grad)
@@ -278,19 +280,6 @@ def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
     else:
         out = composite.accumulate(frame, plan, blurs, spread, options.normalize)
     return out if valid is None else torch.where(valid, out, image)
-
-
-def _surfaces(
-    light: Tensor, coc: Tensor, weight: Tensor | None, plan: Plan
-) -> list[tuple[Tensor, Tensor, Tensor | None]]:
-    """What each pixel shows and hides: its own surface, and the second one of mixed pixels or behind a blurred one."""
-    own, other, other_coc, share = background.split_mixed(light, coc, weight)
-    levels = max(1, math.ceil(math.log2(max(abs(c) for c in plan.coc_px))) + 1)
-    seen = 1.0 - share
-    other, other_coc, share = background.fill_hidden(own, coc, other, other_coc, share, weight, min(levels, 7))
-    if weight is not None:
-        seen, share = seen * weight, share * weight
-    return [(own, coc, seen), (other, other_coc, share)]
 
 
 def _traced() -> bool:
