@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from torchdof.fit.lens import C_UM, D_UM, F_UM, Lens
 
 FACTS = {

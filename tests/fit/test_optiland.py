@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from torchdof.fit.lens import Lens
 from torchdof.fit.rays import trace_rays
 from torchdof.fit.spot import focus_sensor, point_spread

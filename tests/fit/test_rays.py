@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+
 from torchdof.fit.lens import Lens
 from torchdof.fit.rays import trace_rays
 
@@ -107,6 +108,8 @@ def test_rays_that_miss_or_are_clipped_end_without_warnings() -> None:
     position = np.stack([np.zeros(4), height, np.full(4, -1.0)])
     forward = np.tile([[0.0], [0.0], [1.0]], 4)
     assert trace_rays(lens, position, forward).alive.tolist() == [True, False, False, False]
+    air = surfaces([math.inf, 10.0], [1.0, 0.0], [1.0, 1.0])  # a sphere without glass can only be missed
+    assert trace_rays(air, position, forward).alive.tolist() == [True, True, False, False]
     small = lens.with_stop(8.0)
     assert trace_rays(small, position, forward).alive.tolist() == [False] * 4
     assert trace_rays(small, position, forward, clip=False).alive[0]
