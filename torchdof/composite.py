@@ -36,7 +36,7 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
-    out, covered = frame.canvas()
+    out, covered = frame.canvas(blurs[0].kernel.shape[0])
     for tiles, parts in _spread_layers(frame, plan, blurs, spread, with_room=True):
         light, share, room = parts[0], parts[1], parts[2].clamp_min(_LEAST)
         coverage = (share / room).clamp(0.0, 1.0)
@@ -71,7 +71,7 @@ def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, norm
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
     """
-    total, weight = frame.canvas()
+    total, weight = frame.canvas(blurs[0].kernel.shape[0])
     for tiles, (light, share, *_) in _spread_layers(frame, plan, blurs, spread, with_room=False):
         if tiles is None:
             total, weight = total + light, weight + share

@@ -89,14 +89,14 @@ class Frame:
         self.known = None if extend else functional.pad(torch.ones_like(samples[0].x[:1]), ends)
         self._occupied: list[Tensor] = []
 
-    def canvas(self) -> tuple[Tensor, Tensor]:
-        """Nothing yet: light and coverage to lay layers on."""
+    def canvas(self, kernels: int = 1) -> tuple[Tensor, Tensor]:
+        """Nothing yet: light and coverage to lay layers on; ``kernels`` is 1, or C where each colour has its own."""
         light = self.samples[0].light
         if self.tiled:
             count = self.area[0] // TILE * (self.area[1] // TILE)
-            return light.new_zeros(count, light.shape[1], TILE, TILE), light.new_zeros(count, 1, TILE, TILE)
+            return light.new_zeros(count, light.shape[1], TILE, TILE), light.new_zeros(count, kernels, TILE, TILE)
         return light.new_zeros(light.shape[0], light.shape[1], *self.area), light.new_zeros(
-            light.shape[0], 1, *self.area
+            light.shape[0], kernels, *self.area
         )
 
     def image(self, canvas: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ _PACK = 16  # channels of one vectorised depthwise convolution
 def fold(light: Tensor, kernels: Tensor, shares: Tensor | None = None) -> Tensor:
     """The paper's scatter, literally: columns of pixel light times kernel, summed where they fall by ``fold``.
 
-    Works in strips of rows, so that the columns stay within 256 MB.
+    Works in strips of rows, so that the columns stay within 256 MB. Sums of large kernels are taken in float64.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -54,6 +54,10 @@ def fold(light: Tensor, kernels: Tensor, shares: Tensor | None = None) -> Tensor
         kernels, shares = kernels.unsqueeze(0), light.new_ones(1, 1, 1, 1).expand(batch, 1, height, width)
     size = kernels.shape[-1]
     half = size // 2
+    if size * size > _DIRECT_TAPS and light.dtype == torch.float32 and not _traced():
+        wide = _widest(light.device)
+        if wide != light.dtype:
+            return fold(light.to(wide), kernels.to(wide), shares.to(wide)).to(light.dtype)
     rows = max(1, _COLUMN_BYTES // (batch * channels * size * size * width * light.element_size()))
     bands = []
     for top in range(0, height, rows):
@@ -104,7 +108,7 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
         halo = half
     if half == 0:
         return light * kernels[:, 0, 0, None, None]
-    if (2 * half + 1) ** 2 > _DIRECT_TAPS and not (torch.compiler.is_compiling() or torch.compiler.is_exporting()):
+    if (2 * half + 1) ** 2 > _DIRECT_TAPS and not _traced():
         return _fourier(light, kernels)[..., halo : light.shape[-2] - halo, halo : light.shape[-1] - halo]
     batch, channels = light.shape[:2]
     together = _PACK // channels if batch > 1 and channels <= _PACK // 2 else 1
@@ -149,9 +153,19 @@ def _fourier(light: Tensor, kernels: Tensor) -> Tensor:
     height, width = light.shape[-2:]
     half = kernels.shape[-1] // 2
     area = [_smooth_length(height + 2 * half), _smooth_length(width + 2 * half)]
-    spectrum = torch.fft.rfft2(light.to(torch.float64), s=area) * torch.fft.rfft2(kernels.to(torch.float64), s=area)
+    wide = _widest(light.device)
+    spectrum = torch.fft.rfft2(light.to(wide), s=area) * torch.fft.rfft2(kernels.to(wide), s=area)
     spread = torch.fft.irfft2(spectrum, s=area)[..., half : half + height, half : half + width]
     return spread.to(light.dtype)
+
+
+def _widest(device: torch.device) -> torch.dtype:
+    """Type for long sums; not every device has float64."""
+    return torch.float32 if device.type == "mps" else torch.float64
+
+
+def _traced() -> bool:
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
 
 
 def _smooth_length(least: int) -> int:
