@@ -98,7 +98,7 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     behind, behind_spread = _mean((seen, w) for seen, _, w in weights())
     # a thin foreground has no clean pixel: trust the one that differs most from what is behind
     differs = [(seen, w, w * ((seen - behind) ** 2).sum(0) + 1e-12) for seen, w, _ in weights()]
-    pure = sum(w for _, w, _ in differs)
+    pure = torch.stack([w for _, w, _ in differs]).sum(0)
     front, front_spread = _mean((seen, torch.where(pure > 20 * _UNCLEAN, w, v)) for seen, w, v in differs)
 
     contrast = front - behind

@@ -7,7 +7,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as functional
@@ -61,7 +61,7 @@ def renderers() -> dict[str, Renderer]:
         ['untouched', 'scatter', 'ikoma', 'torchdof']
     """
 
-    def layered(**options: bool) -> Renderer:
+    def layered(**options: Any) -> Renderer:
         return lambda scene: DepthOfField(scene.camera, tolerance=0, **options)(scene.image, scene.depth)
 
     return {

@@ -79,8 +79,8 @@ class Camera:
             ValueError: If a number is outside its range.
 
         Example:
-            >>> Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0).focal_px(768)
-            1055.0313290705751
+            >>> round(Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0).focal_px(768), 6)
+            1055.031329
         """
         _check_number("fov_x_deg", fov_x_deg)
         _check_number("aperture_radius_m", aperture_radius_m)

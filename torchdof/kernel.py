@@ -320,6 +320,7 @@ def _slices(half: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @functools.lru_cache(maxsize=2 * _CACHED_HALF_WIDTH)
+@torch.inference_mode(False)  # what is kept must serve autograd as well
 def _cut_quadrant(half: int) -> tuple[Tensor, Tensor, Tensor]:
     # finer slices where a pixel is a larger part of the kernel
     slices = 64 if half <= 4 else 32 if half <= 12 else 16 if half <= 64 else 8

@@ -256,7 +256,7 @@ def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
     coc = coc.clamp(plan.coc_px[0], plan.coc_px[-1])  # beyond, blurs are alike; differences of huge ones would cancel
     weight = None if valid is None else valid.to(light.dtype)
     layered = options.method == "layered"
-    blurs = plan.blurs(options.table, light.shape[-2:], light.dtype, light.device, coarse=layered)
+    blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
     surfaces = [(light, coc, weight)]
     if options.occlusion and len(plan.nodes) > 1:
         levels = math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1

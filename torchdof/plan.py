@@ -145,6 +145,7 @@ def _span(coc_px: Tensor) -> tuple[float, float]:
 
 
 @functools.lru_cache(maxsize=512)
+@torch.inference_mode(False)  # what is kept must serve autograd as well
 def _kernel(table: BlurTable, coc_px: float, width: int, scale: int) -> Tensor:
     coc = torch.tensor([coc_px / scale], dtype=torch.float64)
     kernel = table.kernels(coc, width / scale)[0]

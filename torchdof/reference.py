@@ -64,7 +64,7 @@ def lens_views(
     table: BlurTable | None = None,
     views: int = 256,
     surfaces: Sequence[tuple[Tensor, Tensor]] = (),
-    mixed_edges: bool = True,
+    mixed_edges: bool | None = None,
 ) -> LensViews:
     """Renders depth of field from many views through the lens.
 
@@ -80,7 +80,8 @@ def lens_views(
             ``r^2`` of them.
         surfaces: Further surfaces, such as what is hidden: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
             and depth like ``depth``.
-        mixed_edges: Split pixels that hold two surfaces (:func:`torchdof.background.split_mixed`).
+        mixed_edges: Split pixels that hold two surfaces (:func:`torchdof.background.split_mixed`); None: where no
+            surfaces are given, for beside those the split's guess does more harm than good.
 
     Returns:
         Image and the known share, in the image's dtype; pixels that no view knows are those of ``image``.
@@ -110,7 +111,7 @@ def lens_views_by_coc(
     table: BlurTable | None = None,
     views: int = 256,
     surfaces: Sequence[tuple[Tensor, Tensor]] = (),
-    mixed_edges: bool = True,
+    mixed_edges: bool | None = None,
 ) -> LensViews:
     """The same from a signed circle of confusion.
 
@@ -143,7 +144,7 @@ def lens_views_by_coc(
     for item in range(batch):
         seen = (image[item : item + 1].float(), coc_px.expand(batch, -1, -1, -1)[item : item + 1].float())
         stack = [(*seen, torch.ones_like(seen[1]))]
-        if mixed_edges:
+        if mixed_edges or (mixed_edges is None and not surfaces):
             stack = _split(*seen)
         for rgba, coc in surfaces:
             cover = rgba[item : item + 1, -1:].float().clamp(0.0, 1.0)

@@ -24,7 +24,7 @@ from torch import Tensor
 from .camera import Camera
 from .lens import spread_points
 
-__all__ = ["Plane", "Scene", "plane_scene", "posts", "read_scenes", "waves"]
+__all__ = ["Plane", "Scene", "camera_of", "plane_scene", "posts", "read_scenes", "waves"]
 
 Light = Callable[[Tensor, Tensor], Tensor]
 """Linear light ``[C, ...]`` at places x, y ``[...]``, in pixels of the frame."""
