@@ -70,7 +70,8 @@ def image_and_coc(image: Tensor, coc_px: Tensor, table: BlurTable, values: bool)
     """Refuse an image and a map of the circle of confusion that do not belong together.
 
     Raises:
-        ValueError: If shapes or types are wrong, the table has other channels than the image, or, with ``values``, a coc
+        ValueError: If shapes or types are wrong, the table has other channels than the image, or, with ``values``, a
+        coc
             or a pixel is not finite.
     """
     _image(image)

@@ -96,7 +96,8 @@ def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool
         ``[B, C, H, W]``.
 
     Reference:
-        Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and accumulate.
+        Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and
+        accumulate.
     """
     halo = frame.margin
     ((_, window),) = frame.windows([0], halo)

@@ -139,7 +139,7 @@ class Frame:
             yield None, self._window(halo, None, True)
             return
         places = self._occupied[group[0]].flatten().nonzero()[:, 0]
-        rows, columns = self.area[0] // TILE, self.area[1] // TILE
+        columns = self.area[1] // TILE
         row, column = places // columns, places % columns
         inside = (row * TILE >= halo) & (column * TILE >= halo)
         inside &= ((row + 1) * TILE + halo <= self.size[0]) & ((column + 1) * TILE + halo <= self.size[1])
