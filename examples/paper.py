@@ -2,9 +2,9 @@
 
 Usage: python examples/paper.py --out out
 
-First the shipped table ``sato_j15``: its curve, its blur texture, a blurred quad. Then the paper's own experiment with a
-lens prescription in the place of the camera: a white dot on black paper, in focus at 0.20 m, photographed there and at
-0.50 m; read back from the files, fitted both ways (the paper's ratio and the forward model), made a table, and rendered.
+First the shipped table ``sato_j15``: its curve, its blur texture, a blurred quad. Then the paper's own experiment with
+a lens prescription in the place of the camera: a white dot on black paper, in focus at 0.20 m, photographed there and
+at 0.50 m; read back from the files, fitted both ways (the paper's ratio and the forward model), made a table, rendered.
 """
 
 import argparse

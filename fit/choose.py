@@ -54,7 +54,9 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     return 200.0 if error <= 1e-20 else float(-10 * np.log10(error))
 
 
-def choose(kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float) -> tuple[str, str, dict[str, float]]:
+def choose(
+    kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float
+) -> tuple[str, str, dict[str, float]]:
     """The cheapest family that is accurate enough.
 
     `radial` can follow any round blur, so it stands for the truth; where the noise hides the difference (a cheaper

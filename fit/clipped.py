@@ -6,7 +6,7 @@ import numpy as np
 
 from .dot import Dot
 from .problems import FitError, SaturatedError, SaturatedWarning, warn
-from .result import Array
+from .result import Array, Mask
 
 __all__ = ["plateau", "used_pixels"]
 
@@ -31,7 +31,7 @@ def plateau(picture: Array, dot: Dot) -> float | None:
 
 def used_pixels(
     picture: Array, dot: Dot, white: float | None, file: str | None, name: str, *, refuse: bool = True
-) -> Array:
+) -> Mask:
     """Pixels that are not clipped `[H, W]`, those that noise may have clipped left out with them.
 
     Raises:
@@ -44,7 +44,9 @@ def used_pixels(
 
     if white is not None and not white > dot.background:
         raise FitError(
-            f"white is {white:g} but the background of the {name} picture is {dot.background:g}", file=file, number=white
+            f"white is {white:g} but the background of the {name} picture is {dot.background:g}",
+            file=file,
+            number=white,
         )
     level = white if white is not None else plateau(picture, dot)
     if level is None:
@@ -59,7 +61,9 @@ def used_pixels(
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
     if refuse and share > _MOST:
         raise SaturatedError(
-            f"{100 * share:.0f} % of the {name} dot's pixels are clipped at {level:.4g}; expose less", file=file, number=share
+            f"{100 * share:.0f} % of the {name} dot's pixels are clipped at {level:.4g}; expose less",
+            file=file,
+            number=share,
         )
     if refuse:
         warn(

@@ -50,9 +50,7 @@ def fit(
         typer.Option(help="Prescription: a file, or the name of a shipped one.", rich_help_panel=_LENS),
     ] = None,
     f_number: Annotated[float, typer.Option(help="Aperture of the lens.", rich_help_panel=_LENS)] = 2.0,
-    focus_m: Annotated[
-        float, typer.Option(help="Focus distance in metres; inf allowed.", rich_help_panel=_LENS)
-    ] = 2.0,
+    focus_m: Annotated[float, typer.Option(help="Focus distance in metres; inf allowed.", rich_help_panel=_LENS)] = 2.0,
     nodes: Annotated[int, typer.Option(help="Distances traced.", rich_help_panel=_LENS)] = 33,
     plots: Annotated[
         Path | None, typer.Option(help="Folder for pictures of the fits and the table.", rich_help_panel=_OUT)
@@ -123,7 +121,9 @@ def _fit_with_progress(
 
 
 def _summary(one: Captures, result: TableFit, doubts: list[str], console: Console) -> None:
-    shown = Table(title=f"{one.name or 'captures'}: {result.table.family}, focus {one.focus_m:g} m", title_justify="left")
+    shown = Table(
+        title=f"{one.name or 'captures'}: {result.table.family}, focus {one.focus_m:g} m", title_justify="left"
+    )
     names = [n for n in result.fits[0].params if n != "values"]
     for column in ("distance m", "coc px", *names, "residual %", "x noise", "magnification"):
         shown.add_column(column, justify="right")

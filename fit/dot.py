@@ -56,7 +56,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     if len(dots) > 1:
         where = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
         raise SeveralDotsError(
-            f"{len(dots)} dots where one was expected, at {where}; crop the picture, or read it as a grid (dots='grid')",
+            f"{len(dots)} dots where one was expected, at {where}; crop the picture, or read a grid with dots='centre'",
             file=file,
             number=float(len(dots)),
         )
@@ -162,7 +162,7 @@ def radial_mean(picture: Array, distance: Array) -> tuple[Array, Array]:
 
 
 def noise_inside(picture: Array, dot: Dot) -> tuple[float, int] | None:
-    """Standard deviation of a pixel's noise within a sharp dot, from how many pixels; None where the dot is too small."""
+    """Deviation of a pixel's noise within a sharp dot, and from how many pixels; None where the dot is too small."""
     rows, columns = np.indices(picture.shape)
     inside = np.hypot(columns - dot.x, rows - dot.y) < dot.radius - 4
     if inside.sum() < 25:

@@ -21,7 +21,7 @@ from .problems import (
     warn,
 )
 from .profile import polar_samples
-from .result import Array, BlurFit
+from .result import Array, BlurFit, Mask
 
 __all__ = ["EXPLAINED", "asymmetry_of", "doubt_forward", "doubt_linearity", "signal_pixels"]
 
@@ -36,7 +36,7 @@ _MAGNIFIED = 0.08
 _OUTSIDE_REFUSED, _OUTSIDE_DOUBTED = 0.05, 0.005
 
 
-def signal_pixels(pair: Forward) -> Array:
+def signal_pixels(pair: Forward) -> Mask:
     """Pixels with light in them `[H, W]`: used, and within the blurred dot's reach."""
     rows, columns = np.indices(pair.data.shape)
     near = np.hypot(columns - pair.data_dot.x, rows - pair.data_dot.y) <= pair.data_dot.reach + 1
@@ -96,8 +96,8 @@ def doubt_forward(
     ratio = freest.residual_over_noise
     if freest.residual > _MATTERS and ratio > _FAR_ABOVE:
         text = (
-            f"the residual is {100 * freest.residual:.1f} %, {ratio:.1f} times the noise; is the image linear, not sRGB "
-            "encoded, a single white dot, and not a strong JPEG?"
+            f"the residual is {100 * freest.residual:.1f} %, {ratio:.1f} times the noise; is the image linear, not "
+            "sRGB encoded, a single white dot, and not a strong JPEG?"
         )
         text += f" Family {freest.family!r} may be too simple" if freest.family != "radial" else ""
         warn(ResidualWarning(text, file=file, number=ratio), stacklevel)
@@ -159,7 +159,9 @@ def _doubt_parameters(pair: Forward, solution: Solution, file: str | None, stack
         if not natural and (float(value) >= most * (1 - 1e-6) or float(value) <= least + 1e-6 * abs(least)):
             if name in ("sigma", "radius", "r_c"):
                 raise FlatProfileError(
-                    f"the blur is wider than the window: {name} ran to {float(value):.3g} px", file=file, number=float(value)
+                    f"the blur is wider than the window: {name} ran to {float(value):.3g} px",
+                    file=file,
+                    number=float(value),
                 )
             if name == "m":
                 continue  # the exponent of a tilt that is not there
@@ -167,12 +169,12 @@ def _doubt_parameters(pair: Forward, solution: Solution, file: str | None, stack
             warn(BoundaryWarning(text, file=file, number=float(value)), stacklevel)
     size, error = _size_of_blur(pair, solution)
     if not error < 0.5 * size:
-        text = f"the blur's rms radius of {size:.3g} +- {error:.2g} px is not determined: too little blur, or too much noise"
+        text = f"the blur's rms radius of {size:.3g} +- {error:.2g} px is not determined: too little blur, or too noisy"
         warn(FlatProfileWarning(text, file=file, number=error / size if size else np.inf), stacklevel)
 
 
 def _size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
-    """The kernel's rms radius and its standard error, px: single parameters may trade with each other, this does not."""
+    """The kernel's rms radius and its standard error, px; single parameters may trade with each other."""
     shape = list(solution.params)
     steps = {n: 1e-3 * max(abs(float(solution.params[n])), 0.1) for n in shape}
     given = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}

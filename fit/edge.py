@@ -11,7 +11,10 @@ from .gaussian import inverse
 from .result import Array
 from .solve import best_of
 
-__all__ = ["Edge", "draw_edge", "soft_edge"]
+__all__ = ["STEPS", "Edge", "draw_edge", "soft_edge"]
+
+STEPS = {"radius": 1e-2, "softness": 0.1}
+"""Steps in px over which an edge's errors are passed on."""
 
 _FINE = 6  # samples across a pixel near the edge
 
@@ -79,9 +82,9 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         fit_exponent: let the levels be a power of the light. A round white dot has as much light missing inside its
             edge as there is outside; encoding (a power of about 0.45) breaks that balance and so shows itself.
     """
-    rows, columns = np.indices(picture.shape).astype(np.float64)
-    near = np.hypot(columns - dot.x, rows - dot.y) <= dot.reach + 3
-    rows, columns, levels = rows[near], columns[near], (picture[near] - dot.background) / dot.peak
+    grid: Array = np.indices(picture.shape).astype(np.float64)
+    near = np.hypot(grid[1] - dot.x, grid[0] - dot.y) <= dot.reach + 3
+    rows, columns, levels = grid[0][near], grid[1][near], (picture[near] - dot.background) / dot.peak
     top = np.inf if white is None else (white - dot.background) / dot.peak
 
     def model(_: Array, *p: float) -> Array:
@@ -90,7 +93,8 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         return np.minimum(level * (share ** p[5] if fit_exponent else share), top)
 
     def jacobian(_: Array, *p: float) -> Array:
-        at, columns_ = np.asarray(p), []
+        at: Array = np.array(p, dtype=np.float64)
+        columns_: list[Array] = []
         for i, h in enumerate((1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-4)[: len(p)]):
             up, down = at.copy(), at.copy()
             up[i], down[i] = up[i] + h, max(down[i] - h, 0.0) if i > 1 else down[i] - h
@@ -105,6 +109,11 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     found = best_of(model, levels, starts, bounds, jacobian=jacobian, tolerance=1e-7)
     residual = levels - model(levels, *found)
     slope = jacobian(levels, *found)
+    # a soft edge shows by its variance: a step that is finite has a slope even where the softness is 0
+    for i, h in ((2, STEPS["radius"]), (3, STEPS["softness"])):
+        moved = found.copy()
+        moved[i] += h
+        slope[:, i] = (model(levels, *moved) - model(levels, *found)) / h
     variance = float(residual @ residual) / max(levels.size - len(found), 1)
     expected = float(np.sqrt(np.mean(_variance(picture, dot)[near]))) / dot.peak
     return Edge(

@@ -16,7 +16,7 @@ from torchdof.kernel import FAMILIES, render, support
 
 from .dot import Dot, noise_of
 from .gaussian import inverse
-from .result import Array
+from .result import Array, Mask
 from .solve import best_of
 from .source import Source
 
@@ -59,7 +59,7 @@ class Forward:
 
     source: Source
     data: Array
-    used: Array
+    used: Mask
     data_dot: Dot
     magnification: float = 1.0
     fit_moves: tuple[str, ...] = ALL_MOVES
@@ -99,7 +99,7 @@ class Forward:
     def _transform(self, pictures: Array) -> Array:
         from scipy.fft import rfft2
 
-        return rfft2(pictures, self.grid)  # type: ignore[no-any-return]
+        return rfft2(pictures, self.grid)
 
     def convolve(self, source: Array, kernels: Array, whole: bool = False) -> Array:
         """Transformed source `[h, w]` (or `[n, h, w]`) with kernels `[n, k, k]`: `[n, pixels used]`, or all pixels."""
@@ -161,7 +161,7 @@ class Forward:
         kernel = self.kernels(family, {n: np.array([params[n]]) for n in shape})[0]
         return Solution(
             family=family,
-            params=dict.fromkeys(shape, 0.0) | {n: params[n] for n in shape},
+            params={**{n: params[n] for n in shape}},
             moves=self.moves(params),
             gain=gain,
             background=background,
@@ -258,8 +258,10 @@ class Forward:
             near[n][2 * i + 1] += steps[i]
             near[n][2 * i + 2] = max(near[n][2 * i + 2] - steps[i], -1.0 if n == "b" else 0.0)
         kernels = self.kernels(family, near)
-        slopes = [(kernels[2 * i + 1] - kernels[2 * i + 2]) / (near[n][2 * i + 1] - near[n][2 * i + 2])
-                  for i, n in enumerate(shape)]
+        slopes = [
+            (kernels[2 * i + 1] - kernels[2 * i + 2]) / (near[n][2 * i + 1] - near[n][2 * i + 2])
+            for i, n in enumerate(shape)
+        ]
         blurred = self.convolve(source, np.stack([kernels[0], *slopes]))
         shaped, columns = blurred[0], [*blurred[1:]]
         columns += self.move_columns(params, names[len(shape) :], kernels[:1])

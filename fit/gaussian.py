@@ -166,9 +166,7 @@ def _refuse_flat(x: Array, y: Array, noise: float) -> None:
         )
 
 
-def _fit_smooth(
-    x: Array, y: Array, family: str, clusters: Array | None
-) -> tuple[Array, Array, tuple[str, ...], Array]:
+def _fit_smooth(x: Array, y: Array, family: str, clusters: Array | None) -> tuple[Array, Array, tuple[str, ...], Array]:
     names = _ORDER[family]
 
     def model(_: Array, *p: float) -> Array:

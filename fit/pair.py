@@ -13,8 +13,9 @@ from torchdof.kernel import FAMILIES
 
 from .choose import COST, choose
 from .clipped import used_pixels
-from .dot import find_dot, noise_of
-from .doubt import EXPLAINED, asymmetry_of, doubt_forward, doubt_linearity, signal_pixels
+from .describe import bic_of, describe, kernel_lists
+from .dot import find_dot
+from .doubt import EXPLAINED, doubt_forward, doubt_linearity
 from .edge import soft_edge
 from .forward import ALL_MOVES, Forward, Solution
 from .gaussian import fit_profile
@@ -22,7 +23,6 @@ from .problems import FitError, NonFiniteError, NotInFocusWarning, SaturatedWarn
 from .profile import blur_strength
 from .radial import solve_radial
 from .result import Array, BlurFit
-from .solve import information_criterion
 from .source import IdealDot, PictureOfDot, point_source
 
 __all__ = ["fit_pair"]
@@ -50,6 +50,7 @@ def fit_pair(
     start: BlurFit | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
     knots: int | None = None,
+    reach: float | None = None,
     files: tuple[str | None, str | None] = (None, None),
 ) -> BlurFit:
     """The kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
@@ -69,7 +70,7 @@ def fit_pair(
         model: "forward" or "ratio".
         accuracy_db: PSNR on a natural image that "auto" asks of a family, against the free profile `radial`.
         source: what stands for the sharp dot. "image": its picture; "dot": an ideal round dot fitted to it, which has
-            no noise; "auto": the ideal one where it explains the picture to within its noise, or the picture is clipped.
+            no noise; "auto": the ideal one where it explains the picture to within its noise, or that is clipped.
         magnification: expected size of the dot in the blurred picture over its size in the sharp one.
         fit_magnification: True fits it, False holds it, None fits it only where the pictures contradict the expected
             one by more than 3.5 standard errors. Where it is held, the standard errors take it as known.
@@ -78,6 +79,7 @@ def fit_pair(
         prior: expected value and standard deviation of parameters of `family`, known from elsewhere (the neighbouring
             distances), in px; the result is what both the pictures and it allow, and so are its standard errors.
         knots: number of values of a "radial" profile; None takes two a pixel.
+        reach: where a "radial" profile ends, px; None finds it from a soft disc.
         files: names of the two pictures, for errors and warnings.
 
     Returns:
@@ -104,7 +106,9 @@ def fit_pair(
     if family not in (*FAMILIES, "auto"):
         raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {family!r}")
     if model not in get_args(Model) or source not in get_args(SourceKind):
-        raise FitError(f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; got {model!r}, {source!r}")
+        raise FitError(
+            f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; got {model!r}, {source!r}"
+        )
     if not (0 < magnification < np.inf):
         raise FitError(f"magnification must be positive, got {magnification}", number=magnification)
     data = _picture("blurred", blurred, files[1])
@@ -123,18 +127,18 @@ def fit_pair(
         pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
     pair.prior = dict(prior or {})
     held = _held(pair, fit_magnification, sharp is None)
-    why, psnr = "", {}
+    why, psnr = "", dict[str, float]()
     if family in ("auto", "radial"):
-        solutions = {"radial": _solve_radial(pair, held, knots)}
+        solutions = {"radial": _solve_radial(pair, held, knots, reach)}
         if family == "auto":
             family, why, psnr = _choose(pair, solutions, accuracy_db)
     else:
         solutions = {family: pair.solve(family)}
         if held is None and _improves(pair, solutions[family], free := _with_magnification(pair).solve(family)):
             pair.fit_moves, solutions[family] = ALL_MOVES, free
-    fit = _finish(pair, solutions[family], why)
+    fit = describe(pair, solutions[family], why)
     # a family that was chosen for being cheap is not to blame for what the free profile explains
-    doubt_forward(pair, solutions[family], fit, files, _finish(pair, solutions["radial"], "") if why else fit)
+    doubt_forward(pair, solutions[family], fit, files, describe(pair, solutions["radial"], "") if why else fit)
     return replace(fit, psnr=psnr)
 
 
@@ -195,8 +199,8 @@ def _prepare(
     if clipped:
         warn(
             SaturatedWarning(
-                f"{clipped} pixels of the sharp picture are clipped; an ideal dot of radius {edge.radius:.2f} px stands "
-                "in for it",
+                f"{clipped} pixels of the sharp picture are clipped; an ideal dot of radius {edge.radius:.2f} px "
+                "stands in for it",
                 file=files[0],
                 number=float(clipped),
             ),
@@ -228,10 +232,10 @@ def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
     return (held.squares - free.squares) / floor > _SIGNIFICANT
 
 
-def _solve_radial(pair: Forward, held: bool | None, knots: int | None) -> Solution:
+def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: float | None) -> Solution:
     """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`."""
     soft = pair.solve("softm")
-    reach = _reach(pair, soft)
+    reach = _reach(pair, soft) if reach is None else min(reach, pair.half - 1.0)
     found = solve_radial(pair, soft, reach, knots)
     if held is None:
         free = solve_radial(_with_magnification(pair), found, reach, knots)
@@ -241,14 +245,12 @@ def _solve_radial(pair: Forward, held: bool | None, knots: int | None) -> Soluti
     return found
 
 
-def _choose(
-    pair: Forward, solutions: dict[str, Solution], accuracy_db: float
-) -> tuple[str, str, dict[str, float]]:
+def _choose(pair: Forward, solutions: dict[str, Solution], accuracy_db: float) -> tuple[str, str, dict[str, float]]:
     """Fit every family at the free profile's magnification and choose; the chosen one's is then fitted with it."""
     fit_moves, pair.fit_moves = pair.fit_moves, ("dx", "dy")
     solutions |= {f: pair.solve(f) for f in COST[:-1]}
-    kernels = {f: pair.kernels(f, _lists(s))[0] for f, s in solutions.items()}
-    family, why, psnr = choose(kernels, {f: _bic(pair, s) for f, s in solutions.items()}, accuracy_db)
+    kernels = {f: pair.kernels(f, kernel_lists(s))[0] for f, s in solutions.items()}
+    family, why, psnr = choose(kernels, {f: bic_of(pair, s) for f, s in solutions.items()}, accuracy_db)
     pair.fit_moves = fit_moves
     if family != "radial" and fit_moves == ALL_MOVES:
         pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
@@ -260,79 +262,3 @@ def _reach(pair: Forward, soft: Solution) -> float:
     """Where a free profile may end: a little beyond what the soft disc says."""
     reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
     return min(reach, pair.half - 1.0)
-
-
-def _lists(solution: Solution) -> dict[str, Array]:
-    return {k: np.asarray(v, dtype=np.float64)[None] for k, v in solution.params.items()}
-
-
-def _bic(pair: Forward, solution: Solution) -> float:
-    floor = pair.values.size * (1e-6 * pair.unit) ** 2
-    return information_criterion(
-        solution.squares + floor, pair.values.size, _free_parameters(solution) + len(pair.fit_moves) + 2
-    )
-
-
-def _free_parameters(solution: Solution) -> int:
-    if solution.family == "radial":
-        return int(np.sum(np.asarray(solution.params["values"]) > 0))
-    return len(FAMILIES[solution.family])
-
-
-def _finish(pair: Forward, solution: Solution, why: str) -> BlurFit:
-    near = signal_pixels(pair)
-    light = pair.data[near] - solution.background
-    size = float(np.sqrt(np.sum(light**2)))
-    error = pair.data[near] - solution.model[near]
-    kernel = pair.kernels(solution.family, _lists(solution))[0]
-    through = (solution.gain * pair.source.noise) ** 2 * float(np.sum(kernel**2))
-    spread = np.sqrt(np.diag(solution.covariance))
-    if solution.family == "radial":
-        stderr: dict[str, float | Array] = {"values": spread, "radius": 0.0}
-    else:
-        stderr = {n: float(s) for n, s in zip(solution.names, spread, strict=True) if n in solution.params}
-    return BlurFit(
-        family=solution.family,
-        params=dict(solution.params),
-        stderr=stderr,
-        residual=float(np.sqrt(np.sum(error**2))) / size,
-        noise=float(np.sqrt(error.size * (own_noise(pair, solution, near) ** 2 + through))) / size,
-        covariance=solution.covariance,
-        names=solution.names,
-        bic=_bic(pair, solution),
-        count=pair.values.size,
-        model="forward",
-        gain=solution.gain,
-        background=solution.background,
-        shift=(
-            pair.data_dot.x + solution.moves["dx"] - pair.source.dot.x,
-            pair.data_dot.y + solution.moves["dy"] - pair.source.dot.y,
-        ),
-        magnification=solution.moves["magnification"],
-        asymmetry=asymmetry_of(pair, solution),
-        why=why,
-        samples=_samples(pair, solution),
-        curve=_samples(pair, solution, modelled=True),
-    )
-
-
-def own_noise(pair: Forward, solution: Solution, near: Array) -> float:
-    """Noise of the blurred picture's pixels where the light is: what varies from pixel to pixel in the residual."""
-    residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
-    both = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
-    inside = near[1:-1, 1:-1]
-    here = float(np.sqrt(np.mean(both[inside] ** 2))) if inside.any() else 0.0
-    return max(here, noise_of(pair.data))
-
-
-def _samples(pair: Forward, solution: Solution, modelled: bool = False) -> Array:
-    """Radii and levels over gain of the blurred picture (or its model) around its centre, for the picture of a fit."""
-    x, y = pair.data_dot.x + solution.moves["dx"], pair.data_dot.y + solution.moves["dy"]
-    rows, columns = np.indices(pair.data.shape)
-    distance = np.hypot(columns - x, rows - y)
-    near = (distance <= 1.2 * pair.data_dot.reach) & pair.used
-    levels = (solution.model if modelled else pair.data)[near] - solution.background
-    order = np.argsort(distance[near])
-    scale = solution.gain if solution.gain > 0 else 1.0
-    return np.stack([distance[near][order], levels[order] / scale])

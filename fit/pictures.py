@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -40,7 +40,14 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         raise FitError("this fit carries no samples to draw")
     figure, axes = _figure(5.4, 3.6)
     forward = fit.model == "forward"
-    axes.plot(*fit.samples, ".", color=_DATA, markersize=2.5 if forward else 4, label="samples" if not forward else "pixels", zorder=1)
+    axes.plot(
+        *fit.samples,
+        ".",
+        color=_DATA,
+        markersize=2.5 if forward else 4,
+        label="samples" if not forward else "pixels",
+        zorder=1,
+    )
     if forward:
         r, level = _averaged(*fit.curve)
         axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
@@ -135,7 +142,7 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
     return figure
 
 
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Array]:
+def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
     # no pyplot: it would choose a screen and keep every figure alive
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from .dot import find_dot
 from .problems import FitError
-from .result import Array
+from .result import Array, Indices
 
 __all__ = ["blur_strength", "polar_samples"]
 
@@ -50,7 +50,7 @@ def polar_samples(
 
 def blur_strength(
     sharp: ArrayLike, blurred: ArrayLike, *, step_deg: float = 10.0, spacing: float = 1.0
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Indices]:
     """`I_b(r, theta) / I(r, theta)` from the dot's centre to its circumference.
 
     The centre is the dot's in the sharp picture, as in the paper: a displaced defocused dot is not followed. What is
@@ -75,7 +75,9 @@ def blur_strength(
     dot = find_dot(np.asarray(sharp, dtype=np.float64))
     soft = find_dot(np.asarray(blurred, dtype=np.float64))
     # the last pixel of the dot is half paper
-    r, theta, below = polar_samples(sharp, (dot.x, dot.y), max(dot.radius - 1.0, 1.0), step_deg=step_deg, spacing=spacing)
+    r, theta, below = polar_samples(
+        sharp, (dot.x, dot.y), max(dot.radius - 1.0, 1.0), step_deg=step_deg, spacing=spacing
+    )
     above = polar_samples(blurred, (dot.x, dot.y), float(r[-1]), step_deg=step_deg, spacing=spacing)[2]
     below, above = below - dot.background, above - soft.background
     used = below > 0.2 * dot.peak

@@ -11,7 +11,7 @@ from torchdof.kernel import render
 
 from .forward import Forward, Solution, without_level
 from .gaussian import inverse
-from .result import Array
+from .result import Array, Mask
 
 __all__ = ["solve_radial"]
 
@@ -83,7 +83,7 @@ def hat_mass(count: int, radius: float) -> Array:
     return mass
 
 
-def _non_negative(columns: Array, data: Array) -> tuple[Array, Array, Array]:
+def _non_negative(columns: Array, data: Array) -> tuple[Array, Array, Mask]:
     """Weights `[knots]`, the penalty's matrix, and which weights are free (not held at 0)."""
     from scipy.optimize import nnls
 
@@ -116,7 +116,7 @@ def _covariance(
     kernel: Array,
     gain: float,
     moves: dict[str, float],
-    free: Array,
+    free: Mask,
     smooth: Array,
 ) -> Array:
     tall = (columns - columns.mean(axis=1, keepdims=True))[free].T

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.int64]
 
-__all__ = ["Array", "BlurFit"]
+__all__ = ["Array", "BlurFit", "Indices", "Mask"]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Lengths of a blur in a picture's pixels, on the sensor, and on the photographed paper; and how far a table reaches."""
+"""Lengths of a blur in pixels, on the sensor and on the photographed paper; and how far a table reaches."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def best_of(
     def descend(start: Array, tolerance: float) -> tuple[float, Array] | None:
         try:
             with warnings.catch_warnings():
-                # curve_fit warns where its own covariance has no inverse; ours is computed by the caller, who reports it
+                # it warns where its own covariance has no inverse; the caller computes one, and reports it
                 warnings.simplefilter("ignore", OptimizeWarning)
                 found, _ = curve_fit(
                     model,

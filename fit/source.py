@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from .dot import Dot, noise_of
-from .edge import Edge, draw_edge
+from .edge import STEPS, Edge, draw_edge
 from .result import Array
 
 __all__ = ["IdealDot", "PictureOfDot", "Source", "point_source"]
@@ -96,13 +96,13 @@ class IdealDot:
         return self.edge.level * draw_edge(rows, columns, x, y, radius, softness)
 
     def variants(self) -> tuple[list[Source], Array]:
-        """One hundredth of a pixel more radius, and more softness."""
-        step = 1e-2
+        """A little more radius, and more softness."""
         moved = [
-            replace(self.edge, radius=self.edge.radius + step),
-            replace(self.edge, softness=self.edge.softness + step),
+            replace(self.edge, radius=self.edge.radius + STEPS["radius"]),
+            replace(self.edge, softness=self.edge.softness + STEPS["softness"]),
         ]
-        covariance = np.where(np.isfinite(self.edge.covariance), self.edge.covariance, 0.0) / step**2
+        steps = np.array([STEPS["radius"], STEPS["softness"]])
+        covariance = np.where(np.isfinite(self.edge.covariance), self.edge.covariance, 0.0) / np.outer(steps, steps)
         return [replace(self, edge=e) for e in moved], covariance
 
 

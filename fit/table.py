@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import datetime
 import math
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,16 +16,14 @@ from torchdof.kernel import FAMILIES, LENGTHS, profile, support
 
 from .capture import Capture, Captures
 from .choose import COST
-from .pair import fit_pair
-from .problems import ExposureWarning, FitError, FitWarning, SingleDistanceWarning, warn
+from .join import fit_distances, fit_one
+from .problems import ExposureWarning, FitError, SingleDistanceWarning, warn
 from .result import Array, BlurFit
 from .scale import signed_coc
 
 __all__ = ["TableFit", "fit_captures", "fit_table"]
 
-_KNOTS = 33
 _EXPOSED = 1.3
-_SWEEPS = 2
 
 
 @dataclass(frozen=True)
@@ -61,6 +58,17 @@ def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **op
 
     Raises:
         FitError: see `fit_captures`.
+
+    Example:
+        >>> import torch
+        >>> from torchdof import kernel
+        >>> def picture(radius, blur=0.0):  # a white dot of a radius, blurred by a disc
+        ...     dot = kernel.disc(radius, size=61) * 3.14159 * radius**2
+        ...     return torch.nn.functional.conv2d(dot[None, None], kernel.disc(blur)[None, None], padding="same")[0, 0]
+        >>> near = Capture(picture(8.0).numpy(), picture(10.0, 5.0).numpy(), distance_m=0.8)
+        >>> far = Capture(picture(8.0).numpy(), picture(6.4, 4.0).numpy(), distance_m=1.25)
+        >>> fit_table(Captures((near, far), focus_m=1.0, width_px=1000), "disc")
+        BlurTable('unnamed', disc, 2 nodes)
     """
     if not isinstance(captures, Captures):
         raise FitError(
@@ -86,8 +94,8 @@ def fit_captures(
     second moment, by least squares over all distances.
 
     Each fit starts from its outer neighbour's, scaled by geometry, from both ends towards focus, and leaves that
-    branch only where the pictures clearly ask for it. Then all are fitted once more, each loosely expecting what lies on
-    the line between its neighbours (not those of `radial`, which are smoothed over r).
+    branch only where the pictures clearly ask for it. Then all are fitted once more, each loosely expecting what lies
+    on the line between its neighbours; free profiles are given radii on one line instead.
 
     Args:
         captures: pairs at increasing distances.
@@ -114,18 +122,15 @@ def fit_captures(
     if family == "auto":
         family, why = _choose(pairs, captures.focus_m, accuracy_db, progress, total)
         done = len(pairs)
-    fits: dict[int, BlurFit] = {}
-    for i, before in _towards_focus([p.distance_m for p in pairs], captures.focus_m):
-        start = _scaled(fits[before], pairs[before], pairs[i], captures.focus_m) if before is not None else None
-        pair = pairs[i]
-        fits[i] = _fit(pair, captures.focus_m, family, start)
-        _check_exposure(pair, fits[i])
+
+    def report(pair: Capture, fit: BlurFit) -> None:
+        nonlocal done
+        _check_exposure(pair, fit)
         done += 1
         if progress:
             progress(done, total, f"{pair.distance_m:g} m")
-    if smooth and family != "radial":
-        fits = _together(pairs, captures.focus_m, family, fits)
-    ordered = [fits[i] for i in range(len(pairs))]
+
+    ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
     coc_px, scale = _keys(captures, ordered)
     params = _nodes(ordered, family)
     if len(pairs) == 1:
@@ -153,48 +158,13 @@ def _choose(
     worst = 0
     why = ""
     for i, pair in enumerate(pairs):
-        fit = _fit(pair, focus_m, "auto", None, accuracy_db)
+        fit = fit_one(pair, focus_m, "auto", None, accuracy_db)
         # the richest family that any distance needs serves all
         if not why or COST.index(fit.family) > worst:
             worst, why = COST.index(fit.family), f"{fit.family}, for {pair.distance_m:g} m: {fit.why}"
         if progress:
             progress(i + 1, total, f"{pair.distance_m:g} m")
     return COST[worst], why
-
-
-def _fit(
-    pair: Capture,
-    focus_m: float,
-    family: str,
-    start: BlurFit | None,
-    accuracy_db: float = 45.0,
-    prior: dict[str, tuple[float, float]] | None = None,
-) -> BlurFit:
-    return fit_pair(
-        pair.sharp,
-        pair.blurred,
-        family,
-        accuracy_db=accuracy_db,
-        magnification=focus_m / pair.distance_m,
-        white=pair.white,
-        start=start,
-        prior=prior,
-        knots=_KNOTS if family == "radial" else None,
-        files=pair.files,
-    )
-
-
-def _towards_focus(distances: list[float], focus_m: float) -> list[tuple[int, int | None]]:
-    """Indices from both ends towards focus, each with the neighbour it starts from."""
-    near = [i for i, d in enumerate(distances) if d < focus_m]
-    far = [i for i, d in enumerate(distances) if d > focus_m][::-1]
-    return [(i, side[k - 1] if k else None) for side in (near, far) for k, i in enumerate(side)]
-
-
-def _scaled(fit: BlurFit, before: Capture, after: Capture, focus_m: float) -> BlurFit:
-    ratio = abs(1 / focus_m - 1 / after.distance_m) / abs(1 / focus_m - 1 / before.distance_m)
-    params = {k: v * ratio if k in LENGTHS else v for k, v in fit.params.items()}
-    return replace(fit, params=params)
 
 
 def _check_exposure(pair: Capture, fit: BlurFit) -> None:
@@ -231,49 +201,6 @@ def rms_radius(fit: BlurFit) -> float:
     r = np.linspace(0, support(fit.family, given) + 1e-9, 4001)
     f = profile(fit.family, torch.from_numpy(r), given).numpy()
     return float(np.sqrt((f * r**3).sum() / (f * r).sum()))
-
-
-def _together(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
-    """Fit every pair once more, expecting what its neighbours on the same side of focus say.
-
-    Parameters that trade with each other (a rim's height and its steepness) are thus told alike at all distances,
-    while what the pictures determine stays as they say: the expectation is loose.
-    """
-    place = np.array([1 / focus_m - 1 / p.distance_m for p in pairs])
-    fits = dict(fits)
-    for _ in range(_SWEEPS):
-        for i in sorted(fits, key=lambda k: -abs(place[k])):
-            sides = [k for k in fits if place[k] * place[i] > 0]
-            lower = [k for k in sides if abs(place[k]) < abs(place[i])]
-            upper = [k for k in sides if abs(place[k]) > abs(place[i])]
-            inner = max(lower, key=lambda k: abs(place[k]), default=None)
-            outer = min(upper, key=lambda k: abs(place[k]), default=None)
-            if outer is None and inner is None:
-                continue
-            prior = {n: _expected(n, i, inner, outer, place, fits) for n in FAMILIES[family]}
-            with warnings.catch_warnings():
-                # the first fit of this pair has said it
-                warnings.simplefilter("ignore", FitWarning)
-                fits[i] = _fit(pairs[i], focus_m, family, fits[i], prior=prior)
-    return fits
-
-
-def _expected(
-    name: str, i: int, inner: int | None, outer: int | None, place: Array, fits: dict[int, BlurFit]
-) -> tuple[float, float]:
-    """Value and standard deviation expected of a parameter: on the line between the neighbours, as the table has it."""
-    length = name in LENGTHS
-    if inner is None or outer is None:
-        only = outer if inner is None else inner
-        value = float(fits[only].params[name]) * (abs(place[i] / place[only]) if length else 1.0)  # type: ignore[index]
-        loose = 3.0
-    else:
-        share = (place[i] - place[inner]) / (place[outer] - place[inner])
-        value = float((1 - share) * fits[inner].params[name] + share * fits[outer].params[name])
-        loose = 1.0
-    size = max(float(fits[i].params[n]) for n in fits[i].params if n in LENGTHS)
-    deviation = {"b": 0.1, "m": 0.3}.get(name, 0.05 * size + 0.05)
-    return value, loose * deviation
 
 
 def _nodes(fits: list[BlurFit], family: str) -> dict[str, Array]:

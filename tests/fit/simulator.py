@@ -116,7 +116,9 @@ def _through_jpeg(picture: np.ndarray, quality: int) -> np.ndarray:
     return np.asarray(Image.open(stored), dtype=np.float64) / 255
 
 
-def write_captures(folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=(), **harm):
+def write_captures(
+    folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=(), **harm
+):
     """A folder of 16-bit sRGB PNGs with its capture.toml: the dot in the frame's centre, and wherever `grid` says.
 
     `kernel(distance)` gives (family, params); `camera` is a `Simulator` whose window is ignored.

@@ -81,7 +81,9 @@ def test_harm_leaves_no_bias_of_half_a_percent(simulator, harm, sigma):
 def test_jpeg_leaves_no_bias_of_half_a_percent(simulator):
     camera = simulator.Simulator(jpeg=60, level=0.7, black=0.02, snr_db=None, size=105)
     fits = [
-        fit_pair(*simulator.Simulator(**{**vars(camera), "shift": (dx, dx / 2)}).pair("gaussian", {"sigma": 4.0}), "gaussian")
+        fit_pair(
+            *simulator.Simulator(**{**vars(camera), "shift": (dx, dx / 2)}).pair("gaussian", {"sigma": 4.0}), "gaussian"
+        )
         for dx in (0.0, 0.7, 1.4, 2.1, 2.8)
     ]
     assert abs(np.mean([f.params["sigma"] for f in fits]) / 4.0 - 1) < 0.005
@@ -99,7 +101,9 @@ def test_offset_gain_shift_and_magnification_are_reported(simulator):
 @pytest.mark.parametrize("snr_db", [40, 30])
 def test_standard_errors_hold_in_repeated_captures(simulator, snr_db):
     camera = simulator.Simulator(snr_db=snr_db, size=81, dot_radius=8.0)
-    fits = [fit_pair(*camera.pair("gaussian", {"sigma": 3.0}, s), "gaussian", fit_magnification=True) for s in range(40)]
+    fits = [
+        fit_pair(*camera.pair("gaussian", {"sigma": 3.0}, s), "gaussian", fit_magnification=True) for s in range(40)
+    ]
     pulls = np.array([(f.params["sigma"] - 3.0) / f.stderr["sigma"] for f in fits])
     assert 0.75 < pulls.std() < 1.3
     assert abs(pulls.mean()) < 0.5
@@ -119,7 +123,11 @@ def test_standard_errors_hold_where_the_picture_of_the_dot_is_the_source(simulat
 
 @pytest.mark.parametrize(
     ("family", "true"),
-    [("gaussian", {"sigma": 3.0}), ("disc", {"radius": 7.0}), ("softm", {"radius": 8.0, "sigma": 1.0, "b": 1.0, "m": 4.0})],
+    [
+        ("gaussian", {"sigma": 3.0}),
+        ("disc", {"radius": 7.0}),
+        ("softm", {"radius": 8.0, "sigma": 1.0, "b": 1.0, "m": 4.0}),
+    ],
 )
 def test_auto_takes_the_cheapest_family_that_is_enough(simulator, family, true):
     fit = fit_pair(*simulator.Simulator(snr_db=60).pair(family, true), accuracy_db=60)

@@ -28,7 +28,11 @@ def test_figure_2_shows_samples_and_curve(tmp_path):
 
 def test_a_forward_fit_shows_its_pixels_its_model_and_its_kernel(simulator, tmp_path):
     figure = picture_of_fit(fit_pair(*simulator.Simulator().pair("gaussian", {"sigma": 3.0}), "gaussian"))
-    assert [line.get_label() for line in figure.axes[0].get_lines()] == ["pixels", "forward model", "kernel f(r), scaled"]
+    assert [line.get_label() for line in figure.axes[0].get_lines()] == [
+        "pixels",
+        "forward model",
+        "kernel f(r), scaled",
+    ]
     assert drawn(figure, tmp_path) > 5
 
 
