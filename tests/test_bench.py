@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from torchdof import bench, metrics
 from torchdof.command import app
@@ -16,7 +16,7 @@ DATA = Path(__file__).parent / "data" / "scenes"
 CAMERA = camera_of(200.0, 96, aperture_radius_m=0.04, focus_m=2.0)
 
 
-def run(*arguments: object):
+def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["bench", *map(str, arguments)])
 
 

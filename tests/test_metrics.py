@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 
 import kornia
 import pytest
@@ -57,7 +58,7 @@ def test_flip_is_zero_for_equal_images_and_largest_where_they_differ() -> None:
 
 
 @pytest.mark.parametrize("measure", [metrics.psnr, metrics.ssim])
-def test_different_shapes_are_refused(measure) -> None:
+def test_different_shapes_are_refused(measure: Callable[[torch.Tensor, torch.Tensor], float]) -> None:
     with pytest.raises(ValueError, match=r"same shape, got \[1, 3, 9, 8\] and \[1, 3, 8, 8\]"):
         measure(torch.zeros(1, 3, 9, 8), torch.zeros(1, 3, 8, 8))
 

@@ -1,5 +1,6 @@
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -54,14 +55,14 @@ def test_what_is_in_focus_is_returned_bit_exact() -> None:
 @pytest.mark.parametrize("coc", [-6.0, 4.0])
 def test_a_plane_is_the_convolution_with_the_tables_kernel(table: BlurTable, coc: float) -> None:
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(80.0), indexing="ij")
-    image = waves(5, shortest_px=10.0)(x.double(), y.double()).float()[None]
+    image = waves(5, shortest_px=4.0)(x.double(), y.double()).float()[None]
     out = lens_views_by_coc(image, torch.full((1, 1, 64, 80), coc), table=table, views=512).image
     kernel = table.kernels(torch.tensor([coc]), width=80)[0].float()
     half = kernel.shape[-1] // 2
     blurred = functional.conv2d(image.transpose(0, 1), kernel[None].flip(-1, -2)).transpose(0, 1)
     inner = out[..., half:-half, half:-half]
-    assert metrics.psnr(image[..., half:-half, half:-half], blurred) < 46
-    assert metrics.psnr(inner, blurred) > 52
+    assert metrics.psnr(image[..., half:-half, half:-half], blurred) < 32
+    assert metrics.psnr(inner, blurred) > 58
 
 
 def test_channels_are_blurred_by_their_own_kernels() -> None:
@@ -93,9 +94,9 @@ def test_a_highlight_is_a_disc_of_the_right_radius_and_energy(depth_m: float) ->
 
 def test_with_hidden_surfaces_known_it_agrees_with_the_exact_truth(bars: Scene) -> None:
     alone = lens_views(bars.image, bars.depth, bars.camera, mixed_edges=False)
-    told = lens_views(bars.image, bars.depth, bars.camera, surfaces=bars.surfaces, mixed_edges=False)
+    told = lens_views(bars.image, bars.depth, bars.camera, surfaces=bars.surfaces)
     assert shown_psnr(bars.image, bars, bars.inner) < 32
-    assert shown_psnr(told.image, bars, bars.inner) > 38
+    assert shown_psnr(told.image, bars, bars.inner) > 45
     assert shown_psnr(told.image, bars, bars.inner) > shown_psnr(alone.image, bars, bars.inner) + 3
     assert bool((told.known[bars.inner] == 1).all())
     assert 0.3 < float((alone.known[bars.inner] == 1).float().mean()) < 0.95
@@ -162,6 +163,6 @@ def test_half_precision_and_batches() -> None:
         ({"surfaces": [(torch.rand(1, 4, 8, 8), -torch.ones(1, 1, 8, 8))]}, "depth must be > 0"),
     ],
 )
-def test_bad_arguments_are_refused(options: dict[str, object], message: str) -> None:
+def test_bad_arguments_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lens_views(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), Camera(), **options)
