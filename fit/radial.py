@@ -15,6 +15,8 @@ from .result import Array, Mask
 
 __all__ = ["solve_radial"]
 
+# plain cross-validation (1) follows the noise now and then; 3 costs nothing without noise and up to 12 dB less with it
+_CAUTION = 3.0
 _SMOOTHNESS = 10.0 ** np.arange(-8.0, 0.0)
 
 
@@ -101,7 +103,7 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array, Mask]:
         free = weights > 0
         used = np.trace(np.linalg.solve((normal + smooth)[np.ix_(free, free)], normal[np.ix_(free, free)]))
         squares = max(total - 2 * float(right @ weights) + float(weights @ normal @ weights), 1e-14 * total)
-        score = squares / (data.size - min(float(used), 0.9 * data.size)) ** 2
+        score = squares / (data.size - min(_CAUTION * float(used), 0.9 * data.size)) ** 2
         if best is None or score < best[0]:
             best = score, weights, smooth
     if best is None:
