@@ -70,7 +70,7 @@ class _Pinned(BlurTable):
         self._scale = super()._px_per_unit(width)
         self.unit = "relative"  # to the plan: not tied to the width
 
-    def _px_per_unit(self, width: int) -> float:
+    def _px_per_unit(self, width: float) -> float:
         return getattr(self, "_scale", 1.0)
 
 
@@ -104,10 +104,11 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0
     example = (image, map_, *(torch.full(size[:1], value) for value in (1.5, 2.8)[: len(INPUTS[portable.inputs]) - 2]))
     # Fills the cache of kernels, which the trace then takes as constants.
-    portable.plan.kernels(table, size[1:], image.dtype, image.device)
+    portable.plan.blurs(table, (64, 64), image.dtype, image.device, coarse=portable.dof.method == "layered")
     batch, height, width = (torch.export.Dim(name, min=1) for name in ("B", "H", "W"))
     frame = {0: batch, 2: height, 3: width}
     shapes = (frame, frame, *(({0: batch}, {0: batch}),) * (len(example) > 2))
     with torch.no_grad():
-        return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)
-
+        return torch.export.export(
+            portable, example, dynamic_shapes=shapes, strict=False, prefer_deferred_runtime_asserts_over_guards=True
+        )

@@ -172,14 +172,17 @@ def _moved(portable: Portable, case: Case, expected: Tensor) -> Tensor:
     """How far eager PyTorch moves when the map changes in its last bits, ``[B, H, W]``."""
     image, map_, *lens = case.tensors
     with torch.no_grad():
-        moved = [(portable(image, map_ * (1 + s * ROUNDING), *lens) - expected).abs().amax(1) for s in (-1, -0.5, 0.5, 1)]
+        moved = [
+            (portable(image, map_ * (1 + s * ROUNDING), *lens) - expected).abs().amax(1) for s in (-1, -0.5, 0.5, 1)
+        ]
     # one pixel's rounding shows in its neighbours
     return functional.max_pool2d(torch.stack(moved).amax(0), 5, stride=1, padding=2)
 
 
 def _bank(portable: Portable, like: Tensor) -> list[Tensor]:
     size = (int(like.shape[-2]), int(like.shape[-1]))
-    return portable.plan.kernels(portable.dof.table, size, like.dtype, like.device)
+    blurs = portable.plan.blurs(portable.dof.table, size, like.dtype, like.device, portable.dof.method == "layered")
+    return [blur.kernel for blur in blurs]
 
 
 def check_format(model: onnx.ModelProto, path: str) -> None:

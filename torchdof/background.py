@@ -159,13 +159,14 @@ def fill_hidden(
     if valid is not None:
         depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid
     step = 2**levels
-    extra = (0, (-width) % step, 0, (-height) % step)
+    # in this form exported code knows that the sizes are multiples, and with one more that none of them is 1
+    more = 2 * step - 1
+    extra = (0, (width + more) // step * step - width, 0, (height + more) // step * step - height)
     depth, colour, weight = (functional.pad(t, extra, mode="replicate") for t in (depth, colour, weight))
     at = _positions(_may_hide(coc_px, depth, share, levels, (height, width)))
     here = _pick(coc_px, at)[0]
     reach = here.abs()
-    row, column = at // width % height, at % width
-    item = at // (width * height)
+    item, row, column = _places(at, height, width)
     total = torch.zeros_like(here)
     seen_light, seen_coc = _pick(light, at), here
     for level in range(1, levels + 1):
@@ -290,6 +291,13 @@ def _positions(wanted: Tensor) -> Tensor:
     return wanted.flatten().nonzero()[:, 0]
 
 
+def _places(at: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Item, row and column of flat indices."""
+    line = at // width
+    item = line // height
+    return item, line - item * height, at - line * width
+
+
 def _pick(values: Tensor, at: Tensor) -> Tensor:
     """``[B, C, H, W]`` -> ``[C, P]``."""
     return values.transpose(0, 1).flatten(1)[:, at]
@@ -311,7 +319,7 @@ def _distances() -> list[int]:
 def _around(values: Tensor, at: Tensor) -> Iterator[Tensor]:
     """The pixels around each position, one offset after the other, in the order of :func:`_distances`."""
     height, width = values.shape[-2:]
-    row, column, item = at // width % height, at % width, at // (width * height)
+    item, row, column = _places(at, height, width)
     flat = values.transpose(0, 1).flatten(1)
     for dy in range(-_REACH, _REACH + 1):
         for dx in range(-_REACH, _REACH + 1):

@@ -76,7 +76,9 @@ class Frame:
         self.size = samples[0].light.shape[-2:]
         self.margin, self.tiled = margin, tiled
         align = max(align, TILE) if tiled else align
-        self.area = tuple(n + (-n) % align for n in self.size)
+        # in this form traced code knows that the sizes are multiples, and with one more that none of them is 1
+        more = 2 * align - 1 if torch.compiler.is_exporting() and align > 1 else align - 1
+        self.area = tuple((n + more) // align * align for n in self.size)
         ends = (margin, margin + self.area[1] - self.size[1], margin, margin + self.area[0] - self.size[0])
         self.samples = [
             Sample(

@@ -111,7 +111,7 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     if (2 * half + 1) ** 2 > _DIRECT_TAPS and not _traced():
         return _fourier(light, kernels)[..., halo : light.shape[-2] - halo, halo : light.shape[-1] - halo]
     batch, channels = light.shape[:2]
-    together = _PACK // channels if batch > 1 and channels <= _PACK // 2 else 1
+    together = _PACK // channels if not _traced() and batch > 1 and channels <= _PACK // 2 else 1
     packed = light
     if together > 1:  # items as channels of one convolution
         packed = functional.pad(packed, (0, 0, 0, 0, 0, 0, 0, (-batch) % together))
@@ -188,3 +188,7 @@ def _check(light: Tensor, kernels: Tensor) -> None:
         raise ValueError(f"kernels must be square with an odd width, got {list(kernels.shape)}")
     if kernels.shape[-3] not in (1, light.shape[1]):
         raise ValueError(f"kernels must have 1 or {light.shape[1]} channels as the light does, got {kernels.shape[-3]}")
+
+
+def _traced() -> bool:
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
