@@ -39,7 +39,8 @@ class Portable(nn.Module):
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
-                    f"the camera's {name} must be a float to be exported, got a tensor; focus_m and f_number are inputs "
+                    f"the camera's {name} must be a float to be exported, got a tensor; "
+                    f"focus_m and f_number are inputs "
                     "of the graph, so any value does for them"
                 )
         self.inputs, self.width = inputs, width

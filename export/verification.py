@@ -80,7 +80,8 @@ class Verification:
         lines = [
             f"{self.title}: {self.bytes / 1000:.0f} kB, "
             f"{'verified' if self.passed else 'DIFFERS'} (largest error {self.max_error:.1e} of the local range)",
-            f"{'case':27} {'B x C x H x W':>17} {'max error':>9} {'mean':>7} {'left out':>8} {'torch ms':>8} {'onnx ms':>8}",
+            f"{'case':27} {'B x C x H x W':>17} {'max error':>9} {'mean':>7} {'left out':>8} "
+            f"{'torch ms':>8} {'onnx ms':>8}",
         ]
         for row in self.cases:
             shape = " x ".join(map(str, row.shape))
@@ -96,7 +97,8 @@ def verify(path: str | os.PathLike[str], dof: DepthOfField, *, large: bool = Fal
 
     The file passes ``onnx.checker`` in full and strict shape inference, uses standard operators only and holds its
     weights; its inputs and output have the names, types and free sizes that :func:`to_onnx` promises; and onnxruntime
-    renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the largest
+    renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the
+    largest
     light within the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced ones.
 
     Args:

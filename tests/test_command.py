@@ -186,7 +186,7 @@ def test_method_reaches_the_function(scene: Path, monkeypatch: pytest.MonkeyPatc
 
     def spy(*arguments: Any, method: str, **options: Any) -> torch.Tensor:
         methods.append(method)
-        return torchdof.depth_of_field(*arguments, method=method, **options)  # type: ignore[arg-type]
+        return torchdof.depth_of_field(*arguments, method=method, **options)
 
     monkeypatch.setattr("torchdof.render.depth_of_field", spy)
     for method in ("fold", "layered"):

@@ -188,7 +188,3 @@ def _check(light: Tensor, kernels: Tensor) -> None:
         raise ValueError(f"kernels must be square with an odd width, got {list(kernels.shape)}")
     if kernels.shape[-3] not in (1, light.shape[1]):
         raise ValueError(f"kernels must have 1 or {light.shape[1]} channels as the light does, got {kernels.shape[-3]}")
-
-
-def _traced() -> bool:
-    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
