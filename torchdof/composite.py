@@ -1,6 +1,6 @@
 """Layers, far to near, to one image: each layer is scattered with its kernel and laid over what is behind it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 import torch.nn.functional as functional
@@ -11,6 +11,9 @@ from .plan import Blur, Plan
 from .spread import Spread, fold
 
 __all__ = ["accumulate", "accumulate_once", "over"]
+
+Canvas = tuple[Tensor, Tensor]  # light and coverage
+Lay = Callable[[Tensor, Tensor, list[Tensor]], Canvas]
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 
@@ -36,8 +39,8 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
-    out, covered = frame.canvas(blurs[0].kernel.shape[0])
-    for tiles, parts in _spread_layers(frame, plan, blurs, spread, with_room=True):
+
+    def lay(out: Tensor, covered: Tensor, parts: list[Tensor]) -> Canvas:
         light, share, room = parts[0], parts[1], parts[2].clamp_min(_LEAST)
         coverage = (share / room).clamp(0.0, 1.0)
         colour = light / room
@@ -47,11 +50,9 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
             coverage = torch.where(seen > _LEAST, coverage, 0.0)
             colour = torch.where(seen > _LEAST, colour, 0.0)
         left = 1.0 - coverage
-        if tiles is None:
-            out, covered = torch.addcmul(colour, left, out), 1.0 - left + left * covered
-        else:
-            out[tiles] = torch.addcmul(colour, left, out[tiles])
-            covered[tiles] = 1.0 - left + left * covered[tiles]
+        return torch.addcmul(colour, left, out), 1.0 - left + left * covered
+
+    out, covered = _lay_all(frame, plan, blurs, spread, True, lay)
     return frame.image(torch.where(covered > _LEAST, out / covered.clamp_min(_LEAST), 0.0))
 
 
@@ -71,13 +72,11 @@ def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, norm
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
     """
-    total, weight = frame.canvas(blurs[0].kernel.shape[0])
-    for tiles, (light, share, *_) in _spread_layers(frame, plan, blurs, spread, with_room=False):
-        if tiles is None:
-            total, weight = total + light, weight + share
-        else:
-            total[tiles] += light
-            weight[tiles] += share
+
+    def lay(total: Tensor, weight: Tensor, parts: list[Tensor]) -> Canvas:
+        return total + parts[0], weight + parts[1]
+
+    total, weight = _lay_all(frame, plan, blurs, spread, False, lay)
     if normalize:
         total = torch.where(weight > _LEAST, total / weight.clamp_min(_LEAST), 0.0)
     return frame.image(total)
@@ -116,20 +115,55 @@ def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool
     return frame.image(total)
 
 
-def _spread_layers(
-    frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool
-) -> Iterator[tuple[Tensor | None, list[Tensor]]]:
-    """Scattered light, share, room (share at or behind) and seen share of the layers, far to near, tiles by tiles."""
+def _lay_all(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, lay: Lay) -> Canvas:
+    """Lay all layers, far to near, on an empty canvas."""
+    canvas = frame.canvas(blurs[0].kernel.shape[0])
     for group in frame.groups(plan, blurs):
-        halo = max(blurs[k].halo for k in group)
-        for tiles, window in frame.windows(group, halo):
-            terms = [window.terms(plan.nodes, k, with_room) for k in group]
-            if blurs[group[0]].kernel.shape[0] > 1:
-                colours = terms[0][0].shape[1]
-                terms = [[part.expand(-1, colours, -1, -1) for part in parts] for parts in terms]
-            lengths = [part.shape[1] for parts in terms for part in parts]
-            kernels = [(blurs[k], sum(p.shape[1] for p in parts)) for k, parts in zip(group, terms, strict=True)]
-            scattered = spread(torch.cat([p for parts in terms for p in parts], 1), kernels, halo).split(lengths, 1)
-            each = len(terms[0])
-            for i in range(0, len(scattered), each):
-                yield tiles, [frame.at(part, tiles) for part in scattered[i : i + each]]
+
+        def laid(out: Tensor, covered: Tensor, group: list[int] = group) -> Canvas:
+            for tiles, parts in _spread_group(frame, plan, blurs, spread, with_room, group):
+                if tiles is None:
+                    out, covered = lay(out, covered, parts)
+                else:
+                    out[tiles], covered[tiles] = lay(out[tiles], covered[tiles], parts)
+            return out, covered
+
+        if torch.compiler.is_exporting():  # a graph cannot choose its work beforehand: each group becomes a branch
+            needed = frame.any_share(plan, group, max(blurs[k].halo for k in group))
+            canvas = torch.cond(needed, _dense(laid), _untouched, canvas)
+        else:
+            canvas = laid(*canvas)
+    return canvas
+
+
+def _dense(laid: Callable[[Tensor, Tensor], Canvas]) -> Callable[[Tensor, Tensor], Canvas]:
+    """Both branches of a condition must lie in memory the same way."""
+
+    def dense(out: Tensor, covered: Tensor) -> Canvas:
+        out, covered = laid(out, covered)
+        kept = torch.contiguous_format
+        return out.clone(memory_format=kept), covered.clone(memory_format=kept)
+
+    return dense
+
+
+def _untouched(out: Tensor, covered: Tensor) -> Canvas:
+    return out.clone(), covered.clone()
+
+
+def _spread_group(
+    frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, group: list[int]
+) -> Iterator[tuple[Tensor | None, list[Tensor]]]:
+    """Scattered light, share, room (share at or behind) and seen share of layers, far to near, tiles by tiles."""
+    halo = max(blurs[k].halo for k in group)
+    for tiles, window in frame.windows(group, halo):
+        terms = [window.terms(plan.nodes, k, with_room) for k in group]
+        if blurs[group[0]].kernel.shape[0] > 1:
+            colours = terms[0][0].shape[1]
+            terms = [[part.expand(-1, colours, -1, -1) for part in parts] for parts in terms]
+        lengths = [part.shape[1] for parts in terms for part in parts]
+        kernels = [(blurs[k], sum(p.shape[1] for p in parts)) for k, parts in zip(group, terms, strict=True)]
+        scattered = spread(torch.cat([p for parts in terms for p in parts], 1), kernels, halo).split(lengths, 1)
+        each = len(terms[0])
+        for i in range(0, len(scattered), each):
+            yield tiles, [frame.at(part, tiles) for part in scattered[i : i + each]]

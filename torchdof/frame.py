@@ -76,9 +76,7 @@ class Frame:
         self.size = samples[0].light.shape[-2:]
         self.margin, self.tiled = margin, tiled
         align = max(align, TILE) if tiled else align
-        # in this form traced code knows that the sizes are multiples, and with one more that none of them is 1
-        more = 2 * align - 1 if torch.compiler.is_exporting() and align > 1 else align - 1
-        self.area = tuple((n + more) // align * align for n in self.size)
+        self.area = tuple((n + align - 1) // align * align for n in self.size)
         ends = (margin, margin + self.area[1] - self.size[1], margin, margin + self.area[0] - self.size[0])
         self.samples = [
             Sample(
@@ -90,6 +88,14 @@ class Frame:
         ]
         self.known = None if extend else functional.pad(torch.ones_like(samples[0].x[:1]), ends)
         self._occupied: list[Tensor] = []
+
+    @classmethod
+    def piece(cls, samples: Sequence[Sample], known: Tensor | None, margin: int, side: int) -> "Frame":
+        """A square part of a frame that has its margin already, as a frame of its own."""
+        frame = cls.__new__(cls)
+        frame.size = frame.area = (side, side)
+        frame.samples, frame.known, frame.margin, frame.tiled = list(samples), known, margin, False
+        return frame
 
     def canvas(self, kernels: int = 1) -> tuple[Tensor, Tensor]:
         """Nothing yet: light and coverage to lay layers on; ``kernels`` is 1, or C where each colour has its own."""
@@ -122,7 +128,7 @@ class Frame:
             self._occupied = self._occupancy(plan, blurs)
             return [[k] for k in order if bool(self._occupied[k].any())]
         if not _traced():
-            order = [k for k in order if self._any_share(plan, k)]
+            order = [k for k in order if bool(self.any_share(plan, [k], self.margin))]
         each = (self.samples[0].light.shape[1] + 3) if blurs[0].kernel.shape[0] == 1 else _CHANNELS
         groups: list[list[int]] = []
         for k in order:
@@ -171,10 +177,12 @@ class Frame:
         views = values[0].unfold(1, TILE + 2 * halo, TILE).unfold(2, TILE + 2 * halo, TILE)  # [C, rows, columns, t, t]
         return views.permute(1, 2, 0, 3, 4)[places // columns, places % columns]
 
-    def _any_share(self, plan: Plan, k: int) -> bool:
-        low = plan.nodes[k - 1] if k else -torch.inf
-        high = plan.nodes[k + 1] if k + 1 < len(plan.nodes) else torch.inf
-        return any(bool(((s.x > low) & (s.x < high)).any()) for s in self.samples)
+    def any_share(self, plan: Plan, group: Sequence[int], halo: int) -> Tensor:
+        """Whether a pixel of the frame, or up to ``halo`` outside it, lies in these layers, which are neighbours."""
+        ends = (-torch.inf, *plan.nodes, torch.inf)
+        low, high = ends[min(group)], ends[max(group) + 2]
+        places = [self._cut(s.x, halo, None) for s in self.samples]
+        return torch.stack([((x > low) & (x < high)).any() for x in places]).any()
 
     def _occupancy(self, plan: Plan, blurs: Sequence[Blur]) -> list[Tensor]:
         """For each layer, the tiles that its light can reach: ``[rows, columns]``."""

@@ -11,7 +11,8 @@ from . import check as checks
 from .camera import Camera
 from .check import Border, Method, Options
 from .frame import Frame, Sample
-from .plan import Plan
+from .loop import side, tile_by_tile
+from .plan import Blur, Plan
 from .spread import layers_by_conv, layers_by_fold
 from .table import BlurTable
 
@@ -265,20 +266,24 @@ def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
     first, last = plan.nodes[0], plan.nodes[-1]
     samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
     moves = torch.is_grad_enabled() and (light.requires_grad or coc.requires_grad)
+    exporting = torch.compiler.is_exporting()
+    margin, align = max(blur.halo for blur in blurs), max(blur.scale for blur in blurs)
     frame = Frame(
         samples,
-        margin=max(blur.halo for blur in blurs),
-        align=max(blur.scale for blur in blurs),
+        margin=margin,
+        align=side(margin) if exporting else align,
         tiled=layered and not _traced() and not moves and light.shape[0] == 1,
         extend=options.border == "extend",
     )
-    spread = layers_by_conv if layered else layers_by_fold
-    if options.occlusion:
-        out = composite.over(frame, plan, blurs, spread)
-    elif options.method == "fold":
-        out = composite.accumulate_once(frame, plan, blurs, options.normalize)
-    else:
-        out = composite.accumulate(frame, plan, blurs, spread, options.normalize)
+
+    def rendered(frame: Frame, blurs: list[Blur]) -> Tensor:
+        if options.occlusion:
+            return composite.over(frame, plan, blurs, layers_by_conv if layered else layers_by_fold)
+        if not layered:
+            return composite.accumulate_once(frame, plan, blurs, options.normalize)
+        return composite.accumulate(frame, plan, blurs, layers_by_conv, options.normalize)
+
+    out = tile_by_tile(frame, blurs, rendered) if exporting else rendered(frame, blurs)
     return out if valid is None else torch.where(valid, out, image)
 
 

@@ -1,0 +1,68 @@
+"""The frame tile by tile, in a loop: how an exported graph does only the work that a scene needs.
+
+A graph cannot choose its work before it runs. In a loop over tiles each step sees a small window, and the branches
+inside skip every layer that the window does not hold.
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from .frame import Frame, Sample
+from .plan import Blur
+
+__all__ = ["tile_by_tile"]
+
+_SIDE = 128
+
+
+def side(margin: int) -> int:
+    """Pixels of a tile along each axis, given those that the widest kernel reaches beyond it."""
+    return _SIDE if margin <= _SIDE // 2 else 2 * _SIDE
+
+
+def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, list[Blur]], Tensor]) -> Tensor:
+    """Render each tile of a frame as a frame of its own.
+
+    Args:
+        frame: Surfaces and their border; its area is a multiple of :func:`side`.
+        blurs: Kernel and resolution of each layer.
+        render: Renders one tile with them: ``[1, C, side, side]``.
+
+    Returns:
+        ``[B, C, H, W]``.
+    """
+    from torch._higher_order_ops.scan import scan  # the graph's loop; only an export needs it
+
+    length = side(frame.margin)
+    window = length + 2 * frame.margin
+    rows, columns = (n // length for n in frame.area)
+    parts = [t for s in frame.samples for t in (s.light, s.x, s.weight) if t is not None]
+    batch, colours = parts[0].shape[0], int(parts[0].shape[1])
+    if frame.known is not None:
+        parts.append(frame.known.expand(batch, -1, -1, -1))
+    channels = [int(t.shape[1]) for t in parts]
+    weighted, known = frame.samples[0].weight is not None, frame.known is not None
+    across = torch.arange(window)
+    tiles = torch.cat(parts, 1)
+    tiles = tiles[:, :, (torch.arange(rows) * length)[:, None] + across]  # [B, P, rows, window, W]
+    tiles = tiles[..., (torch.arange(columns) * length)[:, None] + across]  # [B, P, rows, window, columns, window]
+    tiles = tiles.permute(0, 2, 4, 1, 3, 5).reshape(-1, sum(channels), window, window)
+
+    # a loop takes no two views of one tensor, and inside it sizes are unknown until they are stated
+    bank = [(blur.kernel.clone(), tuple(blur.kernel.shape), blur.scale) for blur in blurs]
+    frame_margin = frame.margin
+
+    def step(count: Tensor, tile: Tensor) -> tuple[Tensor, Tensor]:
+        fields = [t.clone() for t in tile.reshape(1, sum(channels), window, window).split(channels, 1)]
+        seen = fields.pop() if known else None
+        each = 3 if weighted else 2
+        samples = [Sample(*fields[i : i + each]) for i in range(0, len(fields), each)]
+        piece = Frame.piece(samples, seen, frame_margin, length)
+        tile = render(piece, [Blur(kernel.reshape(shape), scale) for kernel, shape, scale in bank])
+        return count + 1, tile.reshape(colours, length, length)
+
+    _, pieces = scan(step, torch.zeros(1), tiles)
+    image = pieces.reshape(batch, rows, columns, colours, length, length).permute(0, 3, 1, 4, 2, 5)
+    return frame.image(image.reshape(batch, colours, *frame.area))
