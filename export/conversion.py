@@ -7,12 +7,13 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import onnx
 import onnx_ir
 import torch
 from onnx_ir.passes import common as passes
-from onnxscript import optimizer
+from onnxscript import opset20
 
 from torchdof import DepthOfField
 
@@ -23,7 +24,6 @@ from .verification import Verification, verify
 __all__ = ["OPSET", "to_onnx"]
 
 OPSET = 20
-_LARGEST_FOLDED = 64  # elements; larger constants are computed when the file is loaded rather than stored in it
 
 
 def to_onnx(
@@ -40,12 +40,10 @@ def to_onnx(
     The graph takes ``image [B, C, H, W]`` (linear light), ``depth [B, 1, H, W]`` (metres), ``focus_m [B]`` and
     ``f_number [B]``, or ``image`` and ``coc_px [B, 1, H, W]``, all float32, and gives ``out [B, C, H, W]``. B, H and W
     are free, from 1 upwards. It has the layers of every radius up to ``dof.max_coc_px``; those that no pixel falls into
-    are skipped when it runs. A pixel whose depth is NaN, zero or negative passes through sharp and touches nothing
-    else.
+    are skipped when it runs. A pixel whose depth is NaN, zero or negative passes through sharp and touches nothing else.
 
     Args:
-        dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they
-        are
+        dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they are
             inputs.
         path: The file. It is written to a temporary file beside it and moved into place after it has been verified.
         inputs: ``"depth"``, or ``"coc_px"`` for pipelines that have the circle of confusion already.
@@ -106,19 +104,25 @@ def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
             dynamic_shapes=shapes,
             optimize=False,
             verbose=False,
+            custom_translation_table={torch.ops.aten.remainder.Scalar: _remainder},
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
     return converted.model
 
 
+def _remainder(self: Any, other: Any) -> Any:
+    """``index % width`` with a width that is known only when the graph runs; torch.onnx takes numbers only."""
+    return opset20.Mod(self, opset20.CastLike(other, self))
+
+
 def _slim(model: onnx_ir.Model) -> onnx_ir.Model:
-    """Inlined and without repeated constants, stack traces and names of source files."""
-    with _quiet():
-        model = optimizer.optimize(model, input_size_limit=_LARGEST_FOLDED, output_size_limit=_LARGEST_FOLDED)
+    """One flat graph without repeated constants, stack traces and names of source files."""
     for step in (
-        passes.IdentityEliminationPass(),
-        passes.CommonSubexpressionEliminationPass(),
+        passes.InlinePass(),
+        passes.RemoveUnusedFunctionsPass(),
+        passes.LiftSubgraphInitializersToMainGraphPass(),
+        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         passes.DeduplicateInitializersPass(size_limit=2**24),
         passes.RemoveUnusedNodesPass(),
         passes.RemoveUnusedOpsetsPass(),

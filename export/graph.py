@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.camera import Camera
-from torchdof.plan import Plan
+from torchdof.plan import Blur, Plan
 
 __all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
 
@@ -39,8 +39,7 @@ class Portable(nn.Module):
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
-                    f"the camera's {name} must be a float to be exported, got a tensor; "
-                    f"focus_m and f_number are inputs "
+                    f"the camera's {name} must be a float to be exported, got a tensor; focus_m and f_number are inputs "
                     "of the graph, so any value does for them"
                 )
         self.inputs, self.width = inputs, width
@@ -61,6 +60,11 @@ class Portable(nn.Module):
         """The layers of the graph."""
         return Plan.all(self.dof.max_coc_px, self.dof.tolerance)
 
+    def blurs(self, size: tuple[int, int]) -> list[Blur]:
+        """Kernels of the graph's layers, for a frame of this height and width."""
+        coarse = self.dof.method == "layered"
+        return self.plan.blurs(self.dof.table, size, torch.float32, torch.device("cpu"), coarse)
+
 
 class _Pinned(BlurTable):
     """A table whose kernels are those of one image width, whatever the width of the image at hand."""
@@ -71,7 +75,7 @@ class _Pinned(BlurTable):
         self._scale = super()._px_per_unit(width)
         self.unit = "relative"  # to the plan: not tied to the width
 
-    def _px_per_unit(self, width: float) -> float:
+    def _px_per_unit(self, width: int) -> float:
         return getattr(self, "_scale", 1.0)
 
 
@@ -99,17 +103,16 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     Raises:
         ValueError: If the channels do not fit the table.
     """
-    table, size = portable.dof.table, (2, 64, 64)
+    table, size = portable.dof.table, (2, 400, 300)
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
     image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0
     example = (image, map_, *(torch.full(size[:1], value) for value in (1.5, 2.8)[: len(INPUTS[portable.inputs]) - 2]))
     # Fills the cache of kernels, which the trace then takes as constants.
-    portable.plan.blurs(table, (64, 64), image.dtype, image.device, coarse=portable.dof.method == "layered")
-    batch, height, width = (torch.export.Dim(name, min=1) for name in ("B", "H", "W"))
-    frame = {0: batch, 2: height, 3: width}
-    shapes = (frame, frame, *(({0: batch}, {0: batch}),) * (len(example) > 2))
+    portable.blurs(size[1:])
+    free = torch.export.Dim.AUTO
+    batch, frame = {0: free}, {0: free, 2: free, 3: free}
+    shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
     with torch.no_grad():
-        return torch.export.export(
-            portable, example, dynamic_shapes=shapes, strict=False, prefer_deferred_runtime_asserts_over_guards=True
-        )
+        return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)
+
