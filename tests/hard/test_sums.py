@@ -118,14 +118,14 @@ def test_kernels_of_every_family_sum_to_one_in_single_precision() -> None:
 
 SOAK = """
 import gc, resource, torch, torchdof
-image = torch.rand(1, 3, 48, 64)
-dof = torchdof.DepthOfField(torchdof.Camera(sensor_width_mm=8.0))
+image = torch.rand(1, 3, 24, 32)
+dof = torchdof.DepthOfField(torchdof.Camera(sensor_width_mm=6.0))
 def rss():
     gc.collect()
     return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
 def shoot(count):
     for i in range(count):
-        dof(image, 1.0 + 0.01 * i + torch.rand(1, 1, 48, 64))
+        dof(image, 1.0 + 0.01 * i + torch.rand(1, 1, 24, 32))
 shoot(60)
 early = rss()
 shoot(440)
