@@ -39,11 +39,12 @@ def to_onnx(
 
     The graph takes ``image [B, C, H, W]`` (linear light), ``depth [B, 1, H, W]`` (metres), ``focus_m [B]`` and
     ``f_number [B]``, or ``image`` and ``coc_px [B, 1, H, W]``, all float32, and gives ``out [B, C, H, W]``. B, H and W
-    are free, from 1 upwards. It has the layers of every radius up to ``dof.max_coc_px``; those that no pixel falls into
-    are skipped when it runs. A pixel whose depth is NaN, zero or negative passes through sharp and touches nothing else.
+    are free, from 1 upwards. It has the layers of every radius up to ``dof.max_coc_px``. A pixel whose depth is NaN,
+    zero or negative passes through sharp and touches nothing else.
 
     Args:
-        dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they are
+        dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they
+        are
             inputs.
         path: The file. It is written to a temporary file beside it and moved into place after it has been verified.
         inputs: ``"depth"``, or ``"coc_px"`` for pipelines that have the circle of confusion already.

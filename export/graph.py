@@ -39,7 +39,8 @@ class Portable(nn.Module):
         for name in Camera.__dataclass_fields__:
             if isinstance(getattr(dof.camera, name), Tensor):
                 raise ValueError(
-                    f"the camera's {name} must be a float to be exported, got a tensor; focus_m and f_number are inputs "
+                    f"the camera's {name} must be a float to be exported, got a tensor; "
+                    "focus_m and f_number are inputs "
                     "of the graph, so any value does for them"
                 )
         self.inputs, self.width = inputs, width
@@ -115,4 +116,3 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
     with torch.no_grad():
         return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)
-

@@ -37,8 +37,10 @@ def chain(
 ) -> None:
     """Join a depth estimator's ONNX and a file of :func:`to_onnx` into one file: an image in, a photograph out.
 
-    The joint graph takes ``image [B, 3, H, W]`` in linear light, ``focus_m [B]`` and ``f_number [B]``, and gives ``out``
-    and the ``depth [B, 1, H, W]`` in metres that was used. The estimator sees the image clipped to [0, 1] and encoded as
+    The joint graph takes ``image [B, 3, H, W]`` in linear light, ``focus_m [B]`` and ``f_number [B]``, and gives
+    ``out``
+    and the ``depth [B, 1, H, W]`` in metres that was used. The estimator sees the image clipped to [0, 1] and encoded
+    as
     sRGB, then ``(x - mean) / std``, resized to its own size.
 
     Args:
@@ -47,12 +49,14 @@ def chain(
         dof_model: A file written by :func:`to_onnx`, or one loaded; it must take depth.
         path: The file to write; it is verified against running the parts in turn and then moved into place.
         estimate: What the estimator gives. ``"metric"``: depth, ``scale`` of it a metre. ``"inverse"``: inverse depth,
-            ``1 / z = scale * estimate + shift``, at infinity where that is not positive. ``"relative-inverse"``: inverse
+            ``1 / z = scale * estimate + shift``, at infinity where that is not positive. ``"relative-inverse"``:
+            inverse
             depth up to an unknown scale and shift (as MiDaS and Depth Anything do); the graph then has two more inputs,
             ``near_m [B]`` and ``far_m [B]``, which the nearest and the farthest pixel are put at.
         scale: See ``estimate``.
         shift: See ``estimate``.
-        size: ``(h, w)`` that the estimator wants; None takes what its input declares, or the image's own size where that
+        size: ``(h, w)`` that the estimator wants; None takes what its input declares, or the image's own size where
+        that
             is free.
         mean: What the estimator wants subtracted from its display-encoded input, per channel.
         std: What it wants it divided by then.
@@ -123,9 +127,7 @@ def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
         onnx.compose.add_prefix(part, name) for part, name in zip(parts, names, strict=True)
     )
     taken, given = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"
-    joint = onnx.compose.merge_models(
-        encode, estimator, [("encode/encoded", taken)], outputs=[given, "encode/light"]
-    )
+    joint = onnx.compose.merge_models(encode, estimator, [("encode/encoded", taken)], outputs=[given, "encode/light"])
     joint = onnx.compose.merge_models(joint, decode, [(given, "decode/estimate"), ("encode/light", "decode/light")])
     io_map = [("decode/depth", "dof/depth"), ("decode/image", "dof/image")]
     joint = onnx.compose.merge_models(joint, dof, io_map, outputs=[f"dof/{OUTPUT}", "decode/depth"])
@@ -168,7 +170,9 @@ def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto]
         names = [value.name for value in run.get_inputs()]
         if part is parts[1]:
             values[names[0]] = values["encoded"]
-        results = dict(zip([v.name for v in run.get_outputs()], run.run(None, {n: values[n] for n in names}), strict=True))
+        results = dict(
+            zip([v.name for v in run.get_outputs()], run.run(None, {n: values[n] for n in names}), strict=True)
+        )
         values |= {"estimate": next(iter(results.values()))} if part is parts[1] else results
     for name, result in zip((OUTPUT, "depth"), got, strict=True):
         expected = values[name]

@@ -80,7 +80,8 @@ class Verification:
         lines = [
             f"{self.title}: {self.bytes / 1000:.0f} kB, "
             f"{'verified' if self.passed else 'DIFFERS'} (largest error {self.max_error:.1e} of the local range)",
-            f"{'case':27} {'B x C x H x W':>17} {'max error':>9} {'mean':>7} {'left out':>8} {'torch ms':>8} {'onnx ms':>8}",
+            f"{'case':27} {'B x C x H x W':>17} {'max error':>9} {'mean':>7} "
+            f"{'left out':>8} {'torch ms':>8} {'onnx ms':>8}",
         ]
         for row in self.cases:
             shape = " x ".join(map(str, row.shape))
@@ -96,7 +97,8 @@ def verify(path: str | os.PathLike[str], dof: DepthOfField, *, large: bool = Fal
 
     The file passes ``onnx.checker`` in full and strict shape inference, uses standard operators only and holds its
     weights; its inputs and output have the names, types and free sizes that :func:`to_onnx` promises; and onnxruntime
-    renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the largest
+    renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the
+    largest
     light within the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced ones.
 
     Args:
@@ -172,7 +174,9 @@ def _moved(portable: Portable, case: Case, expected: Tensor) -> Tensor:
     """How far eager PyTorch moves when the map changes in its last bits, ``[B, H, W]``."""
     image, map_, *lens = case.tensors
     with torch.no_grad():
-        moved = [(portable(image, map_ * (1 + s * ROUNDING), *lens) - expected).abs().amax(1) for s in (-1, -0.5, 0.5, 1)]
+        moved = [
+            (portable(image, map_ * (1 + s * ROUNDING), *lens) - expected).abs().amax(1) for s in (-1, -0.5, 0.5, 1)
+        ]
     # one pixel's rounding shows in its neighbours
     return functional.max_pool2d(torch.stack(moved).amax(0), 5, stride=1, padding=2)
 
