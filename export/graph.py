@@ -76,7 +76,7 @@ class _Pinned(BlurTable):
         self._scale = super()._px_per_unit(width)
         self.unit = "relative"  # to the plan: not tied to the width
 
-    def _px_per_unit(self, width: int) -> float:
+    def _px_per_unit(self, width: float) -> float:
         return getattr(self, "_scale", 1.0)
 
 

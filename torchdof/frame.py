@@ -73,7 +73,7 @@ class Frame:
     """
 
     def __init__(self, samples: Sequence[Sample], margin: int, align: int, tiled: bool, extend: bool) -> None:
-        self.size = samples[0].light.shape[-2:]
+        self.size: tuple[int, ...] = tuple(samples[0].light.shape[-2:])
         self.margin, self.tiled = margin, tiled
         align = max(align, TILE) if tiled else align
         self.area = tuple((n + align - 1) // align * align for n in self.size)
