@@ -480,6 +480,7 @@ def compiled_case() -> tuple[Camera, Tensor, Tensor]:
         pytest.param("inductor", WAYS[0], marks=pytest.mark.hard),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
 def test_compiled_without_a_break_equals_eager(backend: str, way: dict[str, Any]) -> None:
     torch.compiler.reset()
     camera, image, depth = compiled_case()
