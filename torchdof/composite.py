@@ -44,11 +44,10 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
         light, share, room = parts[0], parts[1], parts[2].clamp_min(_LEAST)
         coverage = (share / room).clamp(0.0, 1.0)
         colour = light / room
-        if len(parts) > 3:  # light that was not seen: the colour of what was
-            seen = parts[3]
-            colour = colour * (share / seen.clamp_min(_LEAST))
-            coverage = torch.where(seen > _LEAST, coverage, 0.0)
-            colour = torch.where(seen > _LEAST, colour, 0.0)
+        if len(parts) > 3:  # light that was not seen: the colour of what was, fading out with the last of it
+            floor = share.clamp(_LEAST**2, _LEAST)
+            colour = colour * (share / torch.maximum(parts[3], floor))
+            coverage = coverage * (parts[3] / floor).clamp(max=1.0)
         left = 1.0 - coverage
         return torch.addcmul(colour, left, out), 1.0 - left + left * covered
 
