@@ -109,7 +109,9 @@ class DepthOfField(nn.Module):
         checks.image_and_depth(image, depth, values=self.check)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
-        coc = camera.coc_px(depth, image.shape[-1])
+        # as a tensor: an exported graph would take Python's arithmetic with the width to be in float32
+        width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64)
+        coc = camera.coc_px(depth, width)
         return coc if self.check else torch.where(depth > 0, coc, torch.nan)
 
     def plan(

@@ -16,6 +16,7 @@ _FINEST_SPACING = 0.5
 _SPACING = 2.5  # measured: keeps the RMS error below the tolerance with highlights as well
 _COARSE_RADIUS = 8.0  # at a tolerance of 1/255 half resolution starts at twice this radius, a quarter at four times
 _COARSEST = 4
+_NEVER_CUT = 257  # width of kernels that are left whole in frames that are smaller: surfaces go on beyond the border
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Plan:
             parts = flat.split([shape[0] * shape[1] * shape[2] for shape in shapes])
             bank = [kernel.reshape(shape) for kernel, shape in zip(parts, shapes, strict=True)]
         else:
-            largest = 2 * max(size) - 1
+            largest = max(2 * max(size) - 1, _NEVER_CUT)
             bank = [_kernel(table, c, width, s) for c, s in zip(self.coc_px, scales, strict=True)]
             bank = [_cut(kernel, largest).to(device, dtype) for kernel in bank]
         return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
