@@ -81,8 +81,6 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
 def _ramp(low: float, high: float) -> Callable[[int, int, int], Tensor]:
     def ramp(batch: int, height: int, width: int) -> Tensor:
         line = torch.linspace(low, high, height * width)
-        # uneven: a pixel exactly halfway between two surfaces belongs to either, as rounding has it
-        line = line * (0.9 + 0.1 * torch.rand(line.shape, generator=torch.Generator().manual_seed(5)))
         return line.reshape(1, 1, height, width).repeat(batch, 1, 1, 1)
 
     return ramp

@@ -1,11 +1,12 @@
 """The module to a file: traced, translated, slimmed, labelled, verified, and only then moved into place."""
 
 import contextlib
+import itertools
 import logging
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -130,11 +131,24 @@ def _slim(model: onnx_ir.Model) -> onnx_ir.Model:
         passes.ClearMetadataAndDocStringPass(),
     ):
         step(model)
-    for graph in model.graphs():
-        for value in [v for node in graph for v in node.outputs]:
-            if not value.is_graph_output():
-                value.shape = None  # shape inference finds them again; they are half of the file
+    kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
+    names = (f"v{i}" for i in itertools.count())
+    for graph in (model.graph, *model.graph.subgraphs()):
+        for value in (*graph.inputs, *graph.initializers.values()):
+            _shorten(value, kept, names)
+        for node in graph:
+            node.name = None
+            for value in node.outputs:
+                _shorten(value, kept, names)
     return model
+
+
+def _shorten(value: onnx_ir.Value, kept: Collection[str | None], names: Iterator[str]) -> None:
+    if value.name in kept:
+        return
+    value.name = next(names)
+    if not value.is_graph_output() and not value.is_initializer():
+        value.shape = None  # names and shapes of what lies between would be most of the file; inference finds shapes
 
 
 @contextlib.contextmanager

@@ -179,6 +179,15 @@ def test_gradients_at_infinite_depth_and_focus_are_zero_and_not_nan() -> None:
     assert float(slope[..., 1]) == 0.0
 
 
+def test_a_depth_that_is_none_has_no_coc_and_no_part_in_gradients() -> None:
+    depth = depth_of(1.0, 0.0, -2.0, math.nan, 4.0).requires_grad_()
+    focus = torch.tensor([2.0], dtype=torch.float64, requires_grad=True)
+    coc = Camera(focus_m=focus).coc_px(depth, 100)
+    assert torch.isnan(coc).flatten().tolist() == [False, True, True, True, False]
+    for slope in torch.autograd.grad(torch.nan_to_num(coc).sum(), (depth, focus)):
+        assert torch.isfinite(slope).all()
+
+
 def test_half_precision_depth_is_computed_in_single() -> None:
     depth = depth_of(1.0, 3.0, dtype=torch.float16)
     coc = Camera().coc_px(depth, 1920)

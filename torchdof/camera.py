@@ -112,12 +112,12 @@ class Camera:
 
         Args:
             depth: ``[B, 1, H, W]`` (or ``[1, 1, H, W]``, broadcast over the camera's batch), metres, > 0, ``inf``
-                allowed. Half precision is computed in float32. Values are not checked here.
+                allowed. Half precision is computed in float32. Other values are not refused here.
             width: Width in pixels of the image the coc is meant for.
 
         Returns:
-            ``[B, 1, H, W]`` in pixels; negative in front of the focus plane, positive behind it. Differentiable with
-            respect to depth and to every tensor of the camera.
+            ``[B, 1, H, W]`` in pixels; negative in front of the focus plane, positive behind it, NaN where the depth is
+            not > 0. Differentiable with respect to depth and to every tensor of the camera, without what is NaN.
 
         Raises:
             ValueError: If the depth is not a floating-point tensor, or its batch does not fit the camera's.
@@ -126,13 +126,15 @@ class Camera:
             got = f"{depth.dtype} tensor" if isinstance(depth, Tensor) else type(depth).__name__
             raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
         z = depth if depth.dtype in (torch.float32, torch.float64) else depth.float()
+        known = z > 0
+        z = torch.where(known, z, 1.0)
         scale = _column(self.aperture_radius_m * self.focal_px(width), z)
         s = _column(self.focus_m, z)
         both_finite = torch.isfinite(z) & torch.isfinite(s)
         z_safe = torch.where(both_finite, z, 1.0)
         s_safe = torch.where(both_finite, s, 1.0)
         dioptres = torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
-        return scale * dioptres
+        return torch.where(known, scale * dioptres, torch.nan)
 
     def replace(self, **changes: Any) -> "Camera":
         """The same camera with some numbers changed; names are those of the constructor.

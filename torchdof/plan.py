@@ -16,7 +16,6 @@ _FINEST_SPACING = 0.5
 _SPACING = 2.5  # measured: keeps the RMS error below the tolerance with highlights as well
 _COARSE_RADIUS = 8.0  # at a tolerance of 1/255 half resolution starts at twice this radius, a quarter at four times
 _COARSEST = 4
-_NEVER_CUT = 257  # width of kernels that are left whole in frames that are smaller: surfaces go on beyond the border
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,11 +82,10 @@ class Plan:
             shapes = _constant_shapes(table, self.coc_px, width, tuple(scales))
             flat = _constant_bank(table, self.coc_px, width, tuple(scales)).to(device, dtype)
             parts = flat.split([shape[0] * shape[1] * shape[2] for shape in shapes])
-            bank = [kernel.reshape(shape) for kernel, shape in zip(parts, shapes, strict=True)]
+            bank = [_masked(k.reshape(shape), size) for k, shape in zip(parts, shapes, strict=True)]
         else:
-            largest = max(2 * max(size) - 1, _NEVER_CUT)
             bank = [_kernel(table, c, width, s) for c, s in zip(self.coc_px, scales, strict=True)]
-            bank = [_cut(kernel, largest).to(device, dtype) for kernel in bank]
+            bank = [_cut(kernel, size).to(device, dtype) for kernel in bank]
         return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
 
     def _scale(self, coc_px: float) -> int:
@@ -172,6 +170,14 @@ def _constant_bank(table: BlurTable, coc_px: tuple[float, ...], width: int, scal
     return torch.cat([_kernel(table, c, width, s).flatten() for c, s in zip(coc_px, scales, strict=True)])
 
 
-def _cut(kernel: Tensor, largest: int) -> Tensor:
-    spare = max(0, kernel.shape[-1] - largest) // 2
+def _cut(kernel: Tensor, size: tuple[int, int]) -> Tensor:
+    """A kernel without the taps that no pixel of a frame reaches another one with."""
+    spare = max(0, kernel.shape[-1] // 2 - (max(size) - 1))
     return kernel[..., spare : kernel.shape[-1] - spare, spare : kernel.shape[-1] - spare]
+
+
+def _masked(kernel: Tensor, size: tuple[int, int]) -> Tensor:
+    """The same for traced code, whose kernels keep their size: these taps are 0."""
+    half = kernel.shape[-1] // 2
+    within = (torch.arange(-half, half + 1, device=kernel.device).abs() < torch.sym_max(*size)).to(kernel.dtype)
+    return kernel * within * within[:, None]
