@@ -20,6 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .arguments import pixels_wide, real_tensor, show, whole
+
 __all__ = ["Camera"]
 
 Number = float | Tensor
@@ -57,6 +59,8 @@ class Camera:
         for name in ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm"):
             value = getattr(self, name)
             _check_number(name, value)
+        if not isinstance(self.focus_breathing, bool):
+            raise ValueError(f"focus_breathing must be True or False, got {show(self.focus_breathing)}")
         if self.focus_breathing and not _traced():
             focal_m = _largest(self.focal_length_mm / 1000.0 / self.focus_m)
             if focal_m >= 1.0:
@@ -88,6 +92,8 @@ class Camera:
         if not _traced() and _largest(fov_x_deg) >= 180.0:
             raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}")
         half = torch.tan(torch.deg2rad(fov_x_deg) / 2) if isinstance(fov_x_deg, Tensor) else _tan_half_deg(fov_x_deg)
+        if not isinstance(half, Tensor) and half < 1e-300:
+            raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}, which is none")
         focal_length_mm = 18.0 / half
         f_number = focal_length_mm / (2000.0 * aperture_radius_m)
         return cls(focal_length_mm, f_number, focus_m, 36.0, focus_breathing=False)
@@ -99,6 +105,7 @@ class Camera:
 
     def focal_px(self, width: int) -> Number:
         """Image distance over pixel pitch, in pixels of an image ``width`` pixels wide (``F`` of the convention)."""
+        pixels_wide(width)
         focal_px = self.focal_length_mm * (width / self.sensor_width_mm)
         if self.focus_breathing:
             focal_px = focal_px / (1.0 - self.focal_length_mm / 1000.0 / self.focus_m)
@@ -125,6 +132,8 @@ class Camera:
         if not isinstance(depth, Tensor) or not depth.is_floating_point():
             got = f"{depth.dtype} tensor" if isinstance(depth, Tensor) else type(depth).__name__
             raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
+        if depth.layout != torch.strided:
+            raise ValueError(f"depth must be a dense tensor in metres, got {depth.layout}; convert it with .to_dense()")
         z = depth if depth.dtype in (torch.float32, torch.float64) else depth.float()
         known = z > 0
         z = torch.where(known, z, 1.0)
@@ -161,8 +170,13 @@ class Camera:
         Raises:
             ValueError: If the pixel lies outside the frame or the patch holds no valid depth.
         """
-        if depth.ndim != 4 or depth.shape[1] != 1:
+        real_tensor("depth", depth, "[B, 1, H, W] in metres")
+        if depth.ndim != 4 or depth.shape[1] != 1 or not depth.numel():
             raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
+        whole("patch", patch, 1, 2**31)
+        for value in (x, y):
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"focus point must be two numbers (x, y) in pixels, got {show(value)}")
         height, width = depth.shape[-2:]
         if not (0 <= x < width and 0 <= y < height):
             raise ValueError(f"focus point ({x}, {y}) must lie in the frame of {width} x {height} pixels (x, y)")
@@ -206,7 +220,8 @@ class Camera:
             ``(near, far)`` in metres, floats or ``[B]``; far is ``inf`` at and beyond the hyperfocal distance.
         """
         _check_number("coc_px", coc_px)
-        dioptres = coc_px / (self.aperture_radius_m * self.focal_px(width))
+        scale = self.aperture_radius_m * self.focal_px(width)
+        dioptres = coc_px / scale if isinstance(scale, Tensor) or scale > 0 else math.inf
         near, far = 1.0 / (1.0 / self.focus_m + dioptres), 1.0 / self.focus_m - dioptres
         if isinstance(far, Tensor):
             return near, torch.where(far > 0, 1.0 / far, torch.inf)
@@ -241,15 +256,19 @@ def _show(value: Number) -> str:
 
 def _check_number(name: str, value: Number) -> None:
     if isinstance(value, Tensor):
-        if value.ndim > 1 or not value.is_floating_point():
+        if value.ndim > 1 or not value.is_floating_point() or value.layout != torch.strided or not value.numel():
             raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {_describe(value)}")
         if _traced():
             return
+        if value.device.type == "meta":
+            raise ValueError(f"{name} must be a float or a tensor [B] that holds data, got one on the meta device")
         good = bool((value.detach() > 0).all())
     elif isinstance(value, int | float) and not isinstance(value, bool):
-        good = value > 0
+        good = value > 0 and (isinstance(value, float) or value <= 1e300)
     else:
         raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {type(value).__name__}")
+    if not good and not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {show(value)}")
     if not good or (name != "focus_m" and math.isinf(_largest(value))):
         raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {_show(value)}")
 

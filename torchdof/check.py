@@ -1,15 +1,15 @@
 """Checks at the public boundary: what was expected, what came, what to do."""
 
 import dataclasses
-import math
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from .arguments import real_tensor, show
 from .table import BlurTable
 
-__all__ = ["Border", "Method", "Options", "image_and_coc", "image_and_depth"]
+__all__ = ["Border", "Method", "Options", "image_and_coc", "image_and_depth", "image_and_map"]
 
 Method = Literal["layered", "fold"]
 Border = Literal["normalize", "extend"]
@@ -38,15 +38,19 @@ class Options:
             raise ValueError(f"table must be a torchdof.BlurTable, got {got}; read a file with BlurTable.load()")
         tolerance = self.tolerance
         if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < 1:
-            raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, got {tolerance!r}")
-        if self.method not in ("layered", "fold"):
-            raise ValueError(f"method must be 'layered' or 'fold', got {self.method!r}")
-        if self.border not in ("normalize", "extend"):
-            raise ValueError(f"border must be 'normalize' or 'extend', got {self.border!r}")
+            raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, got {show(tolerance)}")
+        for name in ("occlusion", "normalize", "check"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
+        if not isinstance(self.method, str) or self.method not in ("layered", "fold"):
+            raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
+        if not isinstance(self.border, str) or self.border not in ("normalize", "extend"):
+            raise ValueError(f"border must be 'normalize' or 'extend', got {show(self.border)}")
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
-        if not 0.5 < self.max_coc_px < math.inf:
-            raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {self.max_coc_px!r}")
+        reach = self.max_coc_px
+        if isinstance(reach, bool) or not isinstance(reach, int | float) or not 0.5 < reach < 1e300:
+            raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(reach)}")
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
@@ -55,8 +59,7 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
     Raises:
         ValueError: If shapes or types are wrong, or, with ``values``, a depth is NaN or not positive.
     """
-    _image(image)
-    _map("depth", "in metres", depth, image)
+    image_and_map(image, "depth", depth, "in metres")
     if values and not _traced():
         bad = int((~(depth > 0)).sum())
         if bad:
@@ -71,11 +74,9 @@ def image_and_coc(image: Tensor, coc_px: Tensor, table: BlurTable, values: bool)
 
     Raises:
         ValueError: If shapes or types are wrong, the table has other channels than the image, or, with ``values``, a
-        coc
-            or a pixel is not finite.
+            coc or a pixel is not finite.
     """
-    _image(image)
-    _map("coc_px", "in pixels", coc_px, image)
+    image_and_map(image, "coc_px", coc_px, "in pixels")
     if table.channels not in (1, image.shape[1]):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {image.shape[1]}")
     if values and not _traced():
@@ -86,6 +87,19 @@ def image_and_coc(image: Tensor, coc_px: Tensor, table: BlurTable, values: bool)
                     f"{name} must be finite, got {bad} of {tensor.numel()} values that are NaN or infinite; "
                     "mend them, or pass check=False"
                 )
+
+
+def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
+    """Refuse an image and a map of one number a pixel whose kinds, sizes or devices do not fit.
+
+    Raises:
+        ValueError: Naming the one that is wrong.
+    """
+    _image(image)
+    _map(name, unit, value, image)
+    if not _traced():  # there a tensor has no data yet
+        real_tensor("image", image, "[B, C, H, W]")
+        real_tensor(name, value, f"[B, 1, H, W] {unit}")
 
 
 def _image(image: Tensor) -> None:

@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from .arguments import number, real_tensor, show
 from .files import read_values
 
 __all__ = ["DepthKind", "depth_from_values", "fill_holes", "read_depth", "resolve_holes"]
@@ -56,8 +57,9 @@ def depth_from_values(
         >>> depth_from_values(torch.tensor([[[[1500.0, 0.0]]]]), "z", scale=0.001)
         tensor([[[[1.5000,    nan]]]])
     """
-    if kind not in KINDS:
-        raise ValueError(f"the kind of depth must be one of {', '.join(KINDS)}, got {kind!r}")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ValueError(f"the kind of depth must be one of {', '.join(KINDS)}, got {show(kind)}")
+    _map("depth values", values)
     if values.ndim != 4 or values.shape[1] != 1:
         raise ValueError(f"depth values must be [B, 1, H, W], got {list(values.shape)}")
     if kind == "disparity" and scale is None:
@@ -65,8 +67,12 @@ def depth_from_values(
             "disparity needs a scale (--depth-scale): the baseline in metres times the focal length in pixels"
         )
     scale = 1.0 if scale is None else scale
-    if not math.isfinite(scale) or scale == 0.0 or not math.isfinite(offset):
-        raise ValueError(f"scale must be finite and not 0, offset finite, got scale {scale} and offset {offset}")
+    for factor in (scale, offset):
+        if isinstance(factor, bool) or not isinstance(factor, int | float) or not abs(factor) < 1e300 or scale == 0.0:
+            told = f"got scale {show(scale)} and offset {show(offset)}"
+            raise ValueError(f"scale must be finite and not 0, offset finite, {told}")
+    if unknown is not None and not math.isnan(unknown if isinstance(unknown, float) else 0.0):
+        unknown = number("unknown", unknown, infinite=True)
     value = values.double()
     missing = value.isnan() if unknown is None else value.isnan() | (value == unknown)
     depth = scale / (value + offset) if kind in ("disparity", "inverse") else scale * (value + offset)
@@ -98,12 +104,15 @@ def fill_holes(depth: Tensor, fill: Literal["nearest", "far"] | float) -> Tensor
         >>> fill_holes(torch.tensor([[[[1.0, torch.nan, torch.nan, 4.0]]]]), "far")
         tensor([[[[1., 4., 4., 4.]]]])
     """
+    _map("depth", depth)
     if isinstance(fill, int | float) and not isinstance(fill, bool):
-        if not fill > 0:
-            raise ValueError(f"the depth to fill with must be positive metres (inf allowed), got {fill}")
+        if not fill > 0 or torch.finfo(depth.dtype).max < fill < math.inf:
+            raise ValueError(f"the depth to fill with must be positive metres (inf allowed), got {show(fill)}")
         return torch.where(depth.isnan(), float(fill), depth)
-    if fill not in ("nearest", "far"):
-        raise ValueError(f"fill must be 'nearest', 'far' or metres, got {fill!r}")
+    if not isinstance(fill, str) or fill not in ("nearest", "far"):
+        raise ValueError(f"fill must be 'nearest', 'far' or metres, got {show(fill)}")
+    if depth.ndim != 4 or depth.shape[:2] != (1, 1):
+        raise ValueError(f"depth must be [1, 1, H, W], got {list(depth.shape)}")
     if not bool(depth.isnan().any()):
         return depth
     if bool(depth.isnan().all()):
@@ -170,12 +179,21 @@ def read_depth(
     return resolve_holes(depth, str(path), fill)[0]
 
 
+def _map(name: str, values: Tensor) -> None:
+    # integers are what files hold; of the rest only what arithmetic works on
+    if isinstance(values, Tensor) and values.dtype in (torch.uint8, torch.int16, torch.int32, torch.int64):
+        values = values.double()
+    real_tensor(name, values, "[B, 1, H, W]")
+    if not values.numel():
+        raise ValueError(f"{name} must have at least one pixel, got {list(values.shape)}")
+
+
 def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:
     """Length of the ray to depth 1 through each pixel's centre, ``[1, 1, H, W]``."""
-    if not 0.0 < fov_x_deg < 180.0:
-        raise ValueError(f"the field of view must be in (0, 180) degrees, got {fov_x_deg}")
+    if isinstance(fov_x_deg, bool) or not isinstance(fov_x_deg, int | float) or not 0.0 < fov_x_deg < 180.0:
+        raise ValueError(f"the field of view must be in (0, 180) degrees, got {show(fov_x_deg)}")
     height, width = like.shape[-2:]
-    focal_px = width / 2 / math.tan(math.radians(fov_x_deg) / 2)
+    focal_px = width / 2 / max(math.tan(math.radians(fov_x_deg) / 2), 1e-300)
     x = (torch.arange(width, dtype=like.dtype) + 0.5 - width / 2) / focal_px
     y = (torch.arange(height, dtype=like.dtype) + 0.5 - height / 2) / focal_px
     return torch.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)[None, None]

@@ -16,6 +16,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from .arguments import real_tensor, show
+
 __all__ = ["FAMILIES", "disc", "gaussian", "profile", "radial", "render", "ring", "softm", "support"]
 
 FAMILIES: dict[str, tuple[str, ...]] = {
@@ -30,8 +32,10 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
+_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 _SMALLEST = 1e-4  # px; a length below it is rendered as this, which is a kernel of one pixel
 _CACHED_HALF_WIDTH = 64
+_LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
 
 Number = float | Tensor
 
@@ -148,10 +152,7 @@ def render(family: str, params: Mapping[str, Number], size: int | None = None) -
         ValueError: If the family, a parameter or the size is not as described.
     """
     given = _checked(family, params)
-    if size is None:
-        size = 2 * half_width(support(family, given)) + 1
-    if size < 1 or size % 2 == 0:
-        raise ValueError(f"size must be a positive odd number of pixels, got {size}")
+    size = width_of(family, given, size)
     half = size // 2
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in given.items()}
     if family == "gaussian":
@@ -186,7 +187,7 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
         ValueError: If the family or a parameter is not as described.
     """
     given = {k: v if k == "values" else v.unsqueeze(-1) for k, v in _checked(family, params).items()}
-    r = r.to(torch.float64)
+    r = real_tensor("r", r, "[n]").to(torch.float64)
     if family == "gaussian":
         return torch.exp(-0.5 * (r / given["sigma"]) ** 2)
     if family == "ring":
@@ -219,25 +220,63 @@ def support(family: str, params: Mapping[str, Number]) -> float:
     return float(reach.detach().max())
 
 
+def width_of(family: str, params: Mapping[str, Number], size: int | None) -> int:
+    """Width in pixels of kernels: ``size`` if that is one, else the smallest that holds the largest kernel.
+
+    Raises:
+        ValueError: If the size is not odd and positive, or the kernel would be too wide.
+    """
+    if size is None:
+        size = 2 * half_width(support(family, params)) + 1
+        if size > _LARGEST:
+            raise ValueError(
+                f"a kernel must be at most {_LARGEST} pixels wide, got parameters that need {size}; state its size"
+            )
+    if isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= _LARGEST or size % 2 == 0:
+        raise ValueError(f"size must be a positive odd number of pixels, got {show(size)} (at most {_LARGEST})")
+    return size
+
+
 def half_width(reach: float) -> int:
     """Pixels on each side of the centre that a kernel of radius ``reach`` touches."""
-    return max(0, math.ceil(reach - 0.5 - 1e-9))
+    return max(0, math.ceil(min(reach, 1e18) - 0.5 - 1e-9))
 
 
 def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
-    if family not in FAMILIES:
-        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}")
-    if set(params) != set(FAMILIES[family]):
-        raise ValueError(f"{family} takes the parameters {', '.join(FAMILIES[family])}, got {', '.join(params)}")
+    if not isinstance(family, str) or family not in FAMILIES:
+        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {show(family)}")
+    if not isinstance(params, Mapping) or set(params) != set(FAMILIES[family]):
+        got = ", ".join(map(str, params)) if isinstance(params, Mapping) else show(params)
+        raise ValueError(f"{family} takes the parameters {', '.join(FAMILIES[family])}, got {got}")
     device = next((p.device for p in params.values() if isinstance(p, Tensor)), torch.device("cpu"))
-    given = {k: torch.as_tensor(v, dtype=torch.float64, device=device) for k, v in params.items()}
+    given = {k: _parameter(k, v, device) for k, v in params.items()}
     for name, value in given.items():
         low = -1.0 if name == "b" else 0.0
         if not bool((torch.isfinite(value.detach()) & (value.detach() >= low)).all()):
             raise ValueError(f"{name} of {family} must be finite and >= {low:g}, got {value.detach().flatten()[:4]}")
     if family == "radial" and (given["values"].ndim < 1 or given["values"].shape[-1] < 2):
         raise ValueError(f"values must be [..., P] with P >= 2, got {list(given['values'].shape)}")
+    shapes = {k: tuple(v.shape[:-1] if k == "values" else v.shape) for k, v in given.items()}
+    try:
+        torch.broadcast_shapes(*shapes.values())
+    except RuntimeError:
+        told = ", ".join(f"{k} {list(v)}" for k, v in shapes.items())
+        raise ValueError(f"parameters of {family} must broadcast against each other, got {told}") from None
     return given
+
+
+def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
+    if isinstance(value, Tensor):
+        given = real_tensor(name, value.double() if value.dtype in _INTEGERS else value, "[...]")
+        if not given.numel():
+            raise ValueError(f"{name} must hold at least one number, got {show(value)}")
+        return given.to(device, torch.float64)
+    if name == "values":
+        raise ValueError(f"values must be a tensor [..., P], got {show(value)}")
+    plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
+    if not plain:
+        raise ValueError(f"{name} must be a number or a tensor of them, got {show(value)}")
+    return torch.tensor(value, dtype=torch.float64, device=device)
 
 
 def _tilt(r: Tensor, given: Mapping[str, Tensor]) -> Tensor:

@@ -16,7 +16,7 @@ _STORAGE_NAMES = (
     "CompressionQuality",
     "Exif:ColorSpace",
 )
-_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
+_MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 
 
 def kept_metadata(attributes: Iterable[Any]) -> dict[str, tuple[Any, Any]]:
@@ -54,7 +54,7 @@ def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int) -> dict[st
     def number(*names: str) -> float | None:
         for name in names:
             value = metadata.get(name, (None, None))[1]
-            if isinstance(value, int | float) and value > 0 and not math.isnan(value):
+            if isinstance(value, int | float) and (0 < value < 1e300 or value == math.inf):
                 return float(value)
         return None
 
@@ -70,12 +70,14 @@ def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int) -> dict[st
         facts["focus_m"] = math.inf if focus_m > 1e6 else focus_m  # EXIF writes infinity as 2^32 - 1
     by_film = number("Exif:FocalLengthIn35mmFilm")
     if by_film is not None and focal_length_mm is not None:
-        facts["sensor_width_mm"] = 36.0 * focal_length_mm / by_film
+        width_mm = 36.0 * focal_length_mm / by_film
+        if 0 < width_mm < math.inf:
+            facts["sensor_width_mm"] = width_mm
     per_unit = number("Exif:FocalPlaneXResolution")
     if per_unit is not None:
         taken = number("Exif:PixelXDimension") or width
-        unit = _MM_PER_UNIT.get(int(number("Exif:FocalPlaneResolutionUnit") or 2), 25.4)
+        unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
         by_plane = taken / per_unit * unit
-        if abs(by_plane / facts.get("sensor_width_mm", by_plane) - 1.0) < 0.25:
+        if 0 < by_plane < math.inf and abs(by_plane / facts.get("sensor_width_mm", by_plane) - 1.0) < 0.25:
             facts["sensor_width_mm"] = by_plane
     return facts

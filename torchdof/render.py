@@ -11,6 +11,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from . import check
+from .arguments import number, show
 from .camera import Camera
 from .depthmap import DepthKind, depth_from_values, resolve_holes
 from .files import Picture, read_image, read_values, write_image
@@ -99,8 +101,7 @@ class RenderSettings:
             return
         if self.focal_length_mm is not None or self.sensor_width_mm is not None:
             raise ValueError("--fov-deg and --focal-length-mm with --sensor-width-mm say the same; give one of them")
-        if not 0.0 < self.fov_x_deg < 180.0:
-            raise ValueError(f"--fov-deg must be between 0 and 180 degrees, got {self.fov_x_deg:g}")
+        number("--fov-deg", self.fov_x_deg, low=0, high=180, unit="degrees")
         if self.f_number is not None and self.aperture_radius_m is not None:
             raise ValueError("--f-number and --aperture-radius-m both say how wide the lens opens; give one of them")
 
@@ -213,11 +214,17 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
     Returns:
         ``[B, 3, H, W]``, or ``[B, 4, H, W]`` with alpha.
 
+    Raises:
+        ValueError: If shapes or types are not as described.
+
     Example:
         >>> tinted = tint_focus(torch.ones(1, 1, 1, 3), torch.tensor([[[[-3.0, 0.2, 5.0]]]]))
         >>> tinted[0, :, 0].argmax(dim=0)  # red, green and blue are strongest
         tensor([0, 1, 2])
     """
+    check.image_and_map(image, "coc_px", coc_px, "in pixels")
+    if image.shape[1] - has_alpha not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels of colour, got {image.shape[1] - has_alpha}")
     colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
     grey = colour.mean(dim=1, keepdim=True)
     tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
@@ -247,6 +254,8 @@ def pick_device(name: str) -> torch.device:
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if not isinstance(name, str):
+        raise ValueError(f"--device must be a name such as auto, cpu or cuda:1, got {show(name)}")
     try:
         device = torch.device(name)
         torch.empty(1, device=device).sum().item()

@@ -4,6 +4,8 @@ import math
 import re
 from pathlib import Path
 
+from .arguments import number
+
 __all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
 
 _PLACEHOLDER = re.compile(r"#+|%0?(\d*)d")
@@ -113,10 +115,16 @@ def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
     Returns:
         Metres.
 
+    Raises:
+        ValueError: If there is no keyframe or the frame is not a number.
+
     Example:
         >>> focus_at_frame([(0, 1.0), (10, 2.0)], 5)
         1.3333333333333333
     """
+    if not keys:
+        raise ValueError("focus needs at least one keyframe (frame, metres), got none")
+    number("frame", frame)
     if frame <= keys[0][0]:
         return keys[0][1]
     for (before, near), (after, far) in zip(keys, keys[1:], strict=False):

@@ -1,7 +1,6 @@
 """Blur tables: signed circle of confusion to kernel parameters, as measured from a camera or a lens."""
 
 import json
-import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from . import kernel
+from .arguments import number, pixels_wide, real_tensor, show
 
 __all__ = ["BlurTable"]
 
@@ -81,10 +81,14 @@ class BlurTable:
         provenance: Mapping[str, Any] | None = None,
         residual: Sequence[float] | Tensor | None = None,
     ) -> None:
-        if family not in kernel.FAMILIES:
-            raise ValueError(f"family must be one of {', '.join(kernel.FAMILIES)}, got {family!r}")
-        if unit not in UNITS:
-            raise ValueError(f"unit must be one of {', '.join(UNITS)}, got {unit!r}")
+        if not isinstance(family, str) or family not in kernel.FAMILIES:
+            raise ValueError(f"family must be one of {', '.join(kernel.FAMILIES)}, got {show(family)}")
+        if not isinstance(unit, str) or unit not in UNITS:
+            raise ValueError(f"unit must be one of {', '.join(UNITS)}, got {show(unit)}")
+        if not isinstance(name, str):
+            raise ValueError(f"name must be a text, got {show(name)}")
+        if provenance is not None and not isinstance(provenance, Mapping):
+            raise ValueError(f"provenance must be a dict, got {show(provenance)}")
         self.family, self.unit, self.name = family, unit, str(name)
         self.coc = _numbers("coc", coc)
         if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
@@ -98,10 +102,12 @@ class BlurTable:
             )
         if (unit == "mm") != (sensor_width_mm is not None):
             raise ValueError(
-                f"sensor_width_mm goes with unit 'mm' and only with it, got {sensor_width_mm} with {unit!r}"
+                f"sensor_width_mm goes with unit 'mm' and only with it, got {show(sensor_width_mm)} with {unit!r}"
             )
-        if sensor_width_mm is not None and not 0 < sensor_width_mm < math.inf:
-            raise ValueError(f"sensor_width_mm must be positive, got {sensor_width_mm}")
+        if sensor_width_mm is not None and not isinstance(sensor_width_mm, bool | int | float):
+            raise ValueError(f"sensor_width_mm must be a number, got {show(sensor_width_mm)}")
+        if sensor_width_mm is not None and not 0 < sensor_width_mm < 1e300:
+            raise ValueError(f"sensor_width_mm must be positive, got {show(sensor_width_mm)}")
         self.sensor_width_mm = None if sensor_width_mm is None else float(sensor_width_mm)
         self._params = self._check_params(params)
         self.strength = self._per_node("strength", strength)
@@ -152,8 +158,9 @@ class BlurTable:
             Parameters by name, lengths in pixels: ``[channels, ...]`` (``values``: ``[channels, ..., P]``), float64.
             Continuous in ``coc_px`` and differentiable wherever it lies between nodes.
         """
+        pixels_wide(width)
         scale = self._px_per_unit(width)
-        signed = coc_px.to(torch.float64) / scale
+        signed = real_tensor("coc_px", coc_px, "[...] in pixels").to(torch.float64) / scale
         near, far = (self._side_params(sign, signed.abs()) for sign in (-1, 1))
         mixed = {}
         for name in self._params:
@@ -183,6 +190,8 @@ class BlurTable:
             torch.Size([3, 1, 5, 5])
         """
         params = self.params(coc_px, width)
+        if coc_px.ndim != 1 or not coc_px.numel():
+            raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
         kernels = kernel.render(self.family, params, size).transpose(0, 1)
         if self.family == "disc" and self.reach_px(0.5, width) <= 0.5 + 1e-9:
             return kernels
@@ -193,6 +202,7 @@ class BlurTable:
 
     def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
+        number("coc_px", coc_px, unit="pixels")
         both = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
         return kernel.support(self.family, self.params(both, width))
 
@@ -215,10 +225,9 @@ class BlurTable:
             >>> round(float(texture.max()), 3)
             0.581
         """
-        signed = torch.tensor(coc_px, dtype=torch.float64)
+        signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64)
         params = self.params(signed, width)
-        if size is None:
-            size = 2 * kernel.half_width(kernel.support(self.family, params)) + 1
+        size = kernel.width_of(self.family, params, size)
         axis = torch.arange(size, dtype=torch.float64) - size // 2
         r = torch.hypot(axis[:, None], axis[None, :])
         texture = kernel.profile(self.family, r.flatten(), params).unflatten(-1, (size, size))
@@ -260,6 +269,8 @@ class BlurTable:
             >>> BlurTable.load("sato_j15").family
             'ring'
         """
+        if not isinstance(source, str | os.PathLike):
+            raise ValueError(f"source must be the name or the path of a blur table, got {show(source)}")
         path = Path(source)
         if not path.suffix and not path.exists():
             path = _SHIPPED / f"{path}.json"
@@ -299,14 +310,14 @@ class BlurTable:
         """
         if not isinstance(data, dict):
             raise ValueError(f"a blur table must be a JSON object, got {type(data).__name__}")
-        if data.get("schema") != SCHEMA:
-            raise ValueError(f"schema must be {SCHEMA!r}, got {data.get('schema')!r}; is this a blur table?")
-        if data.get("version") != VERSION:
-            raise ValueError(f"version must be {VERSION}, got {data.get('version')!r}; update torchdof to read it")
+        if not isinstance(data.get("schema"), str) or data["schema"] != SCHEMA:
+            raise ValueError(f"schema must be {SCHEMA!r}, got {show(data.get('schema'))}; is this a blur table?")
+        if not isinstance(data.get("version"), int) or data["version"] != VERSION:
+            raise ValueError(f"version must be {VERSION}, got {show(data.get('version'))}; update torchdof to read it")
         for field in ("family", "unit", "coc", "params"):
             if field not in data:
                 raise ValueError(f"{field} is missing")
-        unknown = sorted(set(data) - _FIELDS)
+        unknown = sorted(str(field) for field in set(data) - _FIELDS)
         if unknown:
             raise ValueError(f"{unknown[0]} is not a field of a blur table; known are {', '.join(sorted(_FIELDS))}")
         for field, kind in (("family", str), ("unit", str), ("params", dict), ("name", str), ("provenance", dict)):
@@ -314,7 +325,7 @@ class BlurTable:
                 raise ValueError(f"{field} must be a {kind.__name__}, got {type(data[field]).__name__}")
         sensor = data.get("sensor_width_mm")
         if sensor is not None and (isinstance(sensor, bool) or not isinstance(sensor, int | float)):
-            raise ValueError(f"sensor_width_mm must be a number, got {sensor!r}")
+            raise ValueError(f"sensor_width_mm must be a number, got {show(sensor)}")
         rest = {k: v for k, v in data.items() if k not in ("schema", "version", "family", "coc", "params")}
         return cls(data["family"], data["coc"], data["params"], **rest)
 
@@ -399,7 +410,7 @@ class BlurTable:
 def _numbers(name: str, value: Any) -> Tensor:
     try:
         numbers = torch.as_tensor(value)
-        if numbers.dtype == torch.bool or numbers.is_complex():
+        if numbers.dtype == torch.bool or numbers.is_complex() or numbers.layout != torch.strided:
             raise TypeError
         if not isinstance(value, Tensor):
             numbers = torch.as_tensor(value, dtype=torch.float64)  # a list would have come as float32
