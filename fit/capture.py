@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from torchdof.arguments import show
 from torchdof.files import read_image
 
 from .problems import DistanceError, FitError, ManifestError, NonFiniteError
@@ -56,13 +57,16 @@ class Captures:
             DistanceError: distances are not increasing, not positive, or one is that of the focus.
             FitError: no pair, or a camera number that is not positive.
         """
+        if not isinstance(self.pairs, Sequence) or not all(isinstance(p, Capture) for p in self.pairs):
+            raise FitError(f"pairs must be a tuple of Capture(sharp, blurred, distance_m), got {show(self.pairs)}")
         if not self.pairs:
             raise FitError("captures hold no pair of pictures; photograph the dot at one more distance at least")
         _check_distances([p.distance_m for p in self.pairs], self.focus_m, None)
         for what in ("width_px", "focal_length_mm", "f_number", "sensor_width_mm"):
             value = getattr(self, what)
-            if value is not None and not (0 < value < math.inf):
-                raise FitError(f"{what} must be positive, got {value}", number=float(value))
+            plain = isinstance(value, int | float) and not isinstance(value, bool)
+            if not (plain and 0 < value < 1e100) and (value is not None or what == "width_px"):
+                raise FitError(f"{what} must be positive, got {show(value)}")
 
     def __iter__(self) -> Iterator[Capture]:
         """Iterate over the pairs."""
@@ -226,6 +230,9 @@ def _text(fields: Mapping[str, Any], name: str, where: str, needed: bool = False
 
 
 def _check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
+    for what, value in [("focus_m", focus), *(("distance_m", d) for d in distances)]:
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e100:
+            raise DistanceError(f"{what} must be a positive number of metres, got {show(value)}", file=where)
     for before, distance in zip([0.0, *distances], distances, strict=False):
         if not before < distance < math.inf:
             raise DistanceError(

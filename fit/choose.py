@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .checked import a_picture
+from .problems import FitError
 from .result import Array
 
 __all__ = ["COST", "choose", "natural_psnr"]
@@ -31,6 +33,9 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     Returns:
         Decibels, at most 200.
 
+    Raises:
+        FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
+
     Reference:
         D. J. Field, "Relations between the statistics of natural images and the response properties of cortical
         cells", 1987 (the 1/f spectrum).
@@ -41,7 +46,10 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
         >>> natural_psnr(kernel.disc(6.0), kernel.disc(6.0))
         200.0
     """
-    first, second = np.asarray(kernel, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    first, second = a_picture("kernel", kernel, 1), a_picture("other", other, 1)
+    for name, array in (("kernel", first), ("other", second)):
+        if array.shape[0] != array.shape[1] or array.shape[0] % 2 == 0:
+            raise FitError(f"{name} must be [k, k] with an odd k, got {list(array.shape)}")
     width = max(_WIDTH, first.shape[-1], second.shape[-1])
     frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.rfftfreq(width)[None, :])
     power = np.zeros_like(frequency)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .dot import Dot, noise_inside
+from .dot import Dot, noise_inside, noise_of
 from .edge import Edge, soft_edge
 from .forward import Forward, Solution
 from .problems import (
@@ -32,6 +32,7 @@ _ENCODED = 0.7
 _FAR_ABOVE = 1.6  # residual over noise
 _MATTERS = 0.005
 _UNEVEN = 0.3
+_SPOT, _SPOT_MATTERS = 8.0, 0.003
 _MAGNIFIED = 0.08
 _OUTSIDE_REFUSED, _OUTSIDE_DOUBTED = 0.05, 0.005
 
@@ -108,6 +109,7 @@ def doubt_forward(
             "linear, not sRGB encoded?"
         )
         warn(MagnificationWarning(text, file=file, number=change), stacklevel)
+    _doubt_spots(pair, solution, file, stacklevel + 1)
     if fit.asymmetry > _UNEVEN:
         text = (
             f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle, which no family here "
@@ -148,6 +150,29 @@ def _outside(pair: Forward, solution: Solution) -> float:
     total = float(source[0, 0].real)
     # what the window-wide kernel itself left out
     return 1 - inside / total if total > 0 else 1.0
+
+
+def _doubt_spots(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:
+    """Warn about light beyond the dot's blur, which no family has: too little of it shows in the residual."""
+    from scipy.ndimage import gaussian_filter
+
+    rows, columns = np.indices(pair.data.shape)
+    distance = np.hypot(columns - pair.data_dot.x, rows - pair.data_dot.y)
+    beyond = (distance > pair.data_dot.reach + 4) & pair.used
+    if not beyond.any():
+        return
+    left = gaussian_filter(np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0), 2.0)
+    left = np.where(beyond, left, -np.inf)
+    y, x = np.unravel_index(int(np.argmax(left)), left.shape)
+    height, peak = float(left[y, x]), pair.data_dot.peak
+    # smoothing by sigma = 2 px leaves 0.14 of white noise
+    if height > max(_SPOT * 0.14 * noise_of(pair.data), _SPOT_MATTERS * peak):
+        text = (
+            f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), "
+            f"{distance[y, x]:.0f} px from the dot and beyond its blur: is there another dot, dust or a reflection? "
+            "The error bars do not count it"
+        )
+        warn(ResidualWarning(text, file=file, number=height / peak), stacklevel)
 
 
 def _doubt_parameters(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:

@@ -8,8 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from torchdof.arguments import show
 from torchdof.kernel import FAMILIES, profile
 
+from .checked import a_count
 from .problems import BoundaryWarning, FitError, FlatProfileError, FlatProfileWarning, NonFiniteError, warn
 from .result import Array, BlurFit
 from .solve import best_of, information_criterion
@@ -28,6 +30,7 @@ _BOUNDS = {
     "m": (0.5, 12.0),
 }
 _BENT = 8.0
+_SMALLEST, _LARGEST = 1e-60, 1e60  # their squares enter the covariance
 _STARTS: dict[str, list[list[float]]] = {
     "gaussian": [[1.0, 0.2], [1.0, 0.5], [1.0, 1.5]],
     "ring": [[1.0, 0.05, 0.3], [1.0, 0.5, 0.2], [1.0, 0.1, 1.0]],
@@ -80,6 +83,9 @@ def fit_profile(
         '0.002000 0.000400 0.5800'
     """
     radii, values = _checked(r, strength, family)
+    clusters = None if groups is None else _checked_groups(groups, radii.size)
+    if knots is not None:
+        a_count("knots", knots, 2, 10_000)
     order = np.argsort(radii, kind="stable")
     unit, peak = float(radii.max()), float(np.abs(values).max())
     x, y = radii[order] / unit, values[order] / peak
@@ -90,8 +96,7 @@ def fit_profile(
     elif family == "disc":
         params, covariance, names, curve = _fit_disc(x, y)
     else:
-        clusters = None if groups is None else np.asarray(groups)[order]
-        params, covariance, names, curve = _fit_smooth(x, y, family, clusters)
+        params, covariance, names, curve = _fit_smooth(x, y, family, None if clusters is None else clusters[order])
     squares = float(np.sum((y - curve) ** 2))
     scale = np.array([unit if n in _LENGTHS else peak if n == "N" or n.startswith("values") else 1.0 for n in names])
     covariance = covariance * np.outer(scale, scale)
@@ -124,8 +129,8 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
 
 
 def _checked(r: ArrayLike, strength: ArrayLike, family: str) -> tuple[Array, Array]:
-    if family not in FAMILIES:
-        raise FitError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}")
+    if not isinstance(family, str) or family not in FAMILIES:
+        raise FitError(f"family must be one of {', '.join(FAMILIES)}, got {show(family)}")
     try:
         radii, values = np.asarray(r, dtype=np.float64), np.asarray(strength, dtype=np.float64)
     except (TypeError, ValueError):
@@ -135,6 +140,11 @@ def _checked(r: ArrayLike, strength: ArrayLike, family: str) -> tuple[Array, Arr
     bad = int(np.sum(~np.isfinite(radii) | ~np.isfinite(values)))
     if bad:
         raise NonFiniteError(f"{bad} of {radii.size} samples are NaN or infinite; leave them out", number=float(bad))
+    for name, array in (("r", radii), ("strength", values)):
+        largest = float(np.abs(array).max()) if array.size else 0.0
+        if not _SMALLEST <= largest <= _LARGEST and largest > 0:
+            text = f"{name} must lie within {_SMALLEST:g} and {_LARGEST:g}, got up to {largest:g}; take another unit"
+            raise FitError(text, number=largest)
     if radii.size and radii.min() < 0:
         raise FitError(f"r must be >= 0, got {radii.min():g}", number=float(radii.min()))
     least = len(_ORDER.get(family, ("N", "radius", "", ""))) + 2
@@ -144,6 +154,16 @@ def _checked(r: ArrayLike, strength: ArrayLike, family: str) -> tuple[Array, Arr
     if values.max() <= 0:
         raise FitError("strength must be positive somewhere; is the dot darker than its paper?", number=values.max())
     return radii, values
+
+
+def _checked_groups(groups: ArrayLike, count: int) -> Array:
+    try:
+        array = np.asarray(groups)
+        if array.shape != (count,) or array.dtype.kind not in "iuf":
+            raise ValueError
+    except ValueError:
+        raise FitError(f"groups must be one integer a sample [{count}], got {show(groups)}") from None
+    return array
 
 
 def _noise(y: Array) -> float:

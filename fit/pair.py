@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchdof.arguments import show
 from torchdof.kernel import FAMILIES
 
+from .checked import a_count, a_number, a_picture
 from .choose import COST, choose
 from .clipped import used_pixels
 from .describe import bic_of, describe, kernel_lists
@@ -19,7 +21,7 @@ from .doubt import EXPLAINED, doubt_forward, doubt_linearity
 from .edge import soft_edge
 from .forward import ALL_MOVES, Forward, Solution
 from .gaussian import fit_profile
-from .problems import FitError, NonFiniteError, NotInFocusWarning, SaturatedWarning, warn
+from .problems import FitError, NotInFocusWarning, SaturatedWarning, warn
 from .profile import blur_strength
 from .radial import solve_radial
 from .result import Array, BlurFit
@@ -103,16 +105,10 @@ def fit_pair(
         >>> fit.family, round(fit.params["radius"], 3)
         ('disc', 8.0)
     """
-    if family not in (*FAMILIES, "auto"):
-        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {family!r}")
-    if model not in get_args(Model) or source not in get_args(SourceKind):
-        raise FitError(
-            f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; got {model!r}, {source!r}"
-        )
-    if not (0 < magnification < np.inf):
-        raise FitError(f"magnification must be positive, got {magnification}", number=magnification)
-    data = _picture("blurred", blurred, files[1])
-    still = None if sharp is None else _picture("sharp", sharp, files[0])
+    _check_options(family, model, source, magnification, accuracy_db, fit_magnification, white, start, prior)
+    _check_radial(knots, reach)
+    data = a_picture("blurred", blurred, _SMALLEST_WINDOW, files[1])
+    still = None if sharp is None else a_picture("sharp", sharp, _SMALLEST_WINDOW, files[0])
     if still is not None and still.shape != data.shape:
         raise FitError(
             f"sharp and blurred must have the same shape, got {list(still.shape)} and {list(data.shape)}; "
@@ -142,24 +138,49 @@ def fit_pair(
     return replace(fit, psnr=psnr)
 
 
-def _picture(name: str, picture: ArrayLike, file: str | None) -> Array:
+def _check_options(
+    family: Any,
+    model: Any,
+    source: Any,
+    magnification: Any,
+    accuracy_db: Any,
+    fit_magnification: Any,
+    white: Any,
+    start: Any,
+    prior: Any,
+) -> None:
+    if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
+        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
+    texts = isinstance(model, str) and isinstance(source, str)
+    if not texts or model not in get_args(Model) or source not in get_args(SourceKind):
+        told = f"got {show(model)}, {show(source)}"
+        raise FitError(f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; {told}")
     try:
-        array = np.asarray(picture)
-        if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-            raise TypeError
-        array = array.astype(np.float64)
-    except (TypeError, ValueError, RuntimeError):
-        raise FitError(f"{name} must be an array of real numbers [H, W] in linear light", file=file) from None
-    if array.ndim != 2 or min(array.shape) < _SMALLEST_WINDOW:
-        raise FitError(
-            f"{name} must be [H, W] with at least {_SMALLEST_WINDOW} pixels on a side, got {list(array.shape)}; "
-            "fit the colours of a picture one by one",
-            file=file,
-        )
-    bad = int(np.sum(~np.isfinite(array)))
-    if bad:
-        raise NonFiniteError(f"{bad} pixels of {name} are NaN or infinite", file=file, number=float(bad))
-    return array
+        # beyond this the dot of one picture is not seen in the other
+        a_number("magnification", magnification, 1e-3, 1e3)
+    except FitError:
+        told = f"got {show(magnification)}"
+        raise FitError(f"magnification must be positive (0.001 to 1000), {told}") from None
+    a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
+    if white is not None:
+        a_number("white", white, -1e100, 1e100)
+    if fit_magnification not in (True, False, None):
+        raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
+    if start is not None and not isinstance(start, BlurFit):
+        raise FitError(f"start must be a BlurFit of a similar pair, got {show(start)}")
+    pairs = isinstance(prior, Mapping) and all(isinstance(v, tuple) and len(v) == 2 for v in prior.values())
+    if prior is not None and not pairs:
+        raise FitError(f"prior must map names of parameters to (expected value, deviation), got {show(prior)}")
+    for name, (mean, deviation) in (prior or {}).items():
+        a_number(f"the expected {name}", mean, -1e100, 1e100)
+        a_number(f"the deviation of {name}", deviation, 0)
+
+
+def _check_radial(knots: Any, reach: Any) -> None:
+    if knots is not None:
+        a_count("knots", knots, 2, 1000)
+    if reach is not None:
+        a_number("reach", reach, 0, unit="pixels")
 
 
 def _ratio(still: Array, data: Array, family: str) -> BlurFit:

@@ -5,11 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchdof.arguments import show
+
+from .checked import a_number, a_picture
 from .dot import find_dot
 from .problems import FitError
 from .result import Array, Indices
 
 __all__ = ["blur_strength", "polar_samples"]
+
+_SMALLEST = 5  # px: noise is taken from second differences of second differences
 
 
 def polar_samples(
@@ -38,13 +43,24 @@ def polar_samples(
     """
     from scipy.ndimage import map_coordinates
 
-    if not (radius > 0 and spacing > 0 and 0 < step_deg <= 120):
-        raise FitError(f"radius, spacing and step_deg must be positive, got {radius:g}, {spacing:g}, {step_deg:g}")
+    levels = a_picture("picture", picture, 1)
+    try:
+        x, y = (a_number("centre", c, -1e9, 1e9, unit="pixels") for c in centre)
+    except (TypeError, ValueError):
+        raise FitError(f"centre must be (x, y) in pixels, got {show(centre)}") from None
+    for name, value, most in (("radius", radius, 1e5), ("spacing", spacing, 1e5), ("step_deg", step_deg, 120.1)):
+        try:
+            a_number(name, value, 0.0, most)
+        except FitError:
+            told = f"got {show(radius)}, {show(spacing)}, {show(step_deg)}"
+            raise FitError(f"radius, spacing and step_deg must be positive, {told}") from None
+    if radius / spacing * 360 / step_deg > 1e7:
+        raise FitError(f"spacing and step_deg must give at most 10 million samples, got {spacing:g} and {step_deg:g}")
     r = np.arange(0.0, radius + 1e-9, spacing)
     theta = np.deg2rad(np.arange(0.0, 360.0 - 1e-9, step_deg))
-    x = centre[0] + r[None, :] * np.cos(theta)[:, None]
-    y = centre[1] + r[None, :] * np.sin(theta)[:, None]
-    levels = map_coordinates(np.asarray(picture, dtype=np.float64), [y, x], order=1, mode="nearest")
+    columns = x + r[None, :] * np.cos(theta)[:, None]
+    rows = y + r[None, :] * np.sin(theta)[:, None]
+    levels = map_coordinates(levels, [rows, columns], order=1, mode="nearest")
     return r, theta, np.asarray(levels, dtype=np.float64)
 
 
@@ -72,13 +88,13 @@ def blur_strength(
     Reference:
         Sato, Dobashi, Yamamoto, section 2.
     """
-    dot = find_dot(np.asarray(sharp, dtype=np.float64))
-    soft = find_dot(np.asarray(blurred, dtype=np.float64))
+    still, moved = a_picture("sharp", sharp, _SMALLEST), a_picture("blurred", blurred, _SMALLEST)
+    dot, soft = find_dot(still), find_dot(moved)
     # the last pixel of the dot is half paper
     r, theta, below = polar_samples(
-        sharp, (dot.x, dot.y), max(dot.radius - 1.0, 1.0), step_deg=step_deg, spacing=spacing
+        still, (dot.x, dot.y), max(dot.radius - 1.0, 1.0), step_deg=step_deg, spacing=spacing
     )
-    above = polar_samples(blurred, (dot.x, dot.y), float(r[-1]), step_deg=step_deg, spacing=spacing)[2]
+    above = polar_samples(moved, (dot.x, dot.y), float(r[-1]), step_deg=step_deg, spacing=spacing)[2]
     below, above = below - dot.background, above - soft.background
     used = below > 0.2 * dot.peak
     spokes = np.broadcast_to(np.arange(theta.size)[:, None], used.shape)

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 
 from torchdof import BlurTable, Camera
+from torchdof.arguments import show
 
+from .checked import a_number
 from .problems import FitError, OutsideMeasuredWarning, warn
 
 __all__ = ["check_reach", "mm_to_px", "object_m_to_px", "px_to_mm", "px_to_object_m", "signed_coc"]
@@ -93,8 +95,16 @@ def check_reach(
         >>> found["coc"] < 1
         True
     """
-    if not 0 < near_m <= far_m:
-        raise FitError(f"depths must be 0 < near_m <= far_m, got {near_m} and {far_m}", number=near_m)
+    for what, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
+        if not isinstance(value, kind):
+            raise FitError(f"{what} must be a torchdof.{kind.__name__}, got {show(value)}")
+    if any(isinstance(getattr(camera, name), torch.Tensor) for name in Camera.__dataclass_fields__):
+        raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
+    a_number("width_px", width_px, 0, unit="pixels")
+    plain = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
+    if not plain or not 0 < near_m <= far_m or near_m > 1e300:
+        raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
+    near_m, far_m = float(near_m), min(float(far_m), math.inf)
     found = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
     if table.unit != "relative":
         scale = width_px if table.sensor_width_mm is None else width_px / table.sensor_width_mm

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from torchdof import BlurTable, Camera
+from torchdof.arguments import show
 from torchdof.kernel import FAMILIES, LENGTHS, profile, support
 
 from .capture import Capture, Captures
@@ -116,6 +117,10 @@ def fit_captures(
         ExposureWarning: a fitted gain contradicts the stated exposures.
         FitWarning: what `fit_pair` warns about.
     """
+    if not isinstance(captures, Captures):
+        raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
+    if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
+        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
     pairs = list(captures)
     total, done = len(pairs) * (2 if family == "auto" else 1), 0
     why = f"family {family!r} was asked for"
