@@ -21,6 +21,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from . import highlights
+
 __all__ = ["fill_hidden", "split_mixed", "surfaces"]
 
 HIDDEN_WEIGHT = 0.003
@@ -33,6 +35,8 @@ _REACH = 2  # pixels around a mixed pixel that tell what its two surfaces look l
 _FALL = 0.7  # weight of a level of the pyramid against the finer one before
 _UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
 _TRUST = 4.0  # how much local contrast discredits a split
+_DOUBT = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
+_LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
 
 
 def surfaces(
@@ -63,8 +67,9 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     With F and B the light of the two surfaces near the pixel, the share of F in a pixel is the least-squares
     solution of
     ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on that surface)
-    and drawn towards no split at all where the contrast of the two is small against the texture of each. The light of
-    the two parts sums to the pixel's.
+    and drawn towards no split at all where the contrast of the two is small against the texture of each, or where the
+    texture of the pixel's own surface explains it and moves little light. The light of the two parts sums to the
+    pixel's.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -108,7 +113,16 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     fitted = share.clamp(0.0, 1.0)
     misfit = ((colour - behind - fitted * contrast) ** 2).sum(0)
     trust = strength / (strength + 4e-4 + _TRUST * (behind_spread + front_spread + misfit))
-    other = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * trust * _pick(edge, at)[0]
+    raw = torch.where(is_near, 1.0 - fitted, fitted)
+    own_spread = torch.where(is_near, front_spread, behind_spread)
+    # what lies behind is seen sharp where it is nearer to focus, and so is every error of its split
+    doubt = torch.where(far.abs() < near.abs(), (_DOUBT * own_spread / strength.clamp_min(1e-12)).sqrt(), 0.0)
+    sure = raw - doubt
+    sure = sure * (2.0 * sure / _LEAST_SHARE - 1.0).clamp(0.0, 1.0)
+    # the light of a highlight counts even where its share is small
+    moved = raw * (strength / (colour**2).sum(0).clamp_min(1e-18)).sqrt()
+    sure = torch.lerp(sure, raw, (4.0 * moved - 1.0).clamp(0.0, 1.0))
+    other = sure.clamp(0.0, 0.5) * trust * _pick(edge, at)[0]
     own_pure, other_pure = torch.where(is_near, front, behind), torch.where(is_near, behind, front)
     rest = colour - (1.0 - other) * own_pure - other * other_pure
     norm = other**2 + (1.0 - other) ** 2
@@ -155,6 +169,10 @@ def fill_hidden(
     mixed = (share > 0.05) & (other_coc_px > coc_px)
     depth = torch.where(mixed, other_coc_px, coc_px)
     colour = torch.where(mixed, other_light, light)
+    # a highlight is in one place: what is hidden beside it is no highlight
+    colour = colour * (highlights.ordinary(colour, valid) / colour.amax(1, keepdim=True).clamp_min(1e-30)).clamp(
+        max=1.0
+    )
     weight = torch.where(mixed, share, 1.0 - share)
     if valid is not None:
         depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from . import background, composite, layers
+from . import background, composite, highlights, layers
 from . import check as checks
 from .camera import Camera
 from .check import Border, Method, Options
@@ -265,6 +265,13 @@ def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
         levels = math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1
         own, seen, other, other_coc, share = background.surfaces(light, coc, weight, min(levels, 7))
         surfaces = [(own, coc, seen), (other, other_coc, share)]
+    rays = []
+    if options.occlusion and plan.rays and len(plan.nodes) > 1:
+        limit = highlights.ordinary(light, valid)
+        for i, (colour, c, w) in enumerate(surfaces):
+            left, some = highlights.take(colour, c, w, limit, coc, plan.crisp_px if layered else math.inf)
+            surfaces[i] = (left, c, w)
+            rays += [] if some is None else [some]
     first, last = plan.nodes[0], plan.nodes[-1]
     samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
     moves = torch.is_grad_enabled() and (light.requires_grad or coc.requires_grad)
@@ -286,6 +293,8 @@ def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
         return composite.accumulate(frame, plan, blurs, layers_by_conv, options.normalize)
 
     out = tile_by_tile(frame, blurs, rendered) if exporting else rendered(frame, blurs)
+    if rays:
+        out = out + highlights.trace(rays, coc, options.table, light.shape[1])
     return out if valid is None else torch.where(valid, out, image)
 
 

@@ -25,10 +25,13 @@ class Plan:
     Args:
         nodes: Places of the layers on the blur axis (see :mod:`torchdof.layers`), strictly increasing.
         tolerance: What the plan was made for.
+        rays: Highlights are traced (:mod:`torchdof.highlights`) where layers would not do; False spreads them with
+            their layers, as plans for every scene do.
     """
 
     nodes: tuple[float, ...]
     tolerance: float
+    rays: bool = True
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
@@ -61,7 +64,7 @@ class Plan:
         """Layers for every scene up to a radius: the plan of a compiled or exported module."""
         reach = max_coc_px - 0.5
         inner = [x for x in _law(-reach, reach, tolerance) if abs(x) < reach - 0.3 * spacing(reach, tolerance)]
-        return cls((-reach, *inner, reach), tolerance)
+        return cls((-reach, *inner, reach), tolerance, rays=False)
 
     @property
     def coc_px(self) -> tuple[float, ...]:
@@ -87,6 +90,11 @@ class Plan:
             bank = [_kernel(table, c, width, s) for c, s in zip(self.coc_px, scales, strict=True)]
             bank = [_cut(kernel, size).to(device, dtype) for kernel in bank]
         return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+
+    @property
+    def crisp_px(self) -> float:
+        """Radius from which on layers are blurred at a coarser resolution, which softens the edges of highlights."""
+        return 2 * _COARSE_RADIUS / math.sqrt(self.tolerance * 255.0) if self.tolerance else math.inf
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is blurred at: every ``scale``-th pixel, a power of two."""

@@ -1,0 +1,105 @@
+"""Highlights: crisp discs of the right radius and energy, with the shadows of what stands in their rays' way."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof import BlurTable, blur_by_coc, highlights
+
+LAMP = 3000.0
+
+
+def street(coc_px: float = 14.0, post_px: float | None = None) -> tuple[Tensor, Tensor, tuple[int, int]]:
+    """A lamp of one pixel in front of a dim wall, and a nearer post beside it: image, coc, the lamp's place."""
+    image, coc = torch.full((1, 3, 96, 96), 0.05), torch.full((1, 1, 96, 96), coc_px)
+    coc[..., :2, :2] = 0.0  # more than one surface
+    place = (48, 50)
+    if post_px is not None:
+        coc[..., :, 41:45] = post_px
+    image[..., place[0], place[1]] = LAMP
+    return image, coc, place
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1 / 255, 4 / 255])
+@pytest.mark.parametrize("coc_px", [-23.0, -9.3, 5.2, 14.0, 31.5])
+def test_a_highlight_is_a_disc_of_its_radius_and_energy(coc_px: float, tolerance: float) -> None:
+    image, coc, (row, column) = street(coc_px)
+    unlit = image.clone()
+    unlit[..., row, column] = 0.05
+    disc = (blur_by_coc(image, coc, tolerance=tolerance) - blur_by_coc(unlit, coc, tolerance=tolerance))[0, 0]
+    height = LAMP / (math.pi * coc_px**2)
+    assert math.sqrt(float((disc > height / 2).sum()) / math.pi) == pytest.approx(abs(coc_px), abs=0.5)
+    assert float(disc.sum()) == pytest.approx(LAMP, rel=0.01)
+    edge = ((disc > 0.1 * height) & (disc < 0.9 * height)).sum()
+    assert edge < 1.6 * 2 * math.pi * abs(coc_px), "the edge is wider than a pixel or two"
+
+
+@pytest.mark.parametrize(("coc_px", "post_px"), [(14.0, -6.0), (14.0, 4.0), (-9.0, -15.0), (22.0, 0.0)])
+def test_a_post_in_front_draws_its_shadow_where_its_rays_pass(coc_px: float, post_px: float) -> None:
+    image, coc, (row, column) = street(coc_px, post_px)
+    got = blur_by_coc(image, coc, tolerance=0.0)[0, 0]
+    kernel = BlurTable.disc().kernels(torch.tensor([coc_px]), 96)[0, 0]
+    half = kernel.shape[-1] // 2
+    for dx in range(-half, half + 1):  # along the row of the lamp, ray by ray
+        passes_at = column + dx * (1 - post_px / coc_px)
+        lands = float(got[row, column + dx])
+        if 41.5 <= passes_at <= 43.5:
+            assert lands < 0.2, f"the post stops the ray at {dx}"
+        elif not 39.5 <= passes_at <= 45.5 and kernel[half, half + dx] > 0:
+            assert lands == pytest.approx(0.05 + LAMP * float(kernel[half, half + dx]), rel=0.1), f"ray at {dx}"
+
+
+def test_ordinary_light_stays_in_the_layers() -> None:
+    image = torch.rand(1, 3, 64, 80, generator=torch.Generator().manual_seed(1))
+    coc = torch.linspace(-9, 9, 80).expand(1, 1, 64, 80)
+    left, rays = highlights.take(image, coc, None, highlights.ordinary(image), coc, 1.0)
+    assert rays is None
+    assert left is image
+
+
+def test_what_is_taken_and_what_is_left_sum_to_the_light() -> None:
+    image, coc, (row, column) = street()
+    left, rays = highlights.take(image, coc, None, highlights.ordinary(image), coc, 1.0)
+    assert rays is not None
+    assert rays.at.tolist() == [row * 96 + column]
+    torch.testing.assert_close(left[0, :, row, column] + rays.light[:, 0], image[0, :, row, column])
+    assert float(left.max()) <= highlights.FACTOR * 0.05 * 1.001
+
+
+def test_many_bright_pixels_are_left_to_the_layers_but_for_the_brightest() -> None:
+    generator = torch.Generator().manual_seed(2)
+    image = torch.rand(1, 1, 128, 128, generator=generator)
+    image = torch.where(torch.rand(image.shape, generator=generator) < 0.05, 100.0 * (1.0 + image), 0.01 * image)
+    coc = torch.full((1, 1, 128, 128), 20.0)
+    _, rays = highlights.take(image, coc, None, highlights.ordinary(image), coc, 1.0)
+    assert rays is not None
+    assert len(rays.at) * 41**2 <= highlights._TAPS_PER_PIXEL * 128**2
+    taken = torch.zeros(128 * 128, dtype=torch.bool).index_fill(0, rays.at, True)
+    assert image.flatten()[taken].min() >= image.flatten()[~taken].max()
+
+
+def test_light_that_is_not_known_makes_nothing_a_highlight() -> None:
+    image = torch.zeros(1, 1, 64, 64)
+    image[..., 30:33, 30:33] = 1.0
+    valid = (image > 0).float()
+    assert float(highlights.ordinary(image, valid).min()) >= 1.0
+
+
+def test_rays_are_differentiable_in_light_and_coc() -> None:
+    image, coc, (row, column) = street(6.13, -2.9)  # rays meet no pixel's centre
+    generator = torch.Generator().manual_seed(3)
+    target = torch.rand(1, 3, 96, 96, generator=generator)
+    light, blur = image.double().requires_grad_(), coc.double().requires_grad_()
+    loss = (blur_by_coc(light, blur) * target).sum()
+    by_light, by_coc = torch.autograd.grad(loss, (light, blur))
+    for tensor, gradient, step in ((image, by_light, 1e-2), (coc, by_coc, 1e-4)):
+        moved = [tensor.double().clone() for _ in range(2)]
+        for m, sign in zip(moved, (1, -1), strict=True):
+            m[0, 0, row, column] += sign * step
+        inputs = [(m, coc.double()) if tensor is image else (image.double(), m) for m in moved]
+        # gradients ask for layers that stand still
+        values = [(blur_by_coc(a, b.requires_grad_()) * target).sum().detach() for a, b in inputs]
+        slope = float(values[0] - values[1]) / (2 * step)
+        assert float(gradient[0, 0, row, column]) == pytest.approx(slope, rel=1e-3)

@@ -1,0 +1,241 @@
+"""Highlights: light far brighter than what is around it, traced ray by ray to the crisp discs that a lens makes of it.
+
+Layers know how much of the lens a blurred foreground covers, not which part. For ordinary light that is enough; in the
+disc of a highlight everybody sees it, for a post in front of a lamp draws a crisp line through its disc. A ray from a
+pixel at ``p`` with coc ``c`` through the point ``u`` of the lens lands at ``p + c u``, and it passes a nearer surface
+with
+coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sharp image itself tells which rays pass.
+
+Highlights are few. What exceeds the ordinary light around it is taken out of the layers, and added again as rays:
+where something nearer could stand in the way, where its layer is too coarse for a crisp edge, and at the frame's
+border, where layers make up for the light that is not seen with the light that is.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .table import BlurTable
+
+__all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
+
+FACTOR = 8.0
+"""Light above so many times the ordinary light around it is a highlight's."""
+
+_CELL = 32  # pixels over which light is averaged to tell what is ordinary
+_COARSE_CELL = 8  # pixels in which the nearest surface is looked for
+_NEARER_PX = 1.5  # difference in coc from which on a surface is another one, in front
+_TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
+_TAPS = 2**20  # rays traced together
+
+
+@dataclasses.dataclass(frozen=True)
+class Rays:
+    """Light taken out of one surface of an image.
+
+    Args:
+        at: Flat indices of its pixels in ``[B, 1, H, W]``, ``[n]``.
+        light: ``[C, n]``.
+        coc_px: ``[n]``.
+    """
+
+    at: Tensor
+    light: Tensor
+    coc_px: Tensor
+
+
+def ordinary(light: Tensor, valid: Tensor | None = None) -> Tensor:
+    """Largest light that still is ordinary beside what is around it.
+
+    It is :data:`FACTOR` times what four fifths of the pixels of a cell stay below, interpolated between cells.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        valid: ``[B, 1, H, W]``, 0 where the light is not known; None counts all.
+
+    Returns:
+        ``[B, 1, H, W]``.
+    """
+    height, width = light.shape[-2:]
+    brightest = light.detach().amax(1, keepdim=True)
+    if valid is not None:
+        brightest = torch.where(valid > 0, brightest, torch.inf)
+    # as in `background`: in this form exported code knows that the sizes are multiples
+    more = 2 * _CELL - 1
+    extra = (0, (width + more) // _CELL * _CELL - width, 0, (height + more) // _CELL * _CELL - height)
+    padded = functional.pad(brightest, extra, mode="replicate")[..., ::2, ::2]
+    cells = functional.pixel_unshuffle(padded, _CELL // 2)
+    level = FACTOR * torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
+    level = level.clamp(0.0, torch.finfo(light.dtype).max / 8)
+    level = functional.interpolate(level, scale_factor=float(_CELL), mode="bilinear", align_corners=False)
+    return level[..., :height, :width]
+
+
+def take(
+    light: Tensor, coc_px: Tensor, weight: Tensor | None, limit: Tensor, nearest_px: Tensor, crisp_px: float
+) -> tuple[Tensor, Rays | None]:
+    """Take out of a surface the light above a limit that needs to be traced.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        coc_px: ``[B, 1, H, W]``.
+        weight: Share of each pixel that the surface covers ``[B, 1, H, W]``; None is 1.
+        limit: Largest ordinary light, ``[B, 1, H, W]``.
+        nearest_px: Coc of what each pixel shows, ``[B, 1, H, W]``.
+        crisp_px: Blurs from this radius on lose their edge in coarse layers, so they are traced in any case.
+
+    Returns:
+        The light that is left, and the rays; None where there are none.
+    """
+    brightest = light.amax(1, keepdim=True)
+    place, nearest_px = coc_px.detach(), nearest_px.detach()
+    bright = (brightest > limit) & (place.abs() > 1.0)
+    if weight is not None:
+        bright &= weight > 0
+    if not bool(bright.any()):
+        return light, None
+    blur = place.abs()
+    bright &= (blur >= crisp_px) | (2.0 * blur > _to_border(place)) | _something_nearer(place, nearest_px)
+    at = bright.flatten().nonzero()[:, 0]
+    if len(at) == 0:
+        return light, None
+    peak, coc, most = brightest.flatten()[at], coc_px.flatten()[at], limit.flatten()[at]
+    order = torch.argsort(peak.detach(), descending=True)
+    taps = ((2.0 * coc.detach().abs() + 1.0) ** 2)[order].cumsum(0)
+    few = int((taps <= _TAPS_PER_PIXEL * coc_px.numel()).sum())
+    if few < len(at):  # not few, then: the brightest of them, and only what they are brighter by
+        most = torch.maximum(most, peak[order[few]].detach())
+        order = order[:few]
+        at, peak, coc, most = (t[order] for t in (at, peak, coc, most))
+        if len(at) == 0:
+            return light, None
+    # from nothing at a radius of 1 px to all of it at 2
+    share = (1.0 - most / peak) * (coc.abs() - 1.0).clamp(max=1.0)
+    excess = light.transpose(0, 1).flatten(1)[:, at] * share
+    taken = torch.zeros_like(light.transpose(0, 1)).flatten(1).index_copy(1, at, excess)
+    left = light - taken.unflatten(1, (light.shape[0], *light.shape[-2:])).transpose(0, 1)
+    return left, Rays(at, excess if weight is None else excess * weight.flatten()[at], coc)
+
+
+def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int) -> Tensor:
+    """Scatter highlights, each ray to where it lands unless a nearer surface is in its way.
+
+    Args:
+        rays: From :func:`take`.
+        coc_px: What each pixel shows, ``[B, 1, H, W]``.
+        table: Blur of the lens.
+        channels: C.
+
+    Returns:
+        ``[B, C, H, W]``. Differentiable in the light and coc of the rays.
+    """
+    batch, _, height, width = coc_px.shape
+    order = [torch.argsort(some.coc_px.detach().abs()) for some in rays]
+    margin = max(_half(table, float(some.coc_px.detach().abs().max()), height, width) for some in rays)
+    area = (height + 2 * margin) * (width + 2 * margin)
+    out = rays[0].light.new_zeros(channels, batch * area)
+    for some, sorted_ in zip(rays, order, strict=True):
+        for chunk in _chunks(some.coc_px.detach()[sorted_], table, height, width):
+            chosen = sorted_[chunk]
+            at, coc = some.at[chosen], some.coc_px[chosen]
+            light = some.light[:, chosen]
+            item, row, column = at // (height * width), at // width % height, at % width
+            kernels = _kernels(table, coc, width, max(height, width)).to(light.dtype)  # [n, 1 or C, k, k]
+            half = kernels.shape[-1] // 2
+            step = torch.arange(-half, half + 1, device=at.device)
+            passes = 1.0 - _blocked(coc, item, row, column, step, coc_px)
+            spread = kernels * passes.unsqueeze(1)
+            lands = (row[:, None, None] + margin + step[:, None]) * (width + 2 * margin)
+            lands = (item * area)[:, None, None] + lands + column[:, None, None] + margin + step
+            for channel in range(channels):
+                tap = spread[:, channel % spread.shape[1]] * light[channel, :, None, None]
+                out = out.index_put((torch.tensor(channel, device=at.device), lands.flatten()), tap.flatten(), True)
+    frame = out.unflatten(1, (batch, height + 2 * margin, width + 2 * margin)).transpose(0, 1)
+    return frame[..., margin : margin + height, margin : margin + width]
+
+
+def _half(table: BlurTable, coc_px: float, height: int, width: int) -> int:
+    return min(math.ceil(table.reach_px(coc_px, width) + 0.5), max(height, width) - 1)
+
+
+def _chunks(sorted_coc: Tensor, table: BlurTable, height: int, width: int) -> list[slice]:
+    """Rays of increasing blur in parts of a bounded number of taps."""
+    chunks, start = [], 0
+    while start < len(sorted_coc):
+        stop = start
+        # the first guess is for the first ray; the last ray of the part needs the widest kernel
+        count = _TAPS // (2 * _half(table, float(sorted_coc[start].abs()), height, width) + 1) ** 2
+        stop = min(len(sorted_coc), start + max(1, count))
+        widest = 2 * _half(table, float(sorted_coc[stop - 1].abs()), height, width) + 1
+        stop = min(stop, start + max(1, _TAPS // widest**2))
+        chunks.append(slice(start, stop))
+        start = stop
+    return chunks
+
+
+def _kernels(table: BlurTable, coc: Tensor, width: int, largest: int) -> Tensor:
+    """Kernels ``[n, 1 or C, k, k]``, each as exact as 1/32 px of radius where no gradient asks for more."""
+    if torch.is_grad_enabled() and coc.requires_grad:
+        kernels = table.kernels(coc, width)
+    else:
+        values, which = torch.unique((coc.double() * 32).round() / 32, return_inverse=True)
+        kernels = table.kernels(values.cpu(), width).to(coc.device)[which]
+    spare = max(0, kernels.shape[-1] // 2 - (largest - 1))
+    return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
+
+
+def _to_border(coc_px: Tensor) -> Tensor:
+    """Pixels between each pixel's centre and the nearest border, ``[H, W]``; layers would scale its light up there."""
+    rows, columns = (torch.arange(n, device=coc_px.device) for n in coc_px.shape[-2:])
+    rows, columns = (torch.minimum(i, i.flip(0)) + 0.5 for i in (rows, columns))
+    return torch.minimum(rows[:, None], columns)
+
+
+def _something_nearer(coc: Tensor, nearest_px: Tensor) -> Tensor:
+    """Whether a ray of a pixel could meet a nearer surface, or land where layers would scale it; none too few."""
+    height, width = coc.shape[-2:]
+    cells = functional.max_pool2d(-nearest_px, _COARSE_CELL, ceil_mode=True)
+    found = torch.zeros_like(coc, dtype=torch.bool)
+    inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells
+    farthest = float(torch.maximum(coc.max() - nearest_px.min(), 2.0 * coc.abs().max()))
+    while inner < farthest:
+        around = functional.max_pool2d(functional.pad(cells, (radius,) * 4, value=-math.inf), 2 * radius + 1, 1)
+        near = -functional.interpolate(around, scale_factor=_COARSE_CELL, mode="nearest")[..., :height, :width]
+        found |= (near < coc - inner) | ((near < coc - _NEARER_PX) & (2.0 * coc.abs() > inner))
+        inner, radius = max(_NEARER_PX, float(radius * _COARSE_CELL)), 2 * radius
+    return found
+
+
+def _blocked(coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor, coc_px: Tensor) -> Tensor:
+    """Share of each ray ``[n, k, k]`` that nearer surfaces take."""
+    height, width = coc_px.shape[-2:]
+    blocked = coc.new_zeros(len(coc), len(step), len(step))
+    low, high = float(coc_px.detach().min()), float(coc.detach().max()) - _NEARER_PX
+    if low > high:
+        return blocked
+    y, x = row[:, None].to(coc.dtype), column[:, None].to(coc.dtype)
+    place = (coc_px[:, 0] - low).flatten()  # in bins of 1 px
+    for k in range(math.floor(high - low) + 1):
+        meets = coc - _NEARER_PX >= low + k
+        share = (1.0 - (place - k).abs()).clamp_min(0.0)
+        if not bool(meets.any()) or not bool((share > 0).any()):
+            continue
+        scale = (1.0 - (low + k) / coc[meets])[:, None]
+        at_y = (y[meets] + step * scale).clamp(0, height - 1)  # surfaces go on beyond the border
+        at_x = (x[meets] + step * scale).clamp(0, width - 1)
+        top, left = at_y.floor(), at_x.floor()
+        down, right = (at_y - top)[:, :, None], (at_x - left)[:, None, :]
+        first = item[meets][:, None] * height
+        rows = [(first + r.long().clamp(max=height - 1)) * width for r in (top, top + 1)]
+        columns = [c.long().clamp(max=width - 1) for c in (left, left + 1)]
+        upper, lower = (
+            share[r[:, :, None] + columns[0][:, None, :]] * (1 - right)
+            + share[r[:, :, None] + columns[1][:, None, :]] * right
+            for r in rows
+        )
+        blocked = blocked.index_add(0, meets.nonzero()[:, 0], upper * (1 - down) + lower * down)
+    return blocked.clamp(max=1.0)
