@@ -111,6 +111,8 @@ def read_captures(folder: str | os.PathLike[str], *, dots: Dots | None = None) -
         FitError: a picture's kind of trouble, with its file.
         OSError: a picture is missing or damaged.
     """
+    if not isinstance(folder, str | os.PathLike):
+        raise ManifestError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}")
     path = Path(folder)
     path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
     fields = _manifest(path)
@@ -183,6 +185,9 @@ def read_pair(
         FitError: a picture's kind of trouble, with its file.
         OSError: a picture is missing or damaged.
     """
+    for name, file in (("sharp", sharp), ("blurred", blurred)):
+        if not isinstance(file, str | os.PathLike):
+            raise FitError(f"{name} must be the path of a picture, got {show(file)}")
     still, white = _read(Path(sharp), transfer)
     moved, _ = _read(Path(blurred), transfer)
     if still.shape != moved.shape:

@@ -132,8 +132,10 @@ def _checked(r: ArrayLike, strength: ArrayLike, family: str) -> tuple[Array, Arr
     if not isinstance(family, str) or family not in FAMILIES:
         raise FitError(f"family must be one of {', '.join(FAMILIES)}, got {show(family)}")
     try:
+        if np.iscomplexobj(r) or np.iscomplexobj(strength):
+            raise TypeError
         radii, values = np.asarray(r, dtype=np.float64), np.asarray(strength, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise FitError("r and strength must be numbers, one strength for each radius") from None
     if radii.ndim != 1 or radii.shape != values.shape:
         raise FitError(f"r and strength must both be [n], got {list(radii.shape)} and {list(values.shape)}")

@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from torchdof.arguments import show
+
 from . import prescription
 
 __all__ = ["RGB_UM", "Lens", "Paraxial"]
@@ -97,12 +99,20 @@ class Lens:
         """Check the numbers, so that whatever is computed later is about a lens."""
         columns = {name: getattr(self, name) for name in (*prescription.COLUMNS, "abbe")}
         for name, value in columns.items():
-            array = np.asarray(value, dtype=np.float64)
+            try:
+                array = np.asarray(value)
+                if array.dtype.kind not in "iuf":
+                    raise TypeError
+                array = array.astype(np.float64)
+            except (TypeError, ValueError, OverflowError):
+                raise ValueError(f"{name} must hold one number a surface, got {show(value)}") from None
             if array.ndim != 1 or array.shape != np.shape(self.radius):
                 raise ValueError(f"{name} must hold one number a surface, got shape {list(array.shape)}")
             object.__setattr__(self, name, array)
-        if not 0 <= self.stop < len(self.radius):
-            raise ValueError(f"stop must be the number of a surface (0 to {len(self.radius) - 1}), got {self.stop}")
+        if isinstance(self.stop, bool) or not isinstance(self.stop, int) or not 0 <= self.stop < len(self.radius):
+            raise ValueError(
+                f"stop must be the number of a surface (0 to {len(self.radius) - 1}), got {show(self.stop)}"
+            )
         for i in range(len(self.radius)):
             for name, value in columns.items():
                 if wrong := prescription.wrong(name, float(value[i])):
@@ -121,6 +131,8 @@ class Lens:
             ValueError: If the content is not a prescription; the message names file, line and column.
             FileNotFoundError: If there is neither such a file nor such a shipped lens.
         """
+        if not isinstance(source, str | os.PathLike):
+            raise ValueError(f"source must be the name or the path of a prescription, got {show(source)}")
         path = Path(source)
         if not path.suffix and not path.exists():
             path = _SHIPPED / f"{path}.txt"
@@ -239,5 +251,5 @@ class Lens:
 
 
 def _check_positive(name: str, value: float) -> None:
-    if not 0 < value < math.inf:
-        raise ValueError(f"{name} must be positive and finite, got {value}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1e-9 < value < 1e9:
+        raise ValueError(f"{name} must be positive and finite (below 1e9), got {show(value)}")

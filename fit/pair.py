@@ -164,7 +164,7 @@ def _check_options(
     a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
     if white is not None:
         a_number("white", white, -1e100, 1e100)
-    if fit_magnification not in (True, False, None):
+    if fit_magnification is not None and not isinstance(fit_magnification, bool):
         raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
     if start is not None and not isinstance(start, BlurFit):
         raise FitError(f"start must be a BlurFit of a similar pair, got {show(start)}")

@@ -104,7 +104,7 @@ def check_reach(
     plain = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
     if not plain or not 0 < near_m <= far_m or near_m > 1e300:
         raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
-    near_m, far_m = float(near_m), min(float(far_m), math.inf)
+    near_m, far_m = float(near_m), math.inf if far_m > 1e300 else float(far_m)
     found = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
     if table.unit != "relative":
         scale = width_px if table.sensor_width_mm is None else width_px / table.sensor_width_mm

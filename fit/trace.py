@@ -6,10 +6,11 @@ import datetime
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
+from torchdof.arguments import number, show, whole
 from torchdof.kernel import FAMILIES
 from torchdof.table import BlurTable
 
@@ -79,14 +80,18 @@ def trace_table(
         >>> trace_table(lens, f_number=4.0, focus_m=2.0, nodes=5, points=9, rays=200)
         BlurTable('double_gauss_50mm_f4', radial, 5 nodes)
     """
-    if family not in FAMILIES:
-        raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {family!r}")
+    _check(lens, family, nodes, points, focus, reference, wavelengths_um, rays, name)
+    if not isinstance(focus_m, float) or focus_m != math.inf:
+        number("focus_m", focus_m, unit="metres")
+        if focus_m > 1e9:
+            raise ValueError(f"focus_m must be at most 1e9 metres, or inf, got {show(focus_m)}")
+    number("field_mm", field_mm, -1e6, 1e6)
     if nodes < (5 if math.isfinite(focus_m) else 3):
         raise ValueError(f"nodes must be at least 5 (3 for a focus at infinity), got {nodes}")
-    if points < 3:
-        raise ValueError(f"points must be at least 3, got {points}")
-    if not 0 < sensor_width_mm < math.inf or width_px < 1:
-        raise ValueError(f"sensor_width_mm and width_px must be positive, got {sensor_width_mm} and {width_px}")
+    for value in (sensor_width_mm, width_px):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
+            told = f"got {show(sensor_width_mm)} and {show(width_px)}"
+            raise ValueError(f"sensor_width_mm and width_px must be positive, {told}")
     if wavelengths_um is not None and not lens.dispersive:
         raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
     stopped = lens.with_f_number(f_number)
@@ -94,7 +99,7 @@ def trace_table(
     sensor = focus_sensor(stopped, focus_m, focus, reference)
     if nearest_m is None:
         nearest_m = focus_m / 3.0 if math.isfinite(focus_m) else 0.025 * focal
-    if not 0 < nearest_m < focus_m:
+    if not 0 < number("nearest_m", nearest_m, unit="metres") < focus_m:
         raise ValueError(f"nearest_m must be nearer than the focus at {focus_m} m, got {nearest_m}")
     count = rays or (50_000 if field_mm else 2_000)
     call = (
@@ -156,6 +161,34 @@ def trace_table(
         provenance=provenance,
         residual=_rounded(residual),
     )
+
+
+def _check(
+    lens: Any, family: Any, nodes: Any, points: Any, focus: Any, reference: Any, wavelengths: Any, rays: Any, name: Any
+) -> None:
+    if not isinstance(lens, Lens):
+        raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
+    for what, value, known in (
+        ("family", family, tuple(FAMILIES)),
+        ("focus", focus, get_args(Focus)),
+        ("reference", reference, get_args(Reference)),
+    ):
+        if not isinstance(value, str) or value not in known:
+            raise ValueError(f"{what} must be one of {', '.join(known)}, got {show(value)}")
+    if isinstance(points, bool) or not isinstance(points, int) or not 3 <= points <= 1000:
+        raise ValueError(f"points must be at least 3, got {show(points)} (and 1000 at most)")
+    whole("nodes", nodes, 3, 1000)
+    if rays is not None:
+        if isinstance(rays, bool) or not isinstance(rays, int) or not 16 <= rays <= 10**7:
+            raise ValueError(f"rays must be at least 16 (and 10 million at most), got {show(rays)}")
+    if name is not None and not isinstance(name, str):
+        raise ValueError(f"name must be a text, got {show(name)}")
+    if wavelengths is None:
+        return
+    if not isinstance(wavelengths, list | tuple) or not wavelengths:
+        raise ValueError(f"wavelengths_um must be a list of wavelengths in micrometres, got {show(wavelengths)}")
+    for value in wavelengths:
+        number("wavelengths_um", value, 0.299, 1.201, unit="micrometres")
 
 
 def signed_coc_mm(z_m: float, focal_length_mm: float, f_number: float, focus_m: float) -> float:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .arguments import show
 from .metadata import kept_metadata
 
 __all__ = ["Part", "Sample", "existing", "first_line", "read_array", "read_parts"]
@@ -54,6 +55,8 @@ def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str)
         ValueError: If the suffix is none of ``suffixes``; ``what`` names what was wanted.
         OSError: If there is no file, or it is empty.
     """
+    if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
+        raise ValueError(f"expected the path of {what}, got {show(path)}")
     path = Path(path)
     if path.suffix.lower() not in suffixes:
         raise ValueError(

@@ -214,7 +214,7 @@ def test_command_in_the_provenance_makes_the_table_again() -> None:
         ({"f_number": 1.0}, "f_number must be at least 2.03"),
         ({"f_number": math.nan}, "f_number must be positive"),
         ({"focus_m": 0.04}, "farther than the focal length"),
-        ({"focus_m": math.nan}, "must lie in front of the lens"),
+        ({"focus_m": math.nan}, "focus_m must be a number of metres, got nan"),
         ({"nearest_m": 3.0}, "nearest_m must be nearer than the focus at 2.0 m, got 3.0"),
         ({"focus": "sharp"}, "focus must be one of best, paraxial"),
         ({"reference": "film"}, "reference must be one of principal"),

@@ -1,0 +1,135 @@
+"""Any argument of the fits, however wrong, gives a result or a named error; any manifest and prescription as well."""
+
+import math
+import re
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from torchdof import BlurTable, Camera
+from torchdof.fit import (
+    Capture,
+    Captures,
+    FitWarning,
+    blur_strength,
+    check_reach,
+    fit_captures,
+    fit_pair,
+    fit_profile,
+    fit_table,
+    natural_psnr,
+    polar_samples,
+    read_captures,
+    read_pair,
+    trace_table,
+)
+from torchdof.fit.lens import Lens
+
+pytestmark = pytest.mark.hard
+
+FEW = settings(max_examples=max(40, settings().max_examples // 5), suppress_health_check=list(HealthCheck))
+
+NUMBERS = st.one_of(
+    st.floats(), st.integers(-3, 40), st.sampled_from([0, -1, 10**400, math.nan, math.inf, -math.inf, 5e-324, 1.7e308])
+)
+ARRAYS = st.builds(
+    lambda shape, value, kind: np.full(shape, value, dtype=kind),
+    st.sampled_from([(), (0,), (3,), (0, 0), (15, 15), (20, 17), (3, 15, 15), (1, 1)]),
+    st.sampled_from([0.0, 1.0, -1.0, math.nan, math.inf, 1e35]),
+    st.sampled_from(["float64", "float32", "complex128", "object", "str"]),
+)
+JUNK = st.one_of(
+    st.none(), st.text(max_size=4), st.booleans(), st.binary(max_size=2), st.just(object()), st.complex_numbers(),
+    st.lists(NUMBERS, max_size=6), st.dictionaries(st.text(max_size=3), NUMBERS, max_size=2),
+    st.tuples(NUMBERS, NUMBERS),
+)  # fmt: skip
+ANYTHING = st.one_of(NUMBERS, ARRAYS, JUNK)
+
+
+def dot(size: int = 31, sigma: float = 3.0) -> Any:
+    y, x = np.indices((size, size)) - size // 2
+    return np.exp(-(x**2 + y**2) / (2 * sigma**2))
+
+
+SHARP, BLURRED = dot(), dot(sigma=4.0)
+PAIR = Capture(SHARP, BLURRED, 1.5)
+R = np.linspace(0, 8, 20)
+TABLE = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="fraction")
+LENS = Lens.read("double_gauss_50mm")
+CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
+    "fit_profile": (
+        fit_profile, {"r": R, "strength": dot(39)[19, 19:], "family": "gaussian", "groups": None, "knots": None}
+    ),
+    "fit_pair": (fit_pair, {"sharp": SHARP, "blurred": BLURRED, "family": "gaussian"}),
+    "fit_pair, options": (
+        lambda **a: fit_pair(SHARP, BLURRED, **a),
+        {"family": "gaussian", "model": "forward", "accuracy_db": 45.0, "source": "auto", "magnification": 1.0,
+         "fit_magnification": False, "white": None, "start": None, "prior": None, "knots": None, "reach": None},
+    ),
+    "Captures": (
+        Captures,
+        {"pairs": (PAIR,), "focus_m": 1.0, "width_px": 100, "focal_length_mm": 50.0, "f_number": 2.0,
+         "sensor_width_mm": 36.0},
+    ),
+    "Capture": (lambda **a: Captures((Capture(**a),), 1.0, 100), {"sharp": SHARP, "blurred": SHARP, "distance_m": 2.0}),
+    "fit_table": (fit_table, {"captures": None, "family": "gaussian"}),
+    "fit_captures": (fit_captures, {"captures": None, "family": "gaussian"}),
+    "blur_strength": (blur_strength, {"sharp": SHARP, "blurred": BLURRED}),
+    "polar_samples": (
+        polar_samples, {"picture": SHARP, "centre": (15, 15), "radius": 5.0, "step_deg": 10.0, "spacing": 1.0}
+    ),
+    "natural_psnr": (natural_psnr, {"kernel": SHARP, "other": BLURRED}),
+    "check_reach": (
+        check_reach, {"table": TABLE, "camera": Camera(), "near_m": 1.0, "far_m": 3.0, "width_px": 100}
+    ),
+    "trace_table": (
+        trace_table,
+        {"lens": None, "f_number": 4.0, "focus_m": 2.0, "nodes": 5, "nearest_m": None, "family": "radial", "points": 9,
+         "focus": "best", "reference": "principal", "field_mm": 0.0, "wavelengths_um": None, "sensor_width_mm": 36.0,
+         "width_px": 100, "rays": 100},
+    ),
+    "Lens": (
+        Lens,
+        {"radius": [30.0, -30.0], "thickness": [5.0, 0.0], "index": [1.5, 1.0], "abbe": [math.inf] * 2,
+         "diameter": [10.0, 10.0], "stop": 0},
+    ),
+    "Lens.with_f_number": (LENS.with_f_number, {"f_number": 4.0}),
+    "Lens.scaled": (LENS.scaled, {"focal_length_mm": 35.0}),
+    "Lens.read": (Lens.read, {"source": "wide_22mm"}),
+    "read_captures": (read_captures, {"folder": "nowhere"}),
+    "read_pair": (read_pair, {"sharp": "nowhere.png", "blurred": "nowhere.png"}),
+}  # fmt: skip
+
+
+def honest(call: Callable[[], Any]) -> None:
+    """Runs a call that may refuse by name, in one sentence."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FitWarning)
+        try:
+            call()
+        except (ValueError, FileNotFoundError) as error:
+            message = str(error)
+            assert 20 < len(message) < 1000
+            told = (
+                r"must|need|at least|no such|no lens|negative|flat|no dot|give |takes|NaN|converge|pass|edge|expected"
+            )
+            told += r"|lies at|goes with|stand|can be read|nothing in common"
+            assert re.search(told, message), message
+
+
+@pytest.mark.parametrize("name", CALLS)
+@FEW
+@given(st.data())
+def test_any_argument_gives_a_result_or_a_named_error(name: str, data: st.DataObject) -> None:
+    function, good = CALLS[name]
+    most = data.draw(st.sampled_from([1, 1, 2, 8]), label="wrong arguments")
+    wrong = data.draw(st.lists(st.sampled_from(sorted(good)), min_size=1, max_size=most, unique=True), label="which")
+    arguments = {**good, **{k: data.draw(ANYTHING, label=k) for k in wrong}}
+    if name == "trace_table" and "lens" not in wrong:
+        arguments["lens"] = LENS
+    honest(lambda: function(**arguments))
