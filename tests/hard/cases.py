@@ -33,6 +33,7 @@ class Case:
     truth: str
     measure: Measure
     limit: dict[torch.dtype, float] = dataclasses.field(default_factory=lambda: LIMIT)
+    onnx_limit: float = 1e-5
 
 
 CASES: list[Case] = []
