@@ -197,8 +197,8 @@ def write_image(
         done = output.write_image(array)
         done = output.close() and done
         problem = output.geterror()  # a full disk shows only here
-        if not done or problem:
-            raise OSError(f"{path}: could not be written ({first_line(problem)})")
+        if not done or problem or not _is_whole(part):
+            raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
 
 
 def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
@@ -268,6 +268,17 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(part, target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file that was written can be read: what fails in the last flush of its buffer is reported by nobody."""
+    try:
+        read_parts(path)
+    except (OSError, ValueError):
+        return False
+    with path.open("rb") as file:  # a PNG is read without its last bytes as well
+        file.seek(-8, os.SEEK_END)
+        return path.suffix.lower() != ".png" or file.read() == b"IEND\xaeB`\x82"
 
 
 def _reserve(path: Path, size: int) -> None:

@@ -6,7 +6,9 @@ OpenImageIO is imported when a file is read, so that ``import torchdof`` stays l
 import dataclasses
 import os
 import struct
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +22,9 @@ __all__ = ["Part", "Sample", "existing", "first_line", "read_array", "read_parts
 Sample = Literal["8", "16", "half", "float"]
 
 MAX_PIXELS = 2**28
+# what numpy and zipfile raise on bytes that are no array
+_BROKEN = (ValueError, OSError, EOFError, KeyError, TypeError, MemoryError, OverflowError, RuntimeError, SyntaxError)
+_BROKEN += (zipfile.BadZipFile, struct.error, zlib.error, tokenize.TokenError)
 _SAMPLES: dict[str, Sample] = {"uint8": "8", "uint16": "16", "half": "half"}
 
 
@@ -78,10 +83,15 @@ def read_parts(path: Path) -> list[Part]:
         OSError: If the file is damaged, cut short or not an image.
         ValueError: If it is too large, or holds deep samples.
     """
+    try:
+        return [_read_pfm(path)] if path.suffix.lower() == ".pfm" else _read_every_part(path)
+    except UnicodeDecodeError:
+        raise OSError(f"{path}: is damaged (a name in its header is no text)") from None
+
+
+def _read_every_part(path: Path) -> list[Part]:
     import OpenImageIO as oiio
 
-    if path.suffix.lower() == ".pfm":
-        return [_read_pfm(path)]
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
@@ -173,7 +183,7 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
                 array = arrays[key or arrays.files[0]]
         else:
             array = np.load(path, allow_pickle=False, mmap_mode="r")
-    except (ValueError, OSError, EOFError, KeyError, MemoryError, zipfile.BadZipFile, struct.error) as error:
+    except _BROKEN as error:
         raise ValueError(f"{path}: cannot be read as an array ({first_line(str(error))})") from None
     shape = array.shape
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):

@@ -248,6 +248,8 @@ class BlurTable:
         try:
             with os.fdopen(handle, "w", encoding="utf-8") as file:
                 file.write(text)
+                file.flush()
+                os.fsync(file.fileno())  # a full disk shows here at the latest
             os.chmod(part, 0o644)
             os.replace(part, path)
         except BaseException:
