@@ -9,7 +9,17 @@ from torch import Tensor
 from .arguments import real_tensor, show
 from .table import BlurTable
 
-__all__ = ["Border", "Method", "Options", "image_and_coc", "image_and_depth", "image_and_map"]
+__all__ = [
+    "Border",
+    "Method",
+    "Options",
+    "background",
+    "both_or_none",
+    "image_and_coc",
+    "image_and_depth",
+    "image_and_map",
+    "stack",
+]
 
 Method = Literal["layered", "fold"]
 Border = Literal["normalize", "extend"]
@@ -87,6 +97,77 @@ def image_and_coc(image: Tensor, coc_px: Tensor, table: BlurTable, values: bool)
                     f"{name} must be finite, got {bad} of {tensor.numel()} values that are NaN or infinite; "
                     "mend them, or pass check=False"
                 )
+
+
+def both_or_none(background: Tensor | None, where: Tensor | None) -> None:
+    """Refuse a background without its place, or a place without its background.
+
+    Raises:
+        ValueError: Saying which is missing.
+    """
+    if background is None or where is None:
+        missing = "background" if background is None else "background_depth (or background_coc_px)"
+        raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
+
+
+def background(
+    image: Tensor, behind: Tensor | None, coc_px: Tensor | None, table: BlurTable, options: Options
+) -> tuple[Tensor, Tensor]:
+    """Refuse a background that does not belong to an image; returns it and its circle of confusion.
+
+    Raises:
+        ValueError: If one of both is missing, shapes or types are wrong, or nothing hides anything.
+    """
+    both_or_none(behind, coc_px)
+    if not options.occlusion:
+        raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
+    if (
+        not isinstance(behind, Tensor)
+        or not isinstance(coc_px, Tensor)
+        or behind.shape != image.shape
+        or behind.dtype != image.dtype
+    ):
+        got = f"{behind.dtype} {list(behind.shape)}" if isinstance(behind, Tensor) else type(behind).__name__
+        raise ValueError(f"background must be as the image is, {image.dtype} {list(image.shape)}, got {got}")
+    image_and_coc(behind, coc_px, table, values=options.check)
+    return behind, coc_px
+
+
+def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
+    """Refuse a stack of layers and depths that do not belong together.
+
+    Returns:
+        The depths as ``[B, N, 1, H, W]``, each axis but N of its size or 1.
+
+    Raises:
+        ValueError: If shapes or types are wrong, or, with ``values``, a coverage is outside [0, 1].
+    """
+    for name, value in (("rgba", rgba), ("depth_m", depth_m)):
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"{name} must be a floating-point tensor, got {got}")
+    if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
+        raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
+    batch, count, _, height, width = rgba.shape
+    depth = depth_m
+    if depth.ndim in (1, 2) and depth.shape[-1] == count:
+        depth = depth.reshape(-1, count, 1, 1, 1)
+    if depth.ndim != 5 or depth.shape[0] not in (1, batch) or depth.shape[1:3] != (count, 1):
+        raise ValueError(
+            f"depth_m must be [{count}], [{batch}, {count}] or [B, {count}, 1, H, W], got {[*depth_m.shape]}"
+        )
+    if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
+        raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
+    if values and not _traced():
+        real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
+        real_tensor("depth_m", depth_m, "in metres")
+        cover = rgba[:, :, -1]
+        bad = int((~((cover >= 0) & (cover <= 1))).sum())
+        if bad:
+            raise ValueError(
+                f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
+            )
+    return depth
 
 
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:

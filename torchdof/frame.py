@@ -43,9 +43,16 @@ class Window:
 
     samples: Sequence[Sample]
     known: Tensor | None
+    independent: bool = False
 
     def terms(self, nodes: Sequence[float], k: int, with_room: bool) -> list[Tensor]:
         """What layer k scatters: light, share, and with ``with_room`` the share at or behind it and the seen share."""
+        light, share, room = self._independent(nodes, k) if self.independent else self._shared(nodes, k)
+        if not with_room:
+            return [light, share if self.known is None else share * self.known]
+        return [light, share, room] if self.known is None else [light, share, room, share * self.known]
+
+    def _shared(self, nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
         light = share = room = None
         for sample in self.samples:
             here = share_at_or_behind(sample.x, nodes, k)
@@ -56,9 +63,23 @@ class Window:
             share, room = (mine, here) if share is None or room is None else (share + mine, room + here)
         if light is None or share is None or room is None:
             raise ValueError("a window needs at least one sample")
-        if not with_room:
-            return [light, share if self.known is None else share * self.known]
-        return [light, share, room] if self.known is None else [light, share, room, share * self.known]
+        return light, share, room
+
+    def _independent(self, nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
+        """A pixel is there for layer k as far as what is at or behind it is known, but for what that has in front."""
+        room = torch.ones_like(self.samples[0].x)
+        left, unknown, stopped = room, room, []
+        for sample in self.samples:  # near to far
+            here = share_at_or_behind(sample.x, nodes, k)
+            mine = here - share_at_or_behind(sample.x, nodes, k + 1)
+            cover = room.new_ones(()) if sample.weight is None else sample.weight
+            there = torch.where(here > 0, 1.0 - cover * (1.0 - here), 1.0)
+            stops = cover * mine / there.clamp_min(1e-6)  # of what arrives at it in this layer
+            stopped.append(left * stops)
+            left, room = left * (1.0 - stops), room * there
+            unknown = torch.where(here > 0, unknown * (1.0 - cover), unknown)
+        light = torch.stack([s.light * (room * part) for s, part in zip(self.samples, stopped, strict=True)]).sum(0)
+        return light, room * torch.stack(stopped).sum(0), room * (1.0 - unknown)
 
 
 class Frame:
@@ -70,9 +91,20 @@ class Frame:
         align: The frame is continued to a multiple of this.
         tiled: Cut the frame (of one item) into tiles; False keeps it as one window.
         extend: Continue light over the border as well, as if it were known.
+        independent: The samples of a pixel, near to far, each cover it by their weight, whatever the others do. False:
+            their weights are shares of the pixel.
     """
 
-    def __init__(self, samples: Sequence[Sample], margin: int, align: int, tiled: bool, extend: bool) -> None:
+    def __init__(
+        self,
+        samples: Sequence[Sample],
+        margin: int,
+        align: int,
+        tiled: bool,
+        extend: bool,
+        independent: bool = False,
+    ) -> None:
+        self.independent = independent
         self.size: tuple[int, ...] = tuple(samples[0].light.shape[-2:])
         self.margin, self.tiled = margin, tiled
         align = max(align, TILE) if tiled else align
@@ -95,6 +127,7 @@ class Frame:
         frame = cls.__new__(cls)
         frame.size = frame.area = (side, side)
         frame.samples, frame.known, frame.margin, frame.tiled = list(samples), known, margin, False
+        frame.independent = False
         return frame
 
     def canvas(self, kernels: int = 1) -> tuple[Tensor, Tensor]:
@@ -166,7 +199,7 @@ class Frame:
             weight = None if s.weight is None else self._cut(s.weight, halo, places)
             samples.append(Sample(self._cut(s.light, halo, places), self._cut(s.x, halo, places), weight))
         seen = self._cut(self.known, halo, places) if known and self.known is not None else None
-        return Window(samples, seen)
+        return Window(samples, seen, self.independent)
 
     def _cut(self, values: Tensor, halo: int, places: Tensor | None) -> Tensor:
         start = self.margin - halo

@@ -1,19 +1,15 @@
 """Depth of field as a module and as functions: the chain of the other rooms and nothing else."""
 
-import math
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from . import background, composite, highlights, layers
 from . import check as checks
+from . import pipeline
 from .camera import Camera
 from .check import Border, Method, Options
-from .frame import Frame, Sample
-from .loop import side, tile_by_tile
-from .plan import Blur, Plan
-from .spread import layers_by_conv, layers_by_fold
+from .plan import Plan
 from .table import BlurTable
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
@@ -78,6 +74,8 @@ class DepthOfField(nn.Module):
         focus_m: float | Tensor | None = None,
         f_number: float | Tensor | None = None,
         plan: Plan | None = None,
+        background: Tensor | None = None,
+        background_depth: Tensor | None = None,
     ) -> Tensor:
         """Render.
 
@@ -87,6 +85,10 @@ class DepthOfField(nn.Module):
             focus_m: Focus distance in metres for this call, float or ``[B]``; None takes the camera's.
             f_number: F-number for this call, float or ``[B]``; None takes the camera's.
             plan: Layers to render with, from :meth:`plan`; None plans for this image.
+            background: What is seen where the nearer surfaces of the image are taken away, ``[B, C, H, W]``, where it
+                is known; it takes the place of the guess that fills what a blurred foreground uncovers.
+            background_depth: Its depth in metres, ``[B, 1, H, W]`` or ``[1, 1, H, W]``; nowhere nearer than the image's
+                own, or it counts as that.
 
         Returns:
             ``[B, C, H, W]`` in the image's dtype. Differentiable with respect to image, depth, focus and f-number.
@@ -96,7 +98,50 @@ class DepthOfField(nn.Module):
         Raises:
             ValueError: If shapes, types or values are not as described.
         """
-        return blur_by_coc(image, self.coc_px(image, depth, focus_m, f_number), plan=plan, **self._options())
+        coc = self.coc_px(image, depth, focus_m, f_number)
+        behind = None
+        if background is not None or background_depth is not None:
+            checks.both_or_none(background, background_depth)
+            behind = self.coc_px(background, background_depth, focus_m, f_number)
+        given = {"background": background, "background_coc_px": behind}
+        return blur_by_coc(image, coc, plan=plan, **given, **self._options())
+
+    def layers(
+        self,
+        rgba: Tensor,
+        depth_m: Tensor,
+        focus_m: float | Tensor | None = None,
+        f_number: float | Tensor | None = None,
+    ) -> Tensor:
+        """Render a stack of layers, such as a multi-plane image, in which nothing is hidden.
+
+        Args:
+            rgba: ``[B, N, C + 1, H, W]``: light premultiplied with coverage, then coverage in [0, 1], of N layers in
+                any order. Where nothing covers a pixel the picture stays transparent.
+            depth_m: Their depths in metres, ``[N]``, ``[B, N]`` or a map ``[B, N, 1, H, W]``, > 0, ``inf`` allowed.
+            focus_m: As in :meth:`forward`.
+            f_number: As in :meth:`forward`.
+
+        Returns:
+            ``[B, C + 1, H, W]``: premultiplied light and coverage. Differentiable as :meth:`forward` is.
+
+        Raises:
+            ValueError: If shapes, types or values are not as described, or ``occlusion=False``.
+
+        Example:
+            >>> dof = DepthOfField(Camera(focus_m=1.0))
+            >>> rgba = torch.rand(1, 2, 4, 8, 12)
+            >>> dof.layers(rgba, torch.tensor([1.0, 4.0])).shape
+            torch.Size([1, 4, 8, 12])
+        """
+        depth = checks.stack(rgba, depth_m, self.check)
+        batch, count, _, height, width = rgba.shape
+        maps = depth.expand(batch, -1, 1, height, width).transpose(1, 2).flatten(2, 3)  # [B, 1, N * H, W]
+        options = Options(**self._options())
+        if not options.occlusion:
+            raise ValueError("layers hide each other: they need occlusion=True")
+        coc = self.coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number)
+        return pipeline.blur_stack(rgba, coc.unflatten(2, (count, height)).transpose(1, 2), options)
 
     def coc_px(
         self,
@@ -197,6 +242,8 @@ def blur_by_coc(
     max_coc_px: float = 64.0,
     check: bool = True,
     plan: Plan | None = None,
+    background: Tensor | None = None,
+    background_coc_px: Tensor | None = None,
 ) -> Tensor:
     """Depth of field for pipelines that hold a map of the circle of confusion already.
 
@@ -212,6 +259,8 @@ def blur_by_coc(
         max_coc_px: As in :class:`DepthOfField`.
         check: As in :class:`DepthOfField`; a bad coc is NaN.
         plan: Layers to render with; None plans for this image.
+        background: As in :meth:`DepthOfField.forward`.
+        background_coc_px: Its signed radius in pixels.
 
     Returns:
         ``[B, C, H, W]`` in the image's dtype.
@@ -227,76 +276,11 @@ def blur_by_coc(
     table = BlurTable.disc() if table is None else table
     options = Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)
     checks.image_and_coc(image, coc_px, table, values=check)
+    behind = None
+    if background is not None or background_coc_px is not None:
+        background, background_coc_px = checks.background(image, background, background_coc_px, table, options)
+        behind = (background, background_coc_px)
     if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
         with torch.autocast(image.device.type, enabled=False):
-            return _blur(image, coc_px, plan, options)
-    return _blur(image, coc_px, plan, options)
-
-
-def _blur(image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options) -> Tensor:
-    wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
-    light, coc = image.to(wide), coc_px.to(wide).expand(image.shape[0], -1, -1, -1)
-    if plan is None and _traced():
-        plan = Plan.all(options.max_coc_px, options.tolerance)
-    elif plan is None and torch.is_grad_enabled() and coc_px.requires_grad:
-        plan = Plan.still(coc, options.tolerance)
-    if plan is not None:
-        return _render(light, coc, plan, options).to(image.dtype)
-    # each item has its own layers, as it would have alone
-    pairs = zip(light.split(1), coc.split(1), strict=True)
-    items = [_render(one, its_coc, Plan.of_scene(its_coc, options.tolerance), options) for one, its_coc in pairs]
-    return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
-
-
-def _render(light: Tensor, coc: Tensor, plan: Plan, options: Options) -> Tensor:
-    if plan.nodes == (0.0,):
-        # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
-        return light + 0.0 * torch.nan_to_num(coc) if torch.is_grad_enabled() and coc.requires_grad else light.clone()
-    image, valid = light, None
-    if not options.check:
-        valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
-        coc, light = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0)
-    coc = coc.clamp(plan.coc_px[0], plan.coc_px[-1])  # beyond, blurs are alike; differences of huge ones would cancel
-    weight = None if valid is None else valid.to(light.dtype)
-    layered = options.method == "layered"
-    blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
-    surfaces = [(light, coc, weight)]
-    if options.occlusion and len(plan.nodes) > 1:
-        levels = math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1
-        own, seen, other, other_coc, share = background.surfaces(light, coc, weight, min(levels, 7))
-        surfaces = [(own, coc, seen), (other, other_coc, share)]
-    rays = []
-    if options.occlusion and plan.rays and len(plan.nodes) > 1:
-        limit = highlights.ordinary(light, valid)
-        for i, (colour, c, w) in enumerate(surfaces):
-            left, some = highlights.take(colour, c, w, limit, coc, plan.crisp_px if layered else math.inf)
-            surfaces[i] = (left, c, w)
-            rays += [] if some is None else [some]
-    first, last = plan.nodes[0], plan.nodes[-1]
-    samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
-    moves = torch.is_grad_enabled() and (light.requires_grad or coc.requires_grad)
-    exporting = torch.compiler.is_exporting()
-    margin, align = max(blur.halo for blur in blurs), max(blur.scale for blur in blurs)
-    frame = Frame(
-        samples,
-        margin=margin,
-        align=side(margin) if exporting else align,
-        tiled=layered and not _traced() and not moves and light.shape[0] == 1,
-        extend=options.border == "extend",
-    )
-
-    def rendered(frame: Frame, blurs: list[Blur]) -> Tensor:
-        if options.occlusion:
-            return composite.over(frame, plan, blurs, layers_by_conv if layered else layers_by_fold)
-        if not layered:
-            return composite.accumulate_once(frame, plan, blurs, options.normalize)
-        return composite.accumulate(frame, plan, blurs, layers_by_conv, options.normalize)
-
-    out = tile_by_tile(frame, blurs, rendered) if exporting else rendered(frame, blurs)
-    if rays:
-        out = out + highlights.trace(rays, coc, options.table, light.shape[1])
-    return out if valid is None else torch.where(valid, out, image)
-
-
-def _traced() -> bool:
-    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
+            return pipeline.blur(image, coc_px, plan, options, behind)
+    return pipeline.blur(image, coc_px, plan, options, behind)

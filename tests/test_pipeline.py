@@ -1,0 +1,152 @@
+"""What is hidden, where the caller knows it: a background, or a stack of layers."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof import Camera, DepthOfField, blur_by_coc, metrics
+from torchdof.scenes import Plane, Scene, plane_scene, posts, waves
+
+CAMERA = Camera.from_fov(40.0, 0.09, 3.0)
+DEPTHS = (6.0, 2.0, 1.2)
+
+
+@pytest.fixture(scope="module", params=[1.2, 2.0, 6.0], ids=lambda focus: f"focus at {focus} m")
+def fence(request: pytest.FixtureRequest) -> Scene:
+    """A wall behind two rows of posts; blurs of up to 20 px."""
+    shapes = [None, posts(90, 30), posts(140, 25, -0.2)]
+    planes = [Plane(z, waves(i), shape) for i, (z, shape) in enumerate(zip(DEPTHS, shapes, strict=True))]
+    return plane_scene(planes, CAMERA.replace(focus_m=request.param), (160, 220), samples=256)
+
+
+def psnr(scene: Scene, out: Tensor) -> float:
+    m = scene.margin_px
+    return metrics.psnr(*(metrics.display(t[..., m:-m, m:-m]) for t in (out, scene.truth)))
+
+
+def behind(scene: Scene) -> tuple[Tensor, Tensor]:
+    """What each pixel shows without its nearest surface, and its depth."""
+    far, middle = scene.surfaces[0][0], scene.surfaces[1][0]
+    under_posts = middle[:, :3] + (1.0 - middle[:, 3:]) * far[:, :3]
+    near = scene.depth < 1.5
+    depth = torch.where(near & (middle[:, 3:] > 0.5), DEPTHS[1], DEPTHS[0])
+    return torch.where(near, under_posts, far[:, :3]), depth
+
+
+def test_a_known_background_brings_3_db(fence: Scene) -> None:
+    dof = DepthOfField(fence.camera, tolerance=0)
+    light, depth = behind(fence)
+    alone = psnr(fence, dof(fence.image, fence.depth))
+    told = psnr(fence, dof(fence.image, fence.depth, background=light, background_depth=depth))
+    assert told > alone + 3.0
+
+
+def test_a_stack_that_hides_nothing_renders_the_truth(fence: Scene) -> None:
+    stack = torch.stack([rgba for rgba, _ in fence.surfaces], 1)
+    out = DepthOfField(fence.camera, tolerance=0).layers(stack, torch.tensor(DEPTHS))
+    assert psnr(fence, out[:, :3]) > 49.0
+    torch.testing.assert_close(out[:, 3:], torch.ones_like(out[:, 3:]))
+
+
+def test_the_order_of_a_stack_and_the_form_of_its_depths_do_not_matter(fence: Scene) -> None:
+    dof = DepthOfField(fence.camera)
+    stack, depth = torch.stack([rgba for rgba, _ in fence.surfaces], 1), torch.tensor(DEPTHS)
+    expected = dof.layers(stack, depth)
+    torch.testing.assert_close(dof.layers(stack.flip(1), depth.flip(0)[None]), expected)
+    maps = depth.reshape(1, 3, 1, 1, 1).expand(1, 3, 1, 160, 220)
+    torch.testing.assert_close(dof.layers(stack, maps), expected)
+
+
+def test_an_opaque_layer_alone_is_a_plane_of_that_depth() -> None:
+    image = torch.rand(1, 3, 24, 32, generator=torch.Generator().manual_seed(0))
+    dof = DepthOfField(CAMERA.replace(focus_m=1.0))
+    rgba = torch.cat([image, torch.ones(1, 1, 24, 32)], 1)[:, None]
+    out = dof.layers(rgba, torch.tensor([2.0]))
+    torch.testing.assert_close(out[:, :3], dof(image, torch.full((1, 1, 24, 32), 2.0)))
+    torch.testing.assert_close(out[:, 3], torch.ones(1, 24, 32))
+
+
+def test_what_nothing_covers_stays_transparent_and_what_is_covered_keeps_its_light() -> None:
+    rgba = torch.zeros(1, 1, 4, 61, 61)
+    rgba[..., 24:37, 24:37] = torch.tensor([0.8, 0.4, 0.2, 1.0])[:, None, None]
+    dof = DepthOfField(CAMERA.replace(focus_m=1.0))
+    out = dof.layers(rgba, torch.tensor([2.2]))
+    radius = float(dof.camera.coc_px(torch.full((1, 1, 1, 1), 2.2), 61).abs())
+    assert 3 < radius < 12
+    torch.testing.assert_close(out.sum((-2, -1)), rgba[:, 0].sum((-2, -1)), rtol=1e-4, atol=0)
+    torch.testing.assert_close(out[:, :3], out[:, 3:] * torch.tensor([0.8, 0.4, 0.2])[:, None, None])
+    assert float(out[..., : 24 - math.ceil(radius) - 1, :].abs().max()) == 0.0
+
+
+def test_layers_at_one_depth_cover_each_other_as_over_does() -> None:
+    generator = torch.Generator().manual_seed(1)
+    cover = torch.rand(1, 2, 1, 12, 16, generator=generator)
+    rgba = torch.cat([torch.rand(1, 2, 3, 12, 16, generator=generator) * cover, cover], 2)
+    out = DepthOfField(CAMERA.replace(focus_m=1.0)).layers(rgba, torch.tensor([1.0, 1.0001]))  # both in focus
+    torch.testing.assert_close(out, rgba[:, 0] + (1 - rgba[:, 0, 3:]) * rgba[:, 1])
+
+
+@pytest.mark.parametrize("method", ["layered", "fold"])
+def test_a_background_that_is_nowhere_behind_changes_little(method: str) -> None:
+    generator = torch.Generator().manual_seed(2)
+    image = torch.rand(1, 3, 24, 32, generator=generator)
+    coc = torch.full((1, 1, 24, 32), 3.3)
+    coc[..., 16:] = 3.9  # less than what counts as two surfaces
+    alone = blur_by_coc(image, coc, method=method)  # type: ignore[arg-type]
+    told = blur_by_coc(image, coc, method=method, background=image, background_coc_px=coc)  # type: ignore[arg-type]
+    torch.testing.assert_close(told, alone, rtol=0, atol=1e-5)
+
+
+def test_gradients_reach_background_and_stack() -> None:
+    generator = torch.Generator().manual_seed(3)
+    image, back = (torch.rand(1, 2, 9, 12, generator=generator, dtype=torch.float64) for _ in range(2))
+    coc = torch.full((1, 1, 9, 12), 0.3, dtype=torch.float64)
+    coc[..., 4:8] = -3.2
+    back_coc = torch.full_like(coc, 0.2)
+    back.requires_grad_()
+
+    def picture(light: Tensor) -> Tensor:
+        return blur_by_coc(image, coc, background=light, background_coc_px=back_coc)
+
+    assert torch.autograd.gradcheck(picture, (back,), eps=1e-6, atol=1e-7)
+    slope = torch.autograd.grad(picture(back).sum(), back)[0]
+    assert float(slope[..., 5:7].sum()) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"background": torch.rand(1, 3, 8, 8)}, "depth"),
+        ({"background_depth": torch.ones(1, 1, 8, 8)}, "background"),
+        ({"background": torch.rand(1, 3, 8, 9), "background_depth": torch.ones(1, 1, 8, 9)}, "as the image is"),
+        ({"background": torch.rand(1, 3, 8, 8), "background_depth": -torch.ones(1, 1, 8, 8)}, "depth must be > 0"),
+    ],
+)
+def test_a_background_that_does_not_fit_is_refused(given: dict[str, Tensor], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        DepthOfField(CAMERA)(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), **given)
+
+
+@pytest.mark.parametrize(
+    ("rgba", "depth", "says"),
+    [
+        (torch.rand(1, 4, 8, 8), torch.ones(1), r"rgba must be \[B, N, C \+ 1, H, W\]"),
+        (torch.rand(1, 2, 4, 8, 8), torch.ones(3), r"depth_m must be \[2\]"),
+        (torch.rand(1, 2, 4, 8, 8), torch.ones(1, 2, 1, 8, 9), "8 x 8"),
+        (torch.rand(1, 2, 4, 8, 8), torch.tensor([1.0, -1.0]), "depth must be > 0"),
+        (torch.rand(1, 2, 4, 8, 8) + 1.5, torch.ones(2), "coverage"),
+    ],
+)
+def test_a_stack_that_does_not_fit_is_refused(rgba: Tensor, depth: Tensor, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        DepthOfField(CAMERA).layers(rgba, depth)
+
+
+def test_without_occlusion_nothing_is_hidden() -> None:
+    dof, image, depth = DepthOfField(CAMERA, occlusion=False), torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8)
+    with pytest.raises(ValueError, match="occlusion=True"):
+        dof(image, depth, background=image, background_depth=depth)
+    with pytest.raises(ValueError, match="occlusion=True"):
+        dof.layers(torch.rand(1, 2, 4, 8, 8), torch.ones(2))

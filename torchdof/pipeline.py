@@ -1,0 +1,171 @@
+"""The chain: surfaces of a scene, layers, scatter, composite."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from . import background, composite, highlights, layers
+from .check import Options
+from .frame import Frame, Sample
+from .loop import side, tile_by_tile
+from .plan import Blur, Plan
+from .spread import layers_by_conv, layers_by_fold
+
+__all__ = ["blur", "blur_stack"]
+
+_SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
+
+Surface = tuple[Tensor, Tensor, Tensor | None]
+"""Light ``[B, C, H, W]``, signed coc and weight ``[B, 1, H, W]``; None is 1."""
+
+
+def blur(
+    image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options, behind: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """Depth of field of checked arguments; see :func:`torchdof.blur_by_coc`.
+
+    Args:
+        image: ``[B, C, H, W]``.
+        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``.
+        plan: Layers to render with; None plans for each item.
+        options: Options.
+        behind: Background and its coc, where they are known.
+    """
+    wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
+    maps = [image, coc_px, *(behind or ())]
+    maps = [t.to(wide).expand(image.shape[0], -1, -1, -1) for t in maps]
+    if plan is None and _traced():
+        plan = Plan.all(options.max_coc_px, options.tolerance)
+    elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
+        plan = Plan.still(torch.cat(maps[1::2]), options.tolerance)
+    if plan is not None:
+        return _render(plan, options, *maps).to(image.dtype)
+    # each item has its own layers, as it would have alone
+    items = []
+    for item in zip(*(t.split(1) for t in maps), strict=True):
+        items.append(_render(Plan.of_scene(torch.cat(item[1::2]), options.tolerance), options, *item))
+    return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
+
+
+def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
+    """Depth of field of a stack of layers; see :meth:`torchdof.DepthOfField.layers`.
+
+    Args:
+        rgba: ``[B, N, C + 1, H, W]``, premultiplied.
+        coc_px: ``[B, N, 1, H, W]``.
+        options: Options.
+
+    Returns:
+        ``[B, C + 1, H, W]``, premultiplied.
+    """
+    wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
+    light, coc = rgba.to(wide), coc_px.to(wide)
+    cover = light[:, :, -1:].clamp(0.0, 1.0)
+    valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True)
+    there = valid & (cover > 0)
+    cover, coc = torch.where(there, cover, 0.0), torch.where(there, coc, coc.new_zeros(()))
+    light = torch.where(there, light / cover.clamp_min(1e-12), 0.0)
+    moves = torch.is_grad_enabled() and coc.requires_grad
+    plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), options.tolerance)
+    plan = Plan(plan.nodes, plan.tolerance, rays=False)
+    order = coc.argsort(1)  # near to far
+    light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
+    stack: list[Surface] = [(light[:, i], _within(coc[:, i], plan), cover[:, i]) for i in range(light.shape[1])]
+    # what no layer covers is seen through all of them
+    stack.append((torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], plan.coc_px[-1]), None))
+    return _composite(stack, plan, options, independent=True).to(rgba.dtype)
+
+
+def _render(
+    plan: Plan,
+    options: Options,
+    light: Tensor,
+    coc: Tensor,
+    behind_light: Tensor | None = None,
+    behind_coc: Tensor | None = None,
+) -> Tensor:
+    if plan.nodes == (0.0,):
+        # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
+        return light + 0.0 * torch.nan_to_num(coc) if torch.is_grad_enabled() and coc.requires_grad else light.clone()
+    image, valid = light, None
+    if not options.check:
+        valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
+        coc, light = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0)
+    coc = _within(coc, plan)
+    weight = None if valid is None else valid.to(light.dtype)
+    surfaces: list[Surface] = [(light, coc, weight)]
+    levels = min(math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1, 7)
+    if behind_light is not None and behind_coc is not None:
+        surfaces = _before(light, coc, weight, behind_light, _within(behind_coc, plan), options)
+    elif options.occlusion and len(plan.nodes) > 1:
+        own, seen, other, other_coc, share = background.surfaces(light, coc, weight, levels)
+        surfaces = [(own, coc, seen), (other, other_coc, share)]
+    rays = []
+    if options.occlusion and plan.rays and len(plan.nodes) > 1:
+        limit = highlights.ordinary(light, valid)
+        crisp_px = plan.crisp_px if options.method == "layered" else math.inf
+        for i, (colour, c, w) in enumerate(surfaces):
+            left, some = highlights.take(colour, c, w, limit, coc, crisp_px)
+            surfaces[i] = (left, c, w)
+            rays += [] if some is None else [some]
+    out = _composite(surfaces, plan, options, independent=behind_light is not None)
+    if rays:
+        out = out + highlights.trace(rays, coc, options.table, light.shape[1])
+    return out if valid is None else torch.where(valid, out, image)
+
+
+def _before(
+    light: Tensor, coc: Tensor, weight: Tensor | None, behind: Tensor, behind_coc: Tensor, options: Options
+) -> list[Surface]:
+    """Surfaces of an image in front of a known background, near to far."""
+    own, other, other_coc, share = background.split_mixed(light, coc, weight)
+    # what shows past a nearer surface of a mixed pixel is the background's to tell
+    seen, share = 1.0 - share, torch.where(other_coc < coc, share, 0.0)
+    if weight is not None:
+        seen, share = seen * weight, share * weight
+    apart = (behind_coc - coc - _SAME_PX).clamp(0.0, 1.0)  # else the image itself shows it
+    behind_weight = apart + (1.0 - apart) * share
+    if not options.check:
+        valid = torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
+        behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
+    behind_coc = torch.maximum(behind_coc, coc)
+    return [(other, other_coc, share), (own, coc, seen), (behind, behind_coc, behind_weight)]
+
+
+def _composite(surfaces: Sequence[Surface], plan: Plan, options: Options, independent: bool) -> Tensor:
+    light, coc, _ = surfaces[0]
+    layered = options.method == "layered"
+    blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
+    first, last = plan.nodes[0], plan.nodes[-1]
+    samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
+    moves = torch.is_grad_enabled() and any(t.requires_grad for s in surfaces for t in s[:2])
+    exporting = torch.compiler.is_exporting()
+    margin, align = max(blur.halo for blur in blurs), max(blur.scale for blur in blurs)
+    frame = Frame(
+        samples,
+        margin=margin,
+        align=side(margin) if exporting else align,
+        tiled=layered and not _traced() and not moves and light.shape[0] == 1,
+        extend=options.border == "extend",
+        independent=independent,
+    )
+
+    def rendered(frame: Frame, blurs: list[Blur]) -> Tensor:
+        if options.occlusion:
+            return composite.over(frame, plan, blurs, layers_by_conv if layered else layers_by_fold)
+        if not layered:
+            return composite.accumulate_once(frame, plan, blurs, options.normalize)
+        return composite.accumulate(frame, plan, blurs, layers_by_conv, options.normalize)
+
+    return tile_by_tile(frame, blurs, rendered) if exporting else rendered(frame, blurs)
+
+
+def _within(coc: Tensor, plan: Plan) -> Tensor:
+    """Beyond the plan's reach blurs are alike, and differences of huge ones would cancel."""
+    return coc.clamp(plan.coc_px[0], plan.coc_px[-1])
+
+
+def _traced() -> bool:
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
