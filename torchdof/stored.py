@@ -23,8 +23,8 @@ Sample = Literal["8", "16", "half", "float"]
 
 MAX_PIXELS = 2**28
 # what numpy and zipfile raise on bytes that are no array
-_BROKEN = (ValueError, OSError, EOFError, KeyError, TypeError, MemoryError, OverflowError, RuntimeError, SyntaxError)
-_BROKEN += (zipfile.BadZipFile, struct.error, zlib.error, tokenize.TokenError)
+_BROKEN: tuple[type[Exception], ...] = (ValueError, OSError, EOFError, KeyError, TypeError, MemoryError, OverflowError)
+_BROKEN += (RuntimeError, SyntaxError, zipfile.BadZipFile, struct.error, zlib.error, tokenize.TokenError)
 _SAMPLES: dict[str, Sample] = {"uint8": "8", "uint16": "16", "half": "half"}
 
 

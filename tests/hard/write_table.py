@@ -4,12 +4,17 @@ import argparse
 import importlib.util
 import platform
 import sys
+import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import onnxruntime
 import torch
 
+MARK = "## What the hard cases found"
 TYPES = {"float32": torch.float32, "float16": torch.float16}
 HEAD = """# Hard cases and their measured errors
 
@@ -18,34 +23,39 @@ one, else the same rendering in float64 of the same (rounded) input. The number 
 relative to that pixel. A picture in float16 cannot be nearer than half a unit in its last place: {half:.1e}. Depth and
 circle of confusion are in float32 throughout; only the light is in the type of the column.
 
-Made by `python tests/hard/write_table.py docs/hard_cases.md` with PyTorch {torch} on {machine}, {threads} threads.
-`pytest -m hard` holds every number to its limit.
+The column *onnxruntime* is the exported file ({layers} layers up to 6 px) on the same input in float32, against the
+module with the same layers in float64.
+
+Made by `python tests/hard/write_table.py docs/hard_cases.md` with PyTorch {torch} and onnxruntime {onnxruntime} on
+{machine}, {threads} threads. `pytest -m hard` holds every number to its limit (float32, float16, onnxruntime).
 """
 
 
-def load_cases() -> ModuleType:
-    """The cases beside this file."""
-    spec = importlib.util.spec_from_file_location("torchdof_hard_cases", Path(__file__).with_name("cases.py"))
+def beside(name: str) -> ModuleType:
+    """A module beside this file."""
+    spec = importlib.util.spec_from_file_location(f"torchdof_hard_{name}", Path(__file__).with_name(f"{name}.py"))
     if spec is None or spec.loader is None:
-        raise ImportError("cases.py must lie beside this file")
+        raise ImportError(f"{name}.py must lie beside this file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
 
-def table(cases: ModuleType) -> str:
+def table(cases: ModuleType, through_onnx: Callable[[Any], float]) -> str:
     """All measurements as Markdown, one section a group of cases."""
     lines, group = [], ""
     for number, case in enumerate(cases.CASES, 1):
         if case.group != group:
             group = case.group
-            lines += ["", f"## {group.capitalize()}", "", f"| case | truth | {' | '.join(TYPES)} | limits |"]
-            lines.append("| --- | --- |" + " ---: |" * len(TYPES) + " ---: |")
+            columns = [*TYPES, "onnxruntime"]
+            lines += ["", f"## {group.capitalize()}", "", f"| case | truth | {' | '.join(columns)} | limits |"]
+            lines.append("| --- | --- |" + " ---: |" * (len(columns) + 1))
         start = time.perf_counter()
-        errors = [case.measure(dtype) for dtype in TYPES.values()]
+        errors = [*(case.measure(dtype) for dtype in TYPES.values()), through_onnx(case)]
         shown = " | ".join(f"{error:.1e}" if error else "0" for error in errors)
-        limits = ", ".join(f"{case.limit[dtype]:.0e}" if case.limit[dtype] else "0" for dtype in TYPES.values())
+        bounds = [*(case.limit[dtype] for dtype in TYPES.values()), case.onnx_limit]
+        limits = ", ".join(f"{bound:.0e}" if bound else "0" for bound in bounds)
         lines.append(f"| {case.name} | {case.truth} | {shown} | {limits} |")
         seconds = time.perf_counter() - start
         print(f"{number}/{len(cases.CASES)} {case.group}: {case.name}: {shown} ({seconds:.1f} s)", file=sys.stderr)
@@ -53,14 +63,24 @@ def table(cases: ModuleType) -> str:
 
 
 def main() -> None:
-    """Writes the file named on the command line."""
+    """Writes the file named on the command line; what stands below its mark is kept."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     out = parser.parse_args().out
+    cases, exported = beside("cases"), beside("exported")
+    with tempfile.TemporaryDirectory() as folder:
+        file = exported.Exported(Path(folder), cases.CAMERA)
+    rows = table(cases, lambda case: exported.measure(file, cases, case))
     head = HEAD.format(
-        half=2**-11, torch=torch.__version__, machine=platform.machine(), threads=torch.get_num_threads()
+        half=2**-11,
+        layers=len(file.portable.plan.nodes),
+        torch=torch.__version__,
+        onnxruntime=onnxruntime.__version__,
+        machine=platform.machine(),
+        threads=torch.get_num_threads(),
     )
-    out.write_text(head + table(load_cases()), encoding="utf-8")
+    kept = out.read_text(encoding="utf-8").partition(MARK)[2] if out.exists() else ""
+    out.write_text(head + rows + (f"\n{MARK}{kept}" if kept else ""), encoding="utf-8")
 
 
 if __name__ == "__main__":
