@@ -116,11 +116,13 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     raw = torch.where(is_near, 1.0 - fitted, fitted)
     own_spread = torch.where(is_near, front_spread, behind_spread)
     # what lies behind is seen sharp where it is nearer to focus, and so is every error of its split
-    doubt = torch.where(far.abs() < near.abs(), (_DOUBT * own_spread / strength.clamp_min(1e-12)).sqrt(), 0.0)
+    doubt = torch.where(
+        far.abs() < near.abs(), (_DOUBT * own_spread / strength.clamp_min(1e-12)).clamp_min(1e-12).sqrt(), 0.0
+    )
     sure = raw - doubt
     sure = sure * (2.0 * sure / _LEAST_SHARE - 1.0).clamp(0.0, 1.0)
     # the light of a highlight counts even where its share is small
-    moved = raw * (strength / (colour**2).sum(0).clamp_min(1e-18)).sqrt()
+    moved = raw * (strength / (colour**2).sum(0).clamp_min(1e-18)).clamp_min(1e-12).sqrt()
     sure = torch.lerp(sure, raw, (4.0 * moved - 1.0).clamp(0.0, 1.0))
     other = sure.clamp(0.0, 0.5) * trust * _pick(edge, at)[0]
     own_pure, other_pure = torch.where(is_near, front, behind), torch.where(is_near, behind, front)
@@ -170,9 +172,9 @@ def fill_hidden(
     depth = torch.where(mixed, other_coc_px, coc_px)
     colour = torch.where(mixed, other_light, light)
     # a highlight is in one place: what is hidden beside it is no highlight
-    colour = colour * (highlights.ordinary(colour, valid) / colour.amax(1, keepdim=True).clamp_min(1e-30)).clamp(
-        max=1.0
-    )
+    most, brightest = highlights.ordinary(colour, valid), colour.amax(1, keepdim=True)
+    bright = brightest > most
+    colour = torch.where(bright, colour * (most / torch.where(bright, brightest, 1.0)), colour)
     weight = torch.where(mixed, share, 1.0 - share)
     if valid is not None:
         depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid

@@ -105,20 +105,25 @@ def both_or_none(background: Tensor | None, where: Tensor | None) -> None:
     Raises:
         ValueError: Saying which is missing.
     """
-    if background is None or where is None:
+    if (background is None) != (where is None):
         missing = "background" if background is None else "background_depth (or background_coc_px)"
         raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
 
 
 def background(
     image: Tensor, behind: Tensor | None, coc_px: Tensor | None, table: BlurTable, options: Options
-) -> tuple[Tensor, Tensor]:
-    """Refuse a background that does not belong to an image; returns it and its circle of confusion.
+) -> tuple[Tensor, Tensor] | None:
+    """Refuse a background that does not belong to an image.
+
+    Returns:
+        It and its circle of confusion; None if there is none.
 
     Raises:
         ValueError: If one of both is missing, shapes or types are wrong, or nothing hides anything.
     """
     both_or_none(behind, coc_px)
+    if behind is None or coc_px is None:
+        return None
     if not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
     if (

@@ -18,7 +18,7 @@ __all__ = ["Frame", "Sample", "Window"]
 
 TILE = 64
 _CELL = 16  # occupancy is known in cells of this many pixels
-_AT_ONCE = 96  # tiles computed together
+_AT_ONCE = 24  # tiles computed together: what fits the cache
 _CHANNELS = 16  # channels that are spread together
 
 

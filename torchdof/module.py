@@ -100,11 +100,10 @@ class DepthOfField(nn.Module):
         """
         coc = self.coc_px(image, depth, focus_m, f_number)
         behind = None
-        if background is not None or background_depth is not None:
-            checks.both_or_none(background, background_depth)
+        if background is not None and background_depth is not None:
             behind = self.coc_px(background, background_depth, focus_m, f_number)
-        given = {"background": background, "background_coc_px": behind}
-        return blur_by_coc(image, coc, plan=plan, **given, **self._options())
+        checks.both_or_none(background, background_depth)  # here it is the depth that is missing
+        return blur_by_coc(image, coc, plan=plan, background=background, background_coc_px=behind, **self._options())
 
     def layers(
         self,
@@ -276,10 +275,7 @@ def blur_by_coc(
     table = BlurTable.disc() if table is None else table
     options = Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)
     checks.image_and_coc(image, coc_px, table, values=check)
-    behind = None
-    if background is not None or background_coc_px is not None:
-        background, background_coc_px = checks.background(image, background, background_coc_px, table, options)
-        behind = (background, background_coc_px)
+    behind = checks.background(image, background, background_coc_px, table, options)
     if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
         with torch.autocast(image.device.type, enabled=False):
             return pipeline.blur(image, coc_px, plan, options, behind)
