@@ -1,25 +1,24 @@
 """The module to a file: traced, translated, slimmed, labelled, verified, and only then moved into place."""
 
 import contextlib
-import itertools
 import logging
 import os
 import tempfile
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import onnx
 import onnx_ir
 import torch
-from onnx_ir.passes import common as passes
 from onnxscript import opset20
 
 from torchdof import DepthOfField
 
 from .graph import INPUTS, OUTPUT, Portable, trace
 from .metadata import label
+from .slimming import slim
 from .verification import Verification, verify
 
 __all__ = ["OPSET", "to_onnx"]
@@ -40,13 +39,16 @@ def to_onnx(
 
     The graph takes ``image [B, C, H, W]`` (linear light), ``depth [B, 1, H, W]`` (metres), ``focus_m [B]`` and
     ``f_number [B]``, or ``image`` and ``coc_px [B, 1, H, W]``, all float32, and gives ``out [B, C, H, W]``. B, H and W
-    are free, from 1 upwards. It has the layers of every radius up to ``dof.max_coc_px``. A pixel whose depth is NaN,
-    zero or negative passes through sharp and touches nothing else.
+    are free, from 1 upwards. A pixel whose depth is NaN, zero or negative passes through sharp and touches nothing
+    else.
+
+    The graph has the layers of every radius up to ``dof.max_coc_px``. It renders tile by tile in an ONNX ``Loop`` and
+    skips, by ``If``, layers that no pixel in or near a tile falls into: a frame in focus takes a fraction of the time
+    of a blurred one (numbers in docs/embedding.md).
 
     Args:
         dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they
-        are
-            inputs.
+            are inputs.
         path: The file. It is written to a temporary file beside it and moved into place after it has been verified.
         inputs: ``"depth"``, or ``"coc_px"`` for pipelines that have the circle of confusion already.
         channels: Channels of the image, C.
@@ -72,11 +74,13 @@ def to_onnx(
         raise ValueError(f"dof must be a torchdof.DepthOfField, got {type(dof).__name__}")
     if isinstance(opset, bool) or not isinstance(opset, int) or opset < OPSET:
         raise ValueError(f"opset must be {OPSET} or newer, got {opset!r}")
+    if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
+        raise ValueError(f"channels must be a whole number from 1 upwards, got {channels!r}")
     path = Path(path)
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
     portable = Portable(dof, inputs, width)
-    model = onnx_ir.to_proto(_slim(_translate(portable, channels, opset)))
+    model = onnx_ir.to_proto(slim(_translate(portable, channels, opset)))
     label(model, dof, portable, channels, opset)
     handle, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".onnx", dir=path.parent)
     os.close(handle)
@@ -116,39 +120,6 @@ def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
 def _remainder(self: Any, other: Any) -> Any:
     """``index % width`` with a width that is known only when the graph runs; torch.onnx takes numbers only."""
     return opset20.Mod(self, opset20.CastLike(other, self))
-
-
-def _slim(model: onnx_ir.Model) -> onnx_ir.Model:
-    """One flat graph without repeated constants, stack traces and names of source files."""
-    for step in (
-        passes.InlinePass(),
-        passes.RemoveUnusedFunctionsPass(),
-        passes.LiftSubgraphInitializersToMainGraphPass(),
-        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
-        passes.DeduplicateInitializersPass(size_limit=2**24),
-        passes.RemoveUnusedNodesPass(),
-        passes.RemoveUnusedOpsetsPass(),
-        passes.ClearMetadataAndDocStringPass(),
-    ):
-        step(model)
-    kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
-    names = (f"v{i}" for i in itertools.count())
-    for graph in (model.graph, *model.graph.subgraphs()):
-        for value in (*graph.inputs, *graph.initializers.values()):
-            _shorten(value, kept, names)
-        for node in graph:
-            node.name = None
-            for value in node.outputs:
-                _shorten(value, kept, names)
-    return model
-
-
-def _shorten(value: onnx_ir.Value, kept: Collection[str | None], names: Iterator[str]) -> None:
-    if value.name in kept:
-        return
-    value.name = next(names)
-    if not value.is_graph_output() and not value.is_initializer():
-        value.shape = None  # names and shapes of what lies between would be most of the file; inference finds shapes
 
 
 @contextlib.contextmanager

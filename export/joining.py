@@ -38,10 +38,8 @@ def chain(
     """Join a depth estimator's ONNX and a file of :func:`to_onnx` into one file: an image in, a photograph out.
 
     The joint graph takes ``image [B, 3, H, W]`` in linear light, ``focus_m [B]`` and ``f_number [B]``, and gives
-    ``out``
-    and the ``depth [B, 1, H, W]`` in metres that was used. The estimator sees the image clipped to [0, 1] and encoded
-    as
-    sRGB, then ``(x - mean) / std``, resized to its own size.
+    ``out`` and the ``depth [B, 1, H, W]`` in metres that was used. The estimator sees the image clipped to [0, 1] and
+    encoded as sRGB, then ``(x - mean) / std``, resized to its own size.
 
     Args:
         depth_model: The estimator, a file or a loaded model: one float32 image ``[B, 3, h, w]`` in, one map
@@ -50,14 +48,12 @@ def chain(
         path: The file to write; it is verified against running the parts in turn and then moved into place.
         estimate: What the estimator gives. ``"metric"``: depth, ``scale`` of it a metre. ``"inverse"``: inverse depth,
             ``1 / z = scale * estimate + shift``, at infinity where that is not positive. ``"relative-inverse"``:
-            inverse
-            depth up to an unknown scale and shift (as MiDaS and Depth Anything do); the graph then has two more inputs,
-            ``near_m [B]`` and ``far_m [B]``, which the nearest and the farthest pixel are put at.
+            inverse depth up to an unknown scale and shift (as MiDaS and Depth Anything do); the graph then has two more
+            inputs, ``near_m [B]`` and ``far_m [B]``, which the nearest and the farthest pixel are put at.
         scale: See ``estimate``.
         shift: See ``estimate``.
         size: ``(h, w)`` that the estimator wants; None takes what its input declares, or the image's own size where
-        that
-            is free.
+            that is free.
         mean: What the estimator wants subtracted from its display-encoded input, per channel.
         std: What it wants it divided by then.
 

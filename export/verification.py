@@ -89,8 +89,8 @@ def verify(path: str | os.PathLike[str], dof: DepthOfField, *, large: bool = Fal
     The file passes ``onnx.checker`` in full and strict shape inference, uses standard operators only and holds its
     weights; its inputs and output have the names, types and free sizes that :func:`to_onnx` promises; and onnxruntime
     renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the
-    largest
-    light within the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced ones.
+    largest light within the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced
+    ones.
 
     Args:
         path: The file.
