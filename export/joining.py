@@ -119,9 +119,7 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
     names = ("encode/", "estimator/", "decode/", "dof/")
-    encode, estimator, decode, dof = (
-        onnx.compose.add_prefix(part, name) for part, name in zip(parts, names, strict=True)
-    )
+    encode, estimator, decode, dof = (_prefixed(part, name) for part, name in zip(parts, names, strict=True))
     taken, given = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"
     joint = onnx.compose.merge_models(encode, estimator, [("encode/encoded", taken)], outputs=[given, "encode/light"])
     joint = onnx.compose.merge_models(joint, decode, [(given, "decode/estimate"), ("encode/light", "decode/light")])
@@ -134,6 +132,16 @@ def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
     joint.producer_name, joint.producer_version = dof.producer_name, dof.producer_version
     joint.graph.name = "estimated_depth_of_field"
     return joint
+
+
+def _prefixed(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
+    """Every name with a prefix; ``onnx.compose.add_prefix`` misses those that a loop's body takes from outside."""
+    copy = onnx_ir.from_proto(onnx.ModelProto.FromString(model.SerializeToString()))  # shares tensors with its source
+    for graph in (copy.graph, *copy.graph.subgraphs()):
+        values = [*graph.inputs, *graph.initializers.values(), *(value for node in graph for value in node.outputs)]
+        for value in {id(value): value for value in values}.values():
+            value.name = f"{prefix}{value.name}"
+    return onnx_ir.to_proto(copy)
 
 
 def _write(joint: onnx.ModelProto, parts: Sequence[onnx.ModelProto], size: tuple[int, int], path: Path) -> None:

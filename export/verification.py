@@ -161,6 +161,9 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
     Raises:
         ValueError: Saying which.
     """
+    whole = onnx.load(path, load_external_data=False)  # a loaded model no longer says where its weights were
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in whole.graph.initializer):
+        raise ValueError(f"{path} keeps weights in another file")
     try:
         onnx.checker.check_model(path, full_check=True)
         onnx.shape_inference.infer_shapes(model, check_type=True, strict_mode=True, data_prop=True)
@@ -169,8 +172,6 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
     domains = sorted({entry.domain for entry in model.opset_import} - {"", "ai.onnx"})
     if domains:
         raise ValueError(f"{path} needs operators of {', '.join(domains)}; only standard ones are portable")
-    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in model.graph.initializer):
-        raise ValueError(f"{path} keeps weights in another file")
 
 
 def _check_origin(facts: dict, dof: DepthOfField) -> None:

@@ -1,46 +1,127 @@
 """One exported file renders what the module renders, at sizes and scenes other than the traced one."""
 
+import math
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-import onnxruntime
+import onnx
 import pytest
 import torch
 
 import torchdof
-from torchdof.export import Verification, to_onnx
-from torchdof.plan import Plan
+from torchdof.export import describe, to_onnx
+from torchdof.export.verification import session
 
-DOF = torchdof.DepthOfField(torchdof.Camera.from_fov(50.0, 0.05, 2.0), tolerance=8 / 255, max_coc_px=4.0, check=False)
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Verification]:
-    path = tmp_path_factory.mktemp("onnx") / "dof.onnx"
-    return path, to_onnx(DOF, path)
+CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
+SIMPLE = {"occlusion": False, "tolerance": 0.2, "max_coc_px": 1.5, "check": False}
 
 
-def test_file_is_small_and_every_case_agrees_to_1e_5(exported: tuple[Path, Verification]) -> None:
-    path, verification = exported
-    assert path.stat().st_size < 1_000_000
-    assert len(verification.cases) > 10
+def test_file_is_small_and_every_case_agrees_to_1e_5(layered: Any) -> None:
+    assert layered.path.stat().st_size < 500_000
+    assert len(layered.verification.cases) >= 14
+    assert 0 < layered.verification.max_error < 1e-5
 
 
-def test_file_renders_another_size_focus_and_aperture(exported: tuple[Path, Verification]) -> None:
+def test_file_renders_another_size_focus_and_aperture(layered: Any) -> None:
     generator = torch.Generator().manual_seed(3)
     image = torch.rand(2, 3, 45, 71, generator=generator)
     coarse = torch.rand(2, 1, 5, 7, generator=generator) * 4 + 1
     depth = torch.nn.functional.interpolate(coarse, (45, 71))
-    focus, f_number = torch.tensor([1.4, 3.0]), torch.tensor([0.5, 0.9])
-    session = onnxruntime.InferenceSession(exported[0], providers=["CPUExecutionProvider"])
-    tensors = {"image": image, "depth": depth, "focus_m": focus, "f_number": f_number}
-    (got,) = session.run(None, {name: tensor.numpy() for name, tensor in tensors.items()})
-    expected = DOF(image, depth, focus, f_number, plan=Plan.all(DOF.max_coc_px, DOF.tolerance)).numpy()
-    assert np.abs(expected - image.numpy()).max() > 0.1
-    np.testing.assert_allclose(got, expected, atol=1e-5, rtol=0)
+    tensors = image, depth, torch.tensor([1.4, 3.0]), torch.tensor([0.5, 0.9])
+    expected = layered.eager(*tensors)
+    assert (expected - image).abs().max() > 0.1
+    torch.testing.assert_close(layered.render(*tensors), expected, atol=1e-5, rtol=0)
 
 
-def test_nothing_is_written_when_the_module_is_not_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("bad", [math.nan, 0.0, -2.0])
+def test_a_bad_depth_passes_sharp_and_touches_nothing_else(plain: Any, bad: float) -> None:
+    image = torch.rand(1, 3, 33, 40)
+    lens = torch.tensor([1.0]), torch.tensor([0.3])
+    depth = torch.full((1, 1, 33, 40), 4.0)
+    depth[..., 10, 11] = bad
+    out = plain.render(image, depth, *lens)
+    assert torch.equal(out[..., 10, 11], image[..., 10, 11])
+    assert (out - image).abs().max() > 0.1
+    other = image.clone()
+    other[..., 10, 11] = 1e4  # whatever light a bad pixel has, no other one sees it
+    again = plain.render(other, depth, *lens)
+    again[..., 10, 11] = out[..., 10, 11]
+    assert torch.equal(again, out)
+
+
+def test_all_in_focus_is_returned_bit_for_bit(layered: Any) -> None:
+    image = torch.rand(1, 3, 50, 40)
+    out = layered.render(image, torch.full((1, 1, 50, 40), 2.0), torch.tensor([2.0]), torch.tensor([0.5]))
+    assert torch.equal(out, image)
+
+
+def test_a_file_may_take_the_circle_of_confusion_and_a_single_channel(tmp_path: Path) -> None:
+    table = torchdof.BlurTable.load("double_gauss_50mm_f2")
+    dof = torchdof.DepthOfField(CAMERA, table, **{**SIMPLE, "max_coc_px": 3.0})
+    with pytest.raises(ValueError, match="state it as width=1920"):
+        to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1)
+    to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1, width=1920, opset=21)
+    facts = describe(tmp_path / "dof.onnx")
+    assert list(facts["inputs"]) == ["image", "coc_px"] and facts["width"] == 1920 and facts["opset"] == 21
+    model = onnx.load(tmp_path / "dof.onnx")
+    assert [entry.version for entry in model.opset_import if not entry.domain] == [21]
+    coc = torch.linspace(-3, 3, 60).expand(1, 1, 20, 60).contiguous()
+    coc[..., 4, 7] = math.nan
+    image = torch.rand(1, 1, 20, 60)
+    runner = session(tmp_path / "dof.onnx")
+    out = torch.from_numpy(runner.run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0])
+    assert torch.equal(out[..., 4, 7], image[..., 4, 7])
+    wide = torch.nn.functional.pad(image, (0, 1860)), torch.nn.functional.pad(coc, (0, 1860))
+    expected = torchdof.blur_by_coc(
+        *wide,
+        table=table,
+        plan=torchdof.plan.Plan.all(3.0, 0.2),
+        **{k: v for k, v in SIMPLE.items() if k != "max_coc_px"},
+    )
+    torch.testing.assert_close(out[..., :40], expected[..., :40], atol=1e-5, rtol=0)
+
+
+def test_the_graph_holds_standard_operators_and_one_loop_that_skips_layers(layered: Any) -> None:
+    model = onnx.load(layered.path)
+    assert {entry.domain for entry in model.opset_import} == {""}
+    (loop,) = [node for node in model.graph.node if node.op_type == "Loop"]
+    body = next(a.g for a in loop.attribute if a.name == "body")
+    assert sum(node.op_type == "If" for node in body.node) >= 5
+    assert not {n.op_type for g in (model.graph, body) for n in g.node} & {"Scan", "CastLike"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inputs": "disparity"}, "inputs must be one of depth, coc_px"),
+        ({"opset": 17}, "opset must be 20 or newer"),
+        ({"opset": 20.5}, "opset must be 20 or newer"),
+        ({"width": 640}, "same kernels at any image width"),
+        ({"channels": 0}, "channels must be a whole number"),
+        ({"channels": "3"}, "channels must be a whole number"),
+    ],
+)
+def test_bad_arguments_are_refused_and_nothing_is_written(change: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        to_onnx(torchdof.DepthOfField(CAMERA, **SIMPLE), tmp_path / "dof.onnx", **change)
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_written_when_the_module_is_not_one_or_the_folder_is_missing(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"dof must be a torchdof\.DepthOfField"):
         to_onnx(torch.nn.Identity(), tmp_path / "dof.onnx")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="there is no folder"):
+        to_onnx(torchdof.DepthOfField(CAMERA), tmp_path / "nowhere" / "dof.onnx")
+    camera = torchdof.Camera(focus_m=torch.tensor([1.0, 2.0]))
+    with pytest.raises(ValueError, match="camera's focus_m must be a float"):
+        to_onnx(torchdof.DepthOfField(camera), tmp_path / "dof.onnx")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "dof.onnx").write_text("older")
+    monkeypatch.setattr("torchdof.export.verification.TOLERANCE", -1.0)
+    with pytest.raises(ValueError, match="differs from the module"):
+        to_onnx(torchdof.DepthOfField(CAMERA, **SIMPLE), tmp_path / "dof.onnx")
+    assert [file.name for file in tmp_path.iterdir()] == ["dof.onnx"]
+    assert (tmp_path / "dof.onnx").read_text() == "older"

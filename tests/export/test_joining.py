@@ -1,0 +1,113 @@
+"""A stand-in depth network and a module in one file render what both do in turn."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx.parser
+import pytest
+
+from torchdof.export import chain, describe
+from torchdof.export.verification import session
+
+NETWORK = """
+<ir_version: 8, opset_import: ["": 17]>
+network (float[N,3,{size}] pixels) => (float[N,{size}] map) {{
+    axes = Constant<value_ints = [1]>()
+    grey = ReduceMean<axes = [1], keepdims = 0>(pixels)
+    gain = Constant<value_float = 0.8>()
+    least = Constant<value_float = 0.3>()
+    scaled = Mul(grey, gain)
+    map = Add(scaled, least)
+}}
+"""
+
+
+def network(size: str = "28,42") -> onnx.ModelProto:
+    """Brighter is larger; at a fixed size that is not the image's, or at any."""
+    return onnx.parser.parse_model(NETWORK.format(size=size))
+
+
+@pytest.mark.parametrize(
+    ("estimate", "size", "more"),
+    [
+        ("metric", "28,42", {"scale": 2.0}),
+        ("inverse", "h,w", {"scale": 0.5, "shift": 0.1}),
+        ("relative-inverse", "28,42", {"mean": (0.5, 0.4, 0.4), "std": (0.2, 0.2, 0.2)}),
+    ],
+)
+def test_every_kind_of_estimate_makes_one_file(
+    plain: Any, estimate: Any, size: str, more: dict[str, Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "both.onnx"
+    chain(network(size), plain.path, path, estimate=estimate, **more)
+    facts = describe(path)
+    assert facts["chain"]["estimate"] == estimate and "metres" in facts["output"]["depth"]
+    image = np.random.default_rng(1).random((2, 3, 60, 50), dtype=np.float32)
+    feed = {"image": image, "focus_m": np.array([1.0, 2.0], np.float32), "f_number": np.array([0.05, 0.1], np.float32)}
+    if estimate == "relative-inverse":
+        feed |= {"near_m": np.array([0.5, 1.0], np.float32), "far_m": np.array([9.0, 20.0], np.float32)}
+    assert set(feed) == set(facts["inputs"])
+    out, depth = session(path).run(["out", "depth"], feed)
+    assert depth.shape == (2, 1, 60, 50) and np.abs(out - image).max() > 0.1
+    if estimate == "relative-inverse":
+        assert 0.5 - 1e-4 <= depth[0].min() < 0.7 and 3.0 < depth[0].max() <= 9.0 + 1e-3
+    feed["depth"] = depth
+    names = ("image", "depth", "focus_m", "f_number")
+    (alone,) = session(plain.path).run(["out"], {name: feed[name] for name in names})
+    np.testing.assert_allclose(out, alone, atol=1e-6)
+    assert [file.name for file in tmp_path.iterdir()] == ["both.onnx"]
+
+
+def test_metric_depth_is_the_estimate_at_the_images_size(plain: Any, tmp_path: Path) -> None:
+    chain(network("h,w"), plain.path, tmp_path / "both.onnx", estimate="metric", scale=2.0)
+    image = np.full((1, 3, 8, 9), 0.5, np.float32)
+    lens = {"focus_m": np.ones(1, np.float32), "f_number": np.ones(1, np.float32)}
+    (depth,) = session(tmp_path / "both.onnx").run(["depth"], {"image": image, **lens})
+    srgb = 1.055 * 0.5 ** (1 / 2.4) - 0.055
+    np.testing.assert_allclose(depth, 2.0 * (0.8 * srgb + 0.3), rtol=1e-5)
+
+
+def test_the_chain_loads_in_kornia(plain: Any, tmp_path: Path) -> None:
+    from kornia.onnx import ONNXSequential
+
+    chain(network(), plain.path, tmp_path / "both.onnx", estimate="metric")
+    feed = {
+        "image": np.random.default_rng(1).random((1, 3, 30, 20), dtype=np.float32),
+        "focus_m": np.ones(1, np.float32),
+        "f_number": np.full(1, 0.1, np.float32),
+    }
+    loaded = ONNXSequential(str(tmp_path / "both.onnx"))
+    got = loaded(*feed.values())
+    expected = session(tmp_path / "both.onnx").run(None, feed)
+    np.testing.assert_allclose(got[0], expected[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"estimate": "disparity"}, "estimate must be"),
+        ({"path": "nowhere/both.onnx"}, "there is no folder"),
+        ({"depth_model": "none.onnx"}, "there is no file"),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_leaves_nothing(
+    plain: Any, change: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = {"depth_model": network(), "path": "both.onnx", "estimate": "metric"} | change
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        chain(arguments.pop("depth_model"), plain.path, arguments.pop("path"), **arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_estimator_with_another_interface_is_refused(plain: Any, tmp_path: Path) -> None:
+    model = network()
+    model.graph.output.append(model.graph.output[0])
+    model.graph.output[1].name = "grey"
+    with pytest.raises(ValueError, match="one input and one output"):
+        chain(model, plain.path, tmp_path / "both.onnx", estimate="metric")
+    with pytest.raises(ValueError, match="not written by torchdof.export"):
+        chain(network(), network(), tmp_path / "both.onnx", estimate="metric")
+    assert not list(tmp_path.iterdir())

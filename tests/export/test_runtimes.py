@@ -1,0 +1,70 @@
+"""The same file gives the same pixels in OpenVINO and in onnxruntime-web (WebAssembly under Node)."""
+
+import base64
+import importlib.metadata
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+NODE_FOLDER = Path(os.environ.get("TORCHDOF_NODE_FOLDER", ROOT / "build" / "node"))
+LIMIT = 1e-4
+
+
+def scene() -> list[torch.Tensor]:
+    """A batch of two with a bad depth, an odd size and blur up to the largest radius."""
+    depth = torch.linspace(1.2, 6.0, 71).expand(2, 1, 45, 71).contiguous()
+    depth = depth + 0.2 * torch.rand(2, 1, 45, 71)
+    depth[:, :, 20:30, 30:40] = 1.3
+    depth[0, 0, 5, 6] = torch.nan
+    return [torch.rand(2, 3, 45, 71), depth, torch.tensor([1.5, 3.0]), torch.tensor([0.15, 0.2])]
+
+
+def compare(exported: Any, tensors: list[torch.Tensor], got: np.ndarray) -> None:
+    expected = exported.eager(*tensors)
+    assert (expected - tensors[0]).abs().max() > 0.2
+    torch.testing.assert_close(torch.from_numpy(np.array(got)), expected, atol=LIMIT, rtol=0)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("openvino") is None, reason="openvino is not installed (pip)")
+def test_openvino_gives_the_same_pixels(layered: Any, record_property: Any) -> None:
+    import openvino  # type: ignore[import-not-found, unused-ignore]
+
+    print("openvino", importlib.metadata.version("openvino"))
+    record_property("openvino", importlib.metadata.version("openvino"))
+    compiled = openvino.Core().compile_model(str(layered.path), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    tensors = scene()
+    names = ("image", "depth", "focus_m", "f_number")
+    result = compiled({name: tensor.numpy() for name, tensor in zip(names, tensors, strict=True)})
+    compare(layered, tensors, result[0])
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
+@pytest.mark.skipif(
+    not (NODE_FOLDER / "node_modules" / "onnxruntime-web").is_dir(),
+    reason="onnxruntime-web is not installed: npm install --prefix build/node onnxruntime-web",
+)
+def test_onnxruntime_web_gives_the_same_pixels(layered: Any, tmp_path: Path, record_property: Any) -> None:
+    tensors = scene()
+    feed = {}
+    for name, tensor in zip(("image", "depth", "focus_m", "f_number"), tensors, strict=True):
+        feed[name] = {"dims": list(tensor.shape), "data": base64.b64encode(tensor.numpy().tobytes()).decode()}
+    (tmp_path / "feed.json").write_text(json.dumps(feed))
+    call = ["node", str(Path(__file__).with_name("web.mjs"))]
+    call += [str(layered.path), str(tmp_path / "feed.json"), str(tmp_path / "out.json")]
+    environment = os.environ | {"TORCHDOF_NODE_FOLDER": str(NODE_FOLDER)}
+    done = subprocess.run(call, capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+    result = json.loads((tmp_path / "out.json").read_text())
+    print("onnxruntime-web", result["version"])
+    record_property("onnxruntime-web", result["version"])
+    pixels = np.frombuffer(base64.b64decode(result["data"]), np.float32).reshape(result["dims"])
+    compare(layered, tensors, pixels)

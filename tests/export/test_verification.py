@@ -1,0 +1,105 @@
+"""A file is refused when it is not whole, not portable, or not of this module."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx.helper
+import onnx.numpy_helper
+import pytest
+
+import torchdof
+from torchdof.export import describe, verify
+
+
+@pytest.fixture
+def model(plain: Any) -> onnx.ModelProto:
+    return onnx.load(plain.path)
+
+
+def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            yield from _tensors(attribute.g)
+
+
+def save(model: onnx.ModelProto, folder: Path) -> Path:
+    onnx.save(model, folder / "other.onnx")
+    return folder / "other.onnx"
+
+
+def test_the_report_is_a_table_with_both_times(plain: Any) -> None:
+    lines = str(plain.verification).splitlines()
+    assert "verified" in lines[0] and "torch ms" in lines[1] and "onnx ms" in lines[1]
+    assert {"one pixel", "highlight of 6.5e4", "bad depths"} <= {row.name for row in plain.verification.cases}
+    assert len(lines) == 2 + len(plain.verification.cases)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tolerance": 0.01}, "made with tolerance="),
+        ({"max_coc_px": 5.0}, "made with max_coc_px="),
+        ({"occlusion": True}, "made with occlusion="),
+        ({"table": torchdof.BlurTable.gaussian()}, "made with the table"),
+        ({"camera": torchdof.Camera()}, "camera has"),
+    ],
+)
+def test_another_module_is_refused(plain: Any, change: dict[str, Any], message: str) -> None:
+    options = {"camera": plain.dof.camera, "table": plain.dof.table, **plain.dof._options(table=False)} | change
+    with pytest.raises(ValueError, match=message):
+        verify(plain.path, torchdof.DepthOfField(**options))
+
+
+def test_a_changed_kernel_is_found(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+    tensors = list(_tensors(model.graph))
+    kinds = onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
+    kernel = max(tensors, key=lambda t: int(np.prod(t.dims)) if t.data_type in kinds else 0)
+    values = onnx.numpy_helper.to_array(kernel).copy()
+    values.flat[values.size // 2] *= 1.01
+    kernel.CopyFrom(onnx.numpy_helper.from_array(values, kernel.name))
+    with pytest.raises(ValueError, match=r"differs from the module by more than 1e-05(.|\n)*DIFFERS"):
+        verify(save(model, tmp_path), plain.dof)
+
+
+def test_weights_in_another_file_are_refused(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+    onnx.save(model, tmp_path / "other.onnx", save_as_external_data=True, location="weights.bin", size_threshold=0)
+    with pytest.raises(ValueError, match="keeps weights in another file"):
+        verify(tmp_path / "other.onnx", plain.dof)
+
+
+def test_operators_of_others_are_refused(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+    model.opset_import.append(onnx.helper.make_opsetid("com.microsoft", 1))
+    with pytest.raises(ValueError, match="needs operators of com.microsoft"):
+        verify(save(model, tmp_path), plain.dof)
+
+
+def test_another_interface_is_refused(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[2].dim_param = "height"
+    with pytest.raises(ValueError, match="the graph must take and give"):
+        verify(save(model, tmp_path), plain.dof)
+
+
+def test_damaged_and_foreign_files_are_named(plain: Any, tmp_path: Path) -> None:
+    (tmp_path / "cut.onnx").write_bytes(plain.path.read_bytes()[:5000])
+    (tmp_path / "text.onnx").write_text("not a graph")
+    for name in ("cut.onnx", "text.onnx"):
+        with pytest.raises(ValueError, match=f"{name} is not an ONNX file"):
+            verify(tmp_path / name, plain.dof)
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        verify(tmp_path / "none.onnx", plain.dof)
+
+
+def test_metadata_tell_what_a_file_is(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+    facts = describe(plain.path)
+    assert model.producer_name == "torchdof" and model.producer_version == facts["version"]
+    assert "metres" in facts["inputs"]["depth"] and "linear light" in facts["output"]["out"]
+    assert facts["camera"]["focal_length_mm"] == plain.dof.camera.focal_length_mm
+    assert facts["table"]["family"] == "disc" and len(facts["table"]["sha256"]) == 64
+    assert facts["options"]["tolerance"] == plain.dof.tolerance and facts["opset"] == 20
+    del model.metadata_props[:]
+    with pytest.raises(ValueError, match="not written by torchdof.export"):
+        describe(save(model, tmp_path))
