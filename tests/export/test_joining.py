@@ -70,7 +70,7 @@ def test_metric_depth_is_the_estimate_at_the_images_size(plain: Any, tmp_path: P
 
 
 def test_the_chain_loads_in_kornia(plain: Any, tmp_path: Path) -> None:
-    from kornia.onnx import ONNXSequential
+    from kornia.onnx import ONNXModule
 
     chain(network(), plain.path, tmp_path / "both.onnx", estimate="metric")
     feed = {
@@ -78,7 +78,7 @@ def test_the_chain_loads_in_kornia(plain: Any, tmp_path: Path) -> None:
         "focus_m": np.ones(1, np.float32),
         "f_number": np.full(1, 0.1, np.float32),
     }
-    loaded = ONNXSequential(str(tmp_path / "both.onnx"))
+    loaded = ONNXModule(str(tmp_path / "both.onnx"))
     got = loaded(*feed.values())
     expected = session(tmp_path / "both.onnx").run(None, feed)
     np.testing.assert_allclose(got[0], expected[0], atol=1e-6)
