@@ -36,7 +36,7 @@ def compare(exported: Any, tensors: list[torch.Tensor], got: np.ndarray) -> None
 
 @pytest.mark.skipif(importlib.util.find_spec("openvino") is None, reason="openvino is not installed (pip)")
 def test_openvino_gives_the_same_pixels(layered: Any, record_property: Any) -> None:
-    import openvino  # type: ignore[import-not-found, unused-ignore]
+    import openvino
 
     print("openvino", importlib.metadata.version("openvino"))
     record_property("openvino", importlib.metadata.version("openvino"))
