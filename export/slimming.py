@@ -11,18 +11,14 @@ __all__ = ["slim"]
 
 def slim(model: onnx_ir.Model) -> onnx_ir.Model:
     """One flat graph without repeated constants, stack traces and names of source files; its loop is a ``Loop``."""
-    for step in (
+    before: tuple[onnx_ir.passes.PassBase, ...] = (
         passes.InlinePass(),
         passes.RemoveUnusedFunctionsPass(),
         passes.LiftSubgraphInitializersToMainGraphPass(),
         passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         passes.DeduplicateInitializersPass(size_limit=2**24),
-    ):
-        step(model)
-    for node in list(model.graph):
-        if node.op_type == "Scan":
-            _loop(model.graph, node)
-    for step in (
+    )
+    after: tuple[onnx_ir.passes.PassBase, ...] = (
         passes.ShapeInferencePass(),
         _Casts(),
         passes.DeduplicateInitializersPass(size_limit=2**24),
@@ -30,7 +26,13 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
         passes.RemoveUnusedNodesPass(),
         passes.RemoveUnusedOpsetsPass(),
         passes.ClearMetadataAndDocStringPass(),
-    ):
+    )
+    for step in before:
+        step(model)
+    for node in list(model.graph):
+        if node.op_type == "Scan":
+            _loop(model.graph, node)
+    for step in after:
         step(model)
     kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
     names = (f"v{i}" for i in itertools.count())
@@ -89,11 +91,11 @@ class _Casts(onnx_ir.passes.InPlacePass):
         number = itertools.count()
         for graph in (model.graph, *model.graph.subgraphs()):
             for node in list(graph):
-                if node.op_type != "CastLike" or node.domain or None in node.inputs:
+                if node.op_type != "CastLike" or node.domain:
                     continue
                 value, like = node.inputs
-                kind = like.dtype
-                if kind is None:
+                kind = None if like is None else like.dtype
+                if value is None or kind is None:
                     continue
                 if value.const_value is not None and value.is_initializer():
                     new = _cast_constant(model.graph, value, kind, next(number))
@@ -113,7 +115,9 @@ def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.Dat
     if value.const_value is None:
         raise ValueError(f"{value.name} is no constant")
     tensor = onnx_ir.tensor(value.const_value.numpy().astype(kind.numpy()), name=f"cast_{number}")
-    constant = onnx_ir.Value(name=tensor.name, shape=tensor.shape, type=onnx_ir.TensorType(kind), const_value=tensor)
+    constant = onnx_ir.Value(
+        name=tensor.name, shape=onnx_ir.Shape(tensor.numpy().shape), type=onnx_ir.TensorType(kind), const_value=tensor
+    )
     graph.register_initializer(constant)
     return constant
 
