@@ -1,13 +1,14 @@
-"""``torchdof bench``: how close to the truth each renderer comes, as a table and as pictures."""
+"""``torchdof bench``: speed against error on a scene; or how close to the truth each renderer comes."""
 
 import contextlib
 import csv
 import dataclasses
+import importlib.util
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 import torch.nn.functional as functional
@@ -17,10 +18,11 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from . import metrics
+from . import metrics, speed
 from .files import Picture, whole_file, write_image
 from .module import DepthOfField
 from .reference import lens_views
+from .render import RenderSettings
 from .scenes import Scene, read_scenes
 from .table import BlurTable
 from .transfer import decode
@@ -29,6 +31,7 @@ __all__ = ["Score", "bench", "ikoma", "measure", "renderers"]
 
 Renderer = Callable[[Scene], Tensor]
 
+_SPEED, _ACCURACY = "Speed", "Accuracy"
 _TILE_PX = 128
 _ERROR_GAIN = 4.0
 _MEASURES = {
@@ -142,29 +145,106 @@ def measure(name: str, image: Tensor, scene: Scene, margin_px: int = 0, known: T
 
 
 def bench(
+    image: Annotated[
+        Path | None,
+        typer.Argument(metavar="[IMAGE]", help="Image to measure the speed on; without one, a scene that is built in."),
+    ] = None,
+    depth: Annotated[
+        Path | None, typer.Argument(metavar="[DEPTH]", help="Its depth; not needed if IMAGE has a Z channel.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, or accuracy.csv, .md, .png.")
+    ] = None,
+    repeat: Annotated[int, typer.Option(help="Timed renderings of each setting.", min=1, rich_help_panel=_SPEED)] = 5,
+    focus_m: Annotated[
+        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=_SPEED)
+    ] = None,
+    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_SPEED)] = None,
+    focal_length_mm: Annotated[float | None, typer.Option(help="Focal length.", rich_help_panel=_SPEED)] = None,
+    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_SPEED)] = None,
+    depth_kind: Annotated[
+        Literal["z", "disparity", "inverse", "coc"],
+        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=_SPEED),
+    ] = "z",
+    depth_scale: Annotated[
+        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_SPEED)
+    ] = None,
+    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_SPEED)] = 0.0,
+    fill_depth: Annotated[
+        Literal["nearest", "far"] | None,
+        typer.Option(help="Fill pixels without depth; else they are refused.", rich_help_panel=_SPEED),
+    ] = None,
     truth: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             "--truth",
             help="Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it.",
+            rich_help_panel=_ACCURACY,
         ),
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for accuracy.csv, accuracy.md and accuracy.png.")],
+    ] = None,
     views: Annotated[
         list[int] | None,
-        typer.Option(help="Points on the lens for the reference renderer; repeat it to see how it converges.", min=1),
+        typer.Option(
+            help="Points on the lens for the reference renderer; repeat it to see how it converges.",
+            min=1,
+            rich_help_panel=_ACCURACY,
+        ),
     ] = None,
     inner: Annotated[
-        bool, typer.Option("--inner", help="Leave out the border that light from outside the frame reaches.")
+        bool,
+        typer.Option(
+            "--inner",
+            help="Leave out the border that light from outside the frame reaches.",
+            rich_help_panel=_ACCURACY,
+        ),
     ] = False,
 ) -> None:
-    """Measure the accuracy of torchdof and of simpler renderers against scenes whose depth of field is known.
+    """Measure speed against error on your own scene, or accuracy where the truth is known.
 
-    The picture shows, for each scene, the place where torchdof is farthest from the truth: sharp, truth, each renderer
-    with its error below it, four times enlarged.
+    Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU:
+
+        torchdof bench photo.png depth.exr --f-number 1.8 --out results
+
+    torchdof and simpler renderers against scenes whose depth of field is known:
+
+        torchdof bench --truth scenes --out results
+
+    The picture of the latter shows, for each scene, the place where torchdof is farthest from the truth: sharp, truth,
+    each renderer with its error below it, four times enlarged.
     """
-    if not out.is_dir():
+    if out is not None and not out.is_dir():
         raise FileNotFoundError(f"{out}: there is no such folder; make it first")
+    if truth is not None:
+        if image is not None:
+            raise ValueError("--truth measures the scenes of its folder; leave IMAGE and DEPTH out")
+        if out is None:
+            raise ValueError("--truth writes tables and pictures; give a folder with --out")
+        _accuracy(truth, out, views, inner)
+        return
+    if views or inner:
+        raise ValueError("--views and --inner compare with a truth; name its folder with --truth")
+    how = RenderSettings(
+        focus=None if focus_m is None else [(0, focus_m)],
+        f_number=f_number,
+        focal_length_mm=focal_length_mm,
+        sensor_width_mm=sensor_width_mm,
+        depth_kind=depth_kind,
+        depth_scale=depth_scale,
+        depth_offset=depth_offset,
+        fill=fill_depth,
+    )
+    if image is None and how != RenderSettings(table=how.table):
+        raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
+    if out is not None and importlib.util.find_spec("matplotlib") is None:  # before the time is spent
+        raise ModuleNotFoundError("no matplotlib", name="matplotlib")
+    subject = speed.shipped() if image is None else speed.from_files(image, depth, how)
+    rows, unit = speed.measure_all(subject, repeat, Console(stderr=True))
+    speed.show(rows, subject, unit)
+    if out is not None:
+        speed.write(out, rows, subject, unit, repeat)
+
+
+def _accuracy(truth: Path, out: Path, views: Sequence[int] | None, inner: bool) -> None:
     console = Console(stderr=True)
     scenes = list(read_scenes(truth))
     compared, counts = renderers(), sorted(set(views or [256]))

@@ -1,0 +1,432 @@
+"""Speed against error: what each tolerance costs on a scene, and how far it stays from the exact rendering."""
+
+import contextlib
+import csv
+import ctypes
+import dataclasses
+import importlib.metadata
+import io
+import math
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import torch
+import torch.nn.functional as functional
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from . import metrics
+from .arguments import whole
+from .camera import Camera
+from .check import Method
+from .depthmap import depth_from_values, resolve_holes
+from .files import read_image, read_values, whole_file
+from .module import blur_by_coc
+from .render import RenderSettings
+from .scenes import posts, waves
+
+__all__ = [
+    "Row",
+    "Setting",
+    "Subject",
+    "exact",
+    "from_files",
+    "measure",
+    "measure_all",
+    "pareto",
+    "settings",
+    "shipped",
+    "show",
+    "unit_s",
+    "write",
+]
+
+_LEVELS = (8.0, 4.0, 2.0, 1.0, 0.5)  # of 255
+_LEAST_PX = 16
+_FOLD_PX = 128  # largest side of the crop that the literal scatter gets
+_FOLD_BYTES = 256 * 2**20  # and the memory of its columns
+_ROUNDING = 1e-6
+_COLUMNS = ("ms", "± ms", "Y", "MP/s", "MiB", "RMS", "dB", "SSIM", "kept")
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What is rendered.
+
+    Args:
+        name: For the report.
+        image: ``[1, C, H, W]``, linear light, without alpha.
+        coc_px: ``[1, 1, H, W]``, signed radius in pixels.
+        remark: Camera and focus, in words.
+    """
+
+    name: str
+    image: Tensor
+    coc_px: Tensor
+    remark: str = ""
+
+    def __post_init__(self) -> None:
+        height, width = self.image.shape[-2:]
+        if self.coc_px.shape[-2:] != (height, width):
+            h, w = self.coc_px.shape[-2:]
+            raise ValueError(f"{self.name}: depth is {w} x {h} pixels but the image is {width} x {height}")
+        if min(height, width) < _LEAST_PX:
+            raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {_LEAST_PX} pixels a side on")
+
+    def crop(self, side: int) -> "Subject":
+        """The square in the middle, at most ``side`` pixels wide."""
+        height, width = self.image.shape[-2:]
+        rows, columns = (slice((n - min(side, n)) // 2, (n + min(side, n)) // 2) for n in (height, width))
+        return dataclasses.replace(self, image=self.image[..., rows, columns], coc_px=self.coc_px[..., rows, columns])
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """One way to render, options as in :class:`torchdof.DepthOfField`; ``side``: largest side, None is the frame."""
+
+    method: Method
+    occlusion: bool
+    tolerance: float
+    side: int | None = None
+
+    @property
+    def name(self) -> str:
+        """For the report, such as ``1/255`` or ``fold 1/255``."""
+        level = f"{self.tolerance * 255:g}/255" if self.tolerance else "exact"
+        return level if self.method == "layered" else f"{self.method} {level}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """What one setting took and reached; NaN is what could not be measured.
+
+    Times are in seconds, for a picture from its circle of confusion; ``units`` is the median over unit Y (see
+    :func:`unit_s`); ``peak_mb`` the growth of the process's resident memory in MiB; errors are display-encoded, against
+    the exact rendering with the same occlusion.
+    """
+
+    setting: Setting
+    width: int
+    height: int
+    median_s: float
+    spread_s: float
+    units: float
+    megapixels_s: float
+    peak_mb: float
+    rms_255: float
+    psnr_db: float
+    ssim: float
+    keeps: bool
+
+
+def settings(subject: Subject) -> list[Setting]:
+    """What is compared on a subject: from coarse to exact with and without occlusion, and the literal scatter.
+
+    That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB.
+    """
+    taps = (2 * math.ceil(float(subject.coc_px.abs().max())) + 3) ** 2
+    bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
+    side = min(_FOLD_PX, max(_LEAST_PX, math.isqrt(_FOLD_BYTES // bytes_a_pixel)))
+    found = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
+    return [*found, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
+
+
+def shipped(height: int = 540, width: int = 960) -> Subject:
+    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m, with a blur radius of up to a 60th of the width.
+
+    Example:
+        >>> shipped(54, 96).image.shape
+        torch.Size([1, 3, 54, 96])
+    """
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, width)), indexing="ij")
+    near = posts(width / 6, width / 40)(x, y)
+    light = torch.where(near, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]
+    depth = torch.where(near, 1.0 / (1.0 + 0.1 * x / width), 1.0 / (0.1 + 0.9 * y / height)).float()[None, None]
+    camera = Camera(50.0, 1.0, focus_m=1.0 / 0.6)  # the blur is as large far away as at the posts
+    camera = camera.replace(f_number=float(camera.coc_px(depth, width).abs().max()) / (width / 60))
+    return Subject("slope with posts", light, camera.coc_px(depth, width), f"{camera!r}")
+
+
+def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:
+    """An image and its depth from files; alpha is left out.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        how: Camera and depth as for ``torchdof render``; without a focus it is at the median depth, so that there is
+            blur on both sides.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read.
+    """
+    picture = read_image(image, how.transfer, how.layer)
+    values = picture.depth if depth is None else read_values(depth, how.depth_channel)
+    if values is None:
+        raise ValueError(f"{image}: has no depth channel; name a depth file after it: torchdof bench IMAGE DEPTH")
+    values = depth_from_values(values, how.depth_kind, scale=how.depth_scale, offset=how.depth_offset)
+    values, _ = resolve_holes(values, str(depth or image), how.fill)
+    light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
+    if how.depth_kind == "coc":
+        return Subject(image.name, light, values, "blur as given")
+    focus = "focus as stated"
+    if how.focus is None:
+        focus, how = "focus at the median depth", dataclasses.replace(how, focus=[(0, float(values.median()))])
+    camera, remarks = how.camera(picture.metadata, light.shape[-1], 0)
+    words = f"{camera!r}; {', '.join([focus, *remarks])}"
+    return Subject(image.name, light, camera.coc_px(values, light.shape[-1]), words)
+
+
+def exact(subject: Subject, occlusion: bool) -> Tensor:
+    """The rendering that errors are measured against: exact kernels, dense layers, full resolution."""
+    return _render(subject, Setting("layered", occlusion, 0.0))
+
+
+def unit_s(repeat: int = 5) -> float:
+    """Unit Y in seconds: one depthwise 17 x 17 convolution of ``[1, 16, 540, 960]`` in ``channels_last``, float32.
+
+    Times in it can be compared between machines.
+    """
+    frame = torch.rand(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
+    weight = torch.rand(16, 1, 17, 17)
+    return statistics.median(_times(lambda: functional.conv2d(frame, weight, padding=8, groups=16), repeat))
+
+
+def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, unit: float) -> Row:
+    """Renders once to see that it is right, then ``repeat`` times for the time.
+
+    Args:
+        subject: What is rendered, already cropped.
+        setting: How.
+        wanted: The exact rendering, ``[1, C, H, W]``.
+        repeat: How often, at least 1.
+        unit: Unit Y in seconds.
+    """
+    start = _reset_peak()
+    out = _render(subject, setting)
+    peak_mb = _peak_mb() - start
+    shown, truth = metrics.display(out), metrics.display(wanted)
+    rms = math.sqrt(float((shown.double() - truth.double()).square().mean()))
+    keeps = bool(torch.isfinite(out).all()) and rms <= setting.tolerance + _ROUNDING
+    times = _times(lambda: _render(subject, setting), repeat)
+    median = statistics.median(times)
+    low, high = torch.tensor(times, dtype=torch.float64).quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
+    height, width = out.shape[-2:]
+    speed = (median, float(high - low), median / unit, width * height / 1e6 / median, peak_mb)
+    error = (255 * rms, metrics.psnr(shown, truth), metrics.ssim(shown, truth))
+    return Row(setting, width, height, *speed, *error, keeps)
+
+
+def measure_all(subject: Subject, repeat: int = 5, console: Console | None = None) -> tuple[list[Row], float]:
+    """Every setting on a subject.
+
+    Args:
+        subject: What is rendered.
+        repeat: How often each.
+        console: Where to show progress; None shows none.
+
+    Returns:
+        A row for each setting, and unit Y in seconds.
+
+    Raises:
+        ValueError: If ``repeat`` is no positive number.
+    """
+    whole("--repeat", repeat, 1, 10000)
+    unit, rows = unit_s(repeat), []
+    references: dict[tuple[int | None, bool], Tensor] = {}
+    silent = console is None or not console.is_terminal
+    for setting in track(settings(subject), "settings", console=console, transient=True, disable=silent):
+        part = subject if setting.side is None else subject.crop(setting.side)
+        key = (setting.side, setting.occlusion)
+        if key not in references:
+            references[key] = exact(part, setting.occlusion)
+        rows.append(measure(part, setting, references[key], repeat, unit))
+    return rows, unit
+
+
+def pareto(rows: Sequence[Row]) -> list[Row]:
+    """Rows that no other row beats in time or error without losing in the other, fastest first.
+
+    Rows with and without occlusion answer different questions, so each is compared with its like; crops are left out.
+    """
+    rows = [row for row in rows if row.setting.side is None]
+
+    def beaten(row: Row, other: Row) -> bool:
+        no_worse = other.median_s <= row.median_s and other.rms_255 <= row.rms_255
+        return no_worse and (other.median_s, other.rms_255) != (row.median_s, row.rms_255)
+
+    front = [
+        row
+        for row in rows
+        if not any(beaten(row, other) for other in rows if row.setting.occlusion == other.setting.occlusion)
+    ]
+    return sorted(front, key=lambda row: row.median_s)
+
+
+def write(folder: Path, rows: Sequence[Row], subject: Subject, unit: float, repeat: int) -> None:
+    """Writes ``speed.csv``, ``speed.md`` and ``speed.png``: all of them or none.
+
+    Raises:
+        OSError: If a file cannot be written.
+        ModuleNotFoundError: If matplotlib is missing.
+    """
+    with contextlib.ExitStack() as files:
+        csv_file, md_file, png_file = (
+            files.enter_context(whole_file(folder / f"speed.{s}")) for s in ("csv", "md", "png")
+        )
+        _plot(png_file, rows, subject)
+        csv_file.write_text(_csv(rows), encoding="utf-8")
+        md_file.write_text(_markdown(rows, subject, unit, repeat), encoding="utf-8")
+
+
+def show(rows: Sequence[Row], subject: Subject, unit: float) -> None:
+    """Prints the table."""
+    console = Console()
+    console.print(f"{_title(subject)}; {subject.remark}", markup=False, highlight=False)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("setting", no_wrap=True)
+    for column in _COLUMNS:
+        table.add_column(column.partition(" ")[0], justify="right", no_wrap=True)
+    for seen in (True, False):
+        table.add_section()
+        table.add_row("with occlusion:" if seen else "without:", style="bold")
+        for row, cells in _lines(rows):
+            if row.setting.occlusion == seen:
+                table.add_row(*cells, style=None if row.keeps else "red")
+    console.print(table)
+    console.print(f"ms: median and spread; 1 Y = {unit * 1e3:.3g} ms; RMS (of 255), dB and SSIM against exact.")
+    console.print(f"* on the Pareto front; kept: RMS within the tolerance. {_crops(rows)}", markup=False)
+
+
+def _render(subject: Subject, setting: Setting) -> Tensor:
+    with torch.inference_mode():
+        return blur_by_coc(
+            subject.image,
+            subject.coc_px,
+            tolerance=setting.tolerance,
+            occlusion=setting.occlusion,
+            method=setting.method,
+        )
+
+
+def _times(work: Callable[[], object], repeat: int) -> list[float]:
+    work()  # warms up
+    times = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return times
+
+
+def _reset_peak() -> float:
+    """Forgets the process's peak memory; returns what it holds now in MiB, NaN where the system does not tell."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)  # else what was freed before would serve unseen
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return math.nan
+    return _peak_mb()
+
+
+def _peak_mb() -> float:
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return math.nan
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:")), math.nan)
+
+
+def _csv(rows: Iterable[Row]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = [field.name for field in dataclasses.fields(Row) if field.name != "setting"]
+    writer.writerow(["setting", "method", "occlusion", "tolerance", "crop", *names])
+    for row in rows:
+        how = row.setting
+        values = [how.name, how.method, how.occlusion, how.tolerance, how.side is not None]
+        values += [getattr(row, name) for name in names]
+        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+    return text.getvalue()
+
+
+def _lines(rows: Sequence[Row]) -> list[tuple[Row, list[str]]]:
+    """Each row with the cells of its line."""
+    front, lines = pareto(rows), []
+    for row in rows:
+        cells = [row.setting.name + " *" * (row in front), f"{1e3 * row.median_s:.1f}", f"{1e3 * row.spread_s:.1f}"]
+        cells += [f"{row.units:.2f}", f"{row.megapixels_s:.2f}", f"{row.peak_mb:.0f}", f"{row.rms_255:.3f}"]
+        lines.append((row, [*cells, f"{row.psnr_db:.1f}", f"{row.ssim:.5f}", "yes" if row.keeps else "NO"]))
+    return lines
+
+
+def _crops(rows: Sequence[Row]) -> str:
+    sizes = {f"{row.width} x {row.height}" for row in rows if row.setting.side is not None}
+    return f"fold holds k * k columns a pixel: on the {' and '.join(sizes)} pixels in the middle." if sizes else ""
+
+
+def _title(subject: Subject) -> str:
+    height, width = subject.image.shape[-2:]
+    low, high = float(subject.coc_px.min()), float(subject.coc_px.max())
+    return f"{subject.name}, {width} x {height}, blur radius {low:.1f} to {high:.1f} px"
+
+
+def _markdown(rows: Sequence[Row], subject: Subject, unit: float, repeat: int) -> str:
+    broken = [row.setting for row in rows if not row.keeps]
+    names = "; ".join(f"{how.name}{'' if how.occlusion else ' without occlusion'}" for how in broken)
+    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {torch.get_num_threads()} threads"
+    versions = f"torchdof {importlib.metadata.version('torchdof')}, torch {torch.__version__}"
+    parts = [
+        "# Speed against error\n",
+        f"{_title(subject)}. {subject.remark}.\n",
+        f"{machine}; {versions}, Python {platform.python_version()}, {platform.system()}.\n",
+        f"Median and spread (interquartile range) of {repeat} renderings after one more. Y is the time of one "
+        f"depthwise 17 x 17 convolution of 1 x 16 x 540 x 960, {1e3 * unit:.3g} ms in this run. MiB is the growth of "
+        "resident memory. RMS (of 255), PSNR and SSIM are display-encoded, against the exact rendering with the same "
+        "occlusion; *kept* says whether RMS is within the stated tolerance, a star that the row is on the Pareto "
+        f"front. {_crops(rows)}\n",
+        f"**The tolerance was not kept by: {names}.**\n" if broken else "Every tolerance was kept.\n",
+    ]
+    for seen in (True, False):
+        lines = [["setting", *_COLUMNS], ["---"] * (len(_COLUMNS) + 1)]
+        lines += [cells for row, cells in _lines(rows) if row.setting.occlusion == seen]
+        title = f"## {'With' if seen else 'Without'} occlusion\n"
+        parts += [title, *("| " + " | ".join(line).replace("*", "\\*") + " |" for line in lines), ""]
+    return "\n".join(parts)
+
+
+def _plot(path: Path, rows: Sequence[Row], subject: Subject) -> None:
+    # no pyplot: it would choose a screen and keep every figure alive
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for occlusion, colour in ((True, "#c2410c"), (False, "#1d4ed8")):
+        # a crop's time compares with nothing here
+        chosen = [row for row in rows if row.setting.occlusion == occlusion and row.setting.side is None]
+        seen = [row for row in chosen if row.rms_255 > 0]  # a logarithm has no zero
+        front = [row for row in pareto(chosen) if row.rms_255 > 0]
+        axes.plot([1e3 * r.median_s for r in front], [r.rms_255 for r in front], color=colour, lw=1)
+        for row in seen:
+            at = (1e3 * row.median_s, row.rms_255)
+            axes.plot(*at, "o", ms=6, color=colour, mfc=colour if row in front else "none")
+            axes.annotate(row.setting.name, at, xytext=(5, 4), textcoords="offset points", fontsize=7, color=colour)
+        for row in (row for row in chosen if row.rms_255 == 0):
+            axes.axvline(1e3 * row.median_s, color=colour, ls=":", lw=1)
+        axes.plot([], [], "o-", color=colour, label="with occlusion" if occlusion else "without")
+    axes.plot([], [], ":", color="grey", label="exact: no error")
+    axes.set(xscale="log", yscale="log", xlabel="median time [ms]", ylabel="RMS error, display-encoded [1/255]")
+    axes.set_title(_title(subject), fontsize=9)
+    axes.grid(True, which="both", lw=0.3)
+    axes.legend(fontsize=8, title="filled: Pareto front", title_fontsize=7)
+    figure.savefig(path)
