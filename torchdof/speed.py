@@ -407,6 +407,7 @@ def _plot(path: Path, rows: Sequence[Row], subject: Subject) -> None:
     # no pyplot: it would choose a screen and keep every figure alive
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
 
     figure = Figure(figsize=(7, 4.5), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
@@ -425,7 +426,12 @@ def _plot(path: Path, rows: Sequence[Row], subject: Subject) -> None:
             axes.axvline(1e3 * row.median_s, color=colour, ls=":", lw=1)
         axes.plot([], [], "o-", color=colour, label="with occlusion" if occlusion else "without")
     axes.plot([], [], ":", color="grey", label="exact: no error")
+    if not any(row.rms_255 > 0 for row in rows if row.setting.side is None):  # all in focus, or one plane
+        axes.set_ylim(1e-3, 1.0)
     axes.set(xscale="log", yscale="log", xlabel="median time [ms]", ylabel="RMS error, display-encoded [1/255]")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(LogFormatter())
+        axis.set_minor_formatter(LogFormatter())
     axes.set_title(_title(subject), fontsize=9)
     axes.grid(True, which="both", lw=0.3)
     axes.legend(fontsize=8, title="filled: Pareto front", title_fontsize=7)
