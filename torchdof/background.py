@@ -124,7 +124,9 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     # the light of a highlight counts even where its share is small
     moved = raw * (strength / (colour**2).sum(0).clamp_min(1e-18)).clamp_min(1e-12).sqrt()
     sure = torch.lerp(sure, raw, (4.0 * moved - 1.0).clamp(0.0, 1.0))
-    other = sure.clamp(0.0, 0.5) * trust * _pick(edge, at)[0]
+    # its depth must be that of one of the two: in between, a steep surface goes on
+    sided = ((here - near) - (far - here)).abs() / gap
+    other = sure.clamp(0.0, 0.5) * trust * (4.0 * sided - 2.0).clamp(0.0, 1.0) * _pick(edge, at)[0]
     own_pure, other_pure = torch.where(is_near, front, behind), torch.where(is_near, behind, front)
     rest = colour - (1.0 - other) * own_pure - other * other_pure
     norm = other**2 + (1.0 - other) ** 2

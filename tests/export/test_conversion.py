@@ -13,7 +13,7 @@ from torchdof.export import describe, to_onnx
 from torchdof.export.verification import session
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
-SIMPLE = {"occlusion": False, "tolerance": 0.2, "max_coc_px": 1.5, "check": False}
+SIMPLE: dict[str, Any] = {"occlusion": False, "tolerance": 0.2, "max_coc_px": 1.5, "check": False}
 
 
 def test_file_is_small_and_every_case_agrees_to_1e_5(layered: Any) -> None:

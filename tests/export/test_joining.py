@@ -96,7 +96,7 @@ def test_what_does_not_fit_is_refused_and_leaves_nothing(
     plain: Any, change: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    arguments = {"depth_model": network(), "path": "both.onnx", "estimate": "metric"} | change
+    arguments: dict[str, Any] = {"depth_model": network(), "path": "both.onnx", "estimate": "metric"} | change
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         chain(arguments.pop("depth_model"), plain.path, arguments.pop("path"), **arguments)
     assert not list(tmp_path.iterdir())
