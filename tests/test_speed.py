@@ -63,7 +63,7 @@ def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed
         )
         assert r.rms_255 == pytest.approx(255 * float((out - wanted).square().mean().sqrt()), abs=1e-5)
         assert r.psnr_db == pytest.approx(metrics.psnr(out, wanted), abs=1e-3)
-        assert (r.rms_255 > 0.005) == (r.setting.tolerance > 0)
+        assert r.rms_255 > 0.1 or r.setting.tolerance < 4 / 255  # so that there is something to compare
 
 
 def test_a_wrong_exact_shows(monkeypatch: pytest.MonkeyPatch) -> None:
