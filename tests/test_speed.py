@@ -95,7 +95,13 @@ def test_a_rendering_that_is_not_finite_breaks_the_promise(monkeypatch: pytest.M
     assert not found.keeps
 
 
-def test_median_and_spread_leave_the_warm_up_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_run_more_warms_up() -> None:
+    calls: list[int] = []
+    assert len(speed._times(lambda: calls.append(1), 3)) == 3
+    assert len(calls) == 4
+
+
+def test_median_and_spread_are_those_of_the_timed_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     subject = speed.shipped(36, 64)
     wanted = speed.exact(subject, True)
     ticks = iter([0.0, 1.0, 10.0, 12.0, 20.0, 23.0, 30.0, 34.0, 40.0, 60.0])
