@@ -69,8 +69,8 @@ def ordinary(light: Tensor, valid: Tensor | None = None) -> Tensor:
     extra = (0, (width + more) // _CELL * _CELL - width, 0, (height + more) // _CELL * _CELL - height)
     padded = functional.pad(brightest, extra, mode="replicate")[..., ::2, ::2]
     cells = functional.pixel_unshuffle(padded, _CELL // 2)
-    level = FACTOR * torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
-    level = level.clamp(0.0, torch.finfo(light.dtype).max / 8)
+    level = torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
+    level = FACTOR * level.clamp(0.0, torch.finfo(light.dtype).max / FACTOR)
     level = functional.interpolate(level, scale_factor=float(_CELL), mode="bilinear", align_corners=False)
     return level[..., :height, :width]
 
