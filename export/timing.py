@@ -5,7 +5,6 @@ Each scene runs in onnxruntime alone, in a process of its own, so that the peak 
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import time
@@ -13,6 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 import onnxruntime
+
+from torchdof import memory
 
 __all__ = ["main", "measure"]
 
@@ -89,8 +90,7 @@ def main() -> None:
         runner = session(arguments.model, arguments.threads)
         inputs = feed(runner, (height, width), arguments.alone)
         seconds = _median(lambda: runner.run(None, inputs), arguments.runs)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(json.dumps({"seconds": seconds, "peak_gb": peak}))
+        print(json.dumps({"seconds": seconds, "peak_gb": memory.peak_mb() * 2**20 / 1e9}))
         return
     print(f"{width} x {height}, {arguments.threads} threads, onnxruntime {onnxruntime.__version__}")
     for scene in SCENES:

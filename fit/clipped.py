@@ -44,7 +44,8 @@ def used_pixels(
 
     if white is not None and not white > dot.background:
         raise FitError(
-            f"white is {white:g} but the background of the {name} picture is {dot.background:g}",
+            f"white is {white:g} but the background of the {name} picture is {dot.background:g}; "
+            "give the value at which the camera clips, which lies above it, or None to look for it",
             file=file,
             number=white,
         )

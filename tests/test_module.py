@@ -492,6 +492,15 @@ def test_compiled_without_a_break_equals_eager(backend: str, way: dict[str, Any]
     assert rms(fast, dof(image, depth)) <= 2 * COMPILED["tolerance"]
 
 
+def test_modules_with_other_options_compile_one_after_the_other() -> None:
+    torch.compiler.reset()
+    camera, image, depth = compiled_case()
+    for reach, tolerance in ((3.0, 1 / 60), (2.0, 1 / 30), (2.5, 1 / 40)):
+        dof = DepthOfField(camera, max_coc_px=reach, tolerance=tolerance, occlusion=False)
+        fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth)
+        assert_close(fast, dof(image, depth, plan=Plan.all(reach, tolerance)), rtol=1e-5, atol=1e-6)
+
+
 # Refused
 
 

@@ -37,7 +37,7 @@ def blur(
     maps = [image, coc_px, *(behind or ())]
     maps = [t.to(wide).expand(image.shape[0], -1, -1, -1) for t in maps]
     if plan is None and _traced():
-        plan = Plan.all(options.max_coc_px, options.tolerance)
+        plan = Plan.all(_constant(options.max_coc_px), _constant(options.tolerance))
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
         plan = Plan.still(torch.cat(maps[1::2]), options.tolerance)
     if plan is not None:
@@ -165,6 +165,11 @@ def _composite(surfaces: Sequence[Surface], plan: Plan, options: Options, indepe
 def _within(coc: Tensor, plan: Plan) -> Tensor:
     """Beyond the plan's reach blurs are alike, and differences of huge ones would cancel."""
     return coc.clamp(plan.coc_px[0], plan.coc_px[-1])
+
+
+def _constant(number: float) -> float:
+    """A number whose value a compiled graph is made for: one that differs between two modules is a variable in it."""
+    return float.fromhex(float(number).hex())
 
 
 def _traced() -> bool:

@@ -1,8 +1,6 @@
 """Speed against error: what each tolerance costs on a scene, and how far it stays from the exact rendering."""
 
-import contextlib
 import csv
-import ctypes
 import dataclasses
 import importlib.metadata
 import io
@@ -22,7 +20,7 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from . import metrics
+from . import memory, metrics
 from .arguments import whole
 from .camera import Camera
 from .check import Method
@@ -209,9 +207,9 @@ def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, uni
         repeat: How often, at least 1.
         unit: Unit Y in seconds.
     """
-    start = _reset_peak()
+    start = memory.reset_peak()
     out = _render(subject, setting)
-    peak_mb = _peak_mb() - start
+    peak_mb = memory.peak_mb() - start
     shown, truth = metrics.display(out), metrics.display(wanted)
     rms = math.sqrt(float((shown.double() - truth.double()).square().mean()))
     keeps = bool(torch.isfinite(out).all()) and rms <= setting.tolerance + _ROUNDING
@@ -324,25 +322,6 @@ def _times(work: Callable[[], object], repeat: int) -> list[float]:
         work()
         times.append(time.perf_counter() - start)
     return times
-
-
-def _reset_peak() -> float:
-    """Forgets the process's peak memory; returns what it holds now in MiB, NaN where the system does not tell."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)  # else what was freed before would serve unseen
-    try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return math.nan
-    return _peak_mb()
-
-
-def _peak_mb() -> float:
-    try:
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return math.nan
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:")), math.nan)
 
 
 def _csv(rows: Iterable[Row]) -> str:
