@@ -1,5 +1,6 @@
 """Speed against error: what each tolerance costs on a scene, and how far it stays from the exact rendering."""
 
+import contextlib
 import csv
 import dataclasses
 import importlib.metadata
