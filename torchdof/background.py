@@ -14,7 +14,7 @@ depends on the data, which compiled graphs do not allow for, so these call :func
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from . import highlights
+from .pool import max_around, max_of_four, mean_of_four
 
 __all__ = ["fill_hidden", "split_mixed", "surfaces"]
 
@@ -81,11 +82,11 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
         other's coc and the share of the pixel that it covers, in [0, 1/2], ``[B, 1, H, W]``; 0 away from edges.
     """
     if valid is None:
-        low, high = -functional.max_pool2d(-coc_px, 3, 1, 1), functional.max_pool2d(coc_px, 3, 1, 1)
+        low, high = -max_around(-coc_px), max_around(coc_px)
         edge = ((high - low) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
     else:
-        low = -functional.max_pool2d(torch.where(valid > 0, -coc_px, -_NEVER_PX), 3, 1, 1)
-        high = functional.max_pool2d(torch.where(valid > 0, coc_px, -_NEVER_PX), 3, 1, 1)
+        low = -max_around(torch.where(valid > 0, -coc_px, -_NEVER_PX))
+        high = max_around(torch.where(valid > 0, coc_px, -_NEVER_PX))
         edge = ((high - low) / _EDGE_PX - 1.0).clamp(0.0, 1.0) * valid
     at = _positions(edge > 0)
     near, far, here = (_pick(t, at)[0] for t in (low, high, coc_px))
@@ -135,9 +136,9 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     own_light = (colour - other * other_light) / (1.0 - other)
     return (
         _put(light, at, own_light),
-        _put(torch.zeros_like(light), at, other_light),
+        _place(other_light, at, light),
         _put(coc_px, at, torch.where(is_near, far, near)),
-        _put(torch.zeros_like(coc_px), at, other),
+        _place(other, at, coc_px),
     )
 
 
@@ -175,8 +176,7 @@ def fill_hidden(
     colour = torch.where(mixed, other_light, light)
     # a highlight is in one place: what is hidden beside it is no highlight
     most, brightest = highlights.ordinary(colour, valid), colour.amax(1, keepdim=True)
-    bright = brightest > most
-    colour = torch.where(bright, colour * (most / torch.where(bright, brightest, 1.0)), colour)
+    colour = colour * torch.where(brightest > most, most / brightest, 1.0)
     weight = torch.where(mixed, share, 1.0 - share)
     if valid is not None:
         depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid
@@ -185,29 +185,28 @@ def fill_hidden(
     more = 2 * step - 1
     extra = (0, (width + more) // step * step - width, 0, (height + more) // step * step - height)
     depth, colour, weight = (functional.pad(t, extra, mode="replicate") for t in (depth, colour, weight))
-    at = _positions(_may_hide(coc_px, depth, share, levels, (height, width)))
+    pyramid = []
+    for _ in range(levels):
+        colour, depth, weight = _farthest(colour, depth, weight)
+        pyramid.append((colour, depth, weight))
+    padded = functional.pad(coc_px, extra, mode="replicate")
+    may_hide = _may_hide(padded, [depth for _, depth, _ in pyramid])[..., :height, :width]
+    at = _positions(may_hide & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT))
     here = _pick(coc_px, at)[0]
-    reach = here.abs()
     item, row, column = _places(at, height, width)
     total = torch.zeros_like(here)
-    seen_light, seen_coc = _pick(light, at), here
-    for level in range(1, levels + 1):
-        colour, depth, weight = _farthest(colour, depth, weight)
-        behind_light, behind_coc, any_behind = _behind(colour, depth, weight, item, row, column, here, 2**level)
-        vote = torch.where(any_behind & (2.0 ** (level - 2) <= reach), _FALL**level, 0.0)
+    seen = torch.cat([_pick(light, at), here[None]])
+    for level, (colour, depth, weight) in enumerate(pyramid, 1):
+        coarse = torch.cat([colour, depth, weight], 1).transpose(0, 1).flatten(1)
+        size = (depth.shape[-2], depth.shape[-1])
+        behind, any_behind = _behind(coarse, size, item, row, column, here, 2**level)
+        vote = torch.where((any_behind > 0) & (_least_px(level) <= here.abs()), _FALL**level, 0.0)
         total = total + vote
-        part = vote / total.clamp_min(1e-9)
-        seen_light, seen_coc = (
-            seen_light + (behind_light - seen_light) * part,
-            seen_coc + (behind_coc - seen_coc) * part,
-        )
-    hidden = _put(torch.zeros_like(share), at, torch.where(total > 0, HIDDEN_WEIGHT, 0.0).to(share.dtype))
-    free = (share < HIDDEN_WEIGHT) & (hidden > 0)
-    return (
-        torch.where(free, _put(other_light, at, seen_light), other_light),
-        torch.where(free, _put(other_coc_px, at, seen_coc), other_coc_px),
-        torch.where(free, hidden, share),
-    )
+        seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
+    some = _positions(total > 0)
+    at, seen = at[some], seen.index_select(1, some)
+    hidden = torch.full_like(seen[0], HIDDEN_WEIGHT)
+    return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden)
 
 
 def _surfaces(
@@ -253,49 +252,59 @@ def _backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
 _surfaces_operator.register_autograd(_backward, setup_context=_remember)
 
 
-def _may_hide(coc: Tensor, farthest: Tensor, share: Tensor, levels: int, size: tuple[int, int]) -> Tensor:
-    """Pixels that are blurred and have something farther within reach of the pyramid."""
-    cell = 2 ** min(levels, 3)
-    cells = functional.max_pool2d(farthest, cell)
-    around = max(1, 2**levels // cell)
-    cells = functional.max_pool2d(functional.pad(cells, (around,) * 4, mode="replicate"), 2 * around + 1, 1)
-    farther = functional.interpolate(cells, scale_factor=cell, mode="nearest")[..., : size[0], : size[1]]
-    return (farther > coc + _BEHIND_PX) & (coc.abs() > 0.5) & (share < HIDDEN_WEIGHT)
+def _least_px(level: int) -> float:
+    """Blur from which on a pixel looks as far as this level."""
+    return 2.0 ** (level - 2)
+
+
+def _may_hide(coc: Tensor, depths: Sequence[Tensor]) -> Tensor:
+    """Pixels, in cells, for which a level of the pyramid that they look at shows something farther."""
+    coarsest = min(len(depths), 3)
+    near, blur = -functional.max_pool2d(-coc, 2**coarsest), functional.max_pool2d(coc.abs(), 2**coarsest)
+    found = torch.zeros_like(near, dtype=torch.bool)
+    for level, depth in enumerate(depths, 1):
+        around = max_around(depth)
+        if level < coarsest:
+            around = functional.max_pool2d(around, 2 ** (coarsest - level))
+        elif level > coarsest:
+            around = functional.interpolate(around, scale_factor=float(2 ** (level - coarsest)), mode="nearest")
+        found = found | ((around > near + _BEHIND_PX) & (blur >= _least_px(level)))
+    return functional.interpolate(found.to(coc.dtype), scale_factor=float(2**coarsest), mode="nearest") > 0
 
 
 def _farthest(colour: Tensor, depth: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """One step of the pyramid: of each four children, the mean of those that are farthest."""
-    children = functional.pixel_unshuffle(depth, 2)  # [B, 4, H/2, W/2]
-    counts = functional.pixel_unshuffle(weight, 2) * (children > children.amax(1, keepdim=True) - _BEHIND_PX)
-    total = counts.sum(1, keepdim=True)
+    most = functional.interpolate(max_of_four(depth), scale_factor=2.0, mode="nearest")
+    counts = weight * (depth > most - _BEHIND_PX)
+    total = mean_of_four(counts)
     some = total.clamp_min(1e-9)
-    colours = functional.pixel_unshuffle(colour, 2).unflatten(1, (colour.shape[1], 4))
-    colour = (colours * counts.unsqueeze(1)).sum(2) / some
-    depth = torch.where(total > 0, (children * counts).sum(1, keepdim=True) / some, -_NEVER_PX)
-    return colour, depth, total / 4
+    colour = mean_of_four(colour * counts) / some
+    depth = torch.where(total > 0, mean_of_four(depth * counts) / some, -_NEVER_PX)
+    return colour, depth, total
 
 
 def _behind(
-    colour: Tensor, depth: Tensor, weight: Tensor, item: Tensor, row: Tensor, column: Tensor, here: Tensor, step: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Bilinear sample of a level at fine positions, of the samples behind each position only."""
-    height, width = depth.shape[-2:]
+    level: Tensor, size: tuple[int, int], item: Tensor, row: Tensor, column: Tensor, here: Tensor, step: int
+) -> tuple[Tensor, Tensor]:
+    """Bilinear sample of a level ``[C + 2, P]`` at fine positions, of the samples behind each position only.
+
+    Light and coc ``[C + 1, P]`` and their weight, 0 where nothing is behind.
+    """
+    height, width = size
     y, x = (row + 0.5) / step - 0.5, (column + 0.5) / step - 0.5
     top, left = y.floor(), x.floor()
-    colour, depth, weight = (t.transpose(0, 1).flatten(1) for t in (colour, depth, weight))
-    light = coc = total = torch.zeros_like(here)
-    for down in (0, 1):
-        for right in (0, 1):
-            r = (top.long() + down).clamp(0, height - 1)
-            c = (left.long() + right).clamp(0, width - 1)
-            where = (item * height + r) * width + c
-            share = (1 - (y - top - down).abs()) * (1 - (x - left - right).abs())
-            its_coc = depth[0, where]
-            share = share * weight[0, where] * (its_coc > here + _BEHIND_PX)
-            light, coc, total = light + colour[:, where] * share, coc + its_coc * share, total + share
-    enough = total > 1e-4
-    total = torch.where(enough, total, 1.0)
-    return light / total, coc / total, enough
+    down, right = y - top, x - left
+    first = item * height
+    rows = [(first + (top.long() + i).clamp(0, height - 1)) * width for i in (0, 1)]
+    columns = [(left.long() + i).clamp(0, width - 1) for i in (0, 1)]
+    seen = total = torch.zeros_like(here)
+    for line, vertical in zip(rows, (1 - down, down), strict=True):
+        for place, horizontal in zip(columns, (1 - right, right), strict=True):
+            its = level.index_select(1, line + place)
+            share = vertical * horizontal * its[-1] * (its[-2] > here + _BEHIND_PX)
+            seen, total = seen + its[:-1] * share, total + share
+    total = torch.where(total > 1e-4, total, 0.0)
+    return seen / total.clamp_min(1e-4), total
 
 
 def _mean(weighted: Iterator[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
@@ -322,7 +331,15 @@ def _places(at: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor
 
 def _pick(values: Tensor, at: Tensor) -> Tensor:
     """``[B, C, H, W]`` -> ``[C, P]``."""
-    return values.transpose(0, 1).flatten(1)[:, at]
+    return values.transpose(0, 1).flatten(1).index_select(1, at)
+
+
+def _place(new: Tensor, at: Tensor, like: Tensor) -> Tensor:
+    """Zeros like ``[B, C, H, W]``, but for what :func:`_pick` would take."""
+    batch, channels, height, width = like.shape
+    flat = like.new_zeros(channels, batch * height * width)
+    flat.index_copy_(1, at, new.reshape(channels, -1).to(like.dtype))
+    return flat.reshape(channels, batch, height, width).transpose(0, 1)
 
 
 def _put(values: Tensor, at: Tensor, new: Tensor) -> Tensor:
@@ -346,4 +363,4 @@ def _around(values: Tensor, at: Tensor) -> Iterator[Tensor]:
     for dy in range(-_REACH, _REACH + 1):
         for dx in range(-_REACH, _REACH + 1):
             where = ((row + dy).clamp(0, height - 1) + item * height) * width + (column + dx).clamp(0, width - 1)
-            yield flat[:, where]
+            yield flat.index_select(1, where)

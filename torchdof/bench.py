@@ -27,7 +27,7 @@ from .scenes import Scene, read_scenes
 from .table import BlurTable
 from .transfer import decode
 
-__all__ = ["Score", "bench", "ikoma", "measure", "renderers"]
+__all__ = ["Score", "bench", "ikoma", "layered_fft", "measure", "renderers"]
 
 Renderer = Callable[[Scene], Tensor]
 
@@ -76,12 +76,18 @@ def renderers() -> dict[str, Renderer]:
 
 
 def ikoma(scene: Scene, spacing_px: float = 0.75) -> Tensor:
-    """The formula that torchdof builds on, as published: nothing hidden, no mixed pixels, dense layers, exact discs.
+    """:func:`layered_fft` of a scene, in float64: what torchdof builds on, with dense layers and exact discs."""
+    return layered_fft(scene.image.double(), scene.coc_px, spacing_px).to(scene.image.dtype)
+
+
+def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tensor:
+    """The formula that torchdof builds on, as published: nothing hidden, no mixed pixels, exact discs, by FFT.
 
     The frame is continued outwards as it is at its border; where a hole is left the rest is scaled up.
 
     Args:
-        scene: The scene.
+        image: ``[1, C, H, W]``, linear light; its type is the one that is computed in.
+        coc_px: ``[1, 1, H, W]``, signed circle of confusion.
         spacing_px: Largest distance between layers, in circle of confusion.
 
     Returns:
@@ -90,27 +96,26 @@ def ikoma(scene: Scene, spacing_px: float = 0.75) -> Tensor:
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
-    coc = scene.coc_px.double()
-    low, high = float(coc.min()), float(coc.max())
+    low, high = float(coc_px.min()), float(coc_px.max())
     nodes = torch.linspace(low, high, 2 + int((high - low) / spacing_px), dtype=torch.float64)
-    place = (coc - low) / max(high - low, 1e-9) * (len(nodes) - 1)
-    kernels = BlurTable.disc().kernels(nodes, coc.shape[-1])[:, 0]
+    place = ((coc_px.double() - low) / max(high - low, 1e-9) * (len(nodes) - 1)).to(image.dtype)
+    kernels = BlurTable.disc().kernels(nodes, coc_px.shape[-1])[:, 0].to(image.dtype)
     half = kernels.shape[-1] // 2
-    light, place = (functional.pad(x, (half,) * 4, mode="replicate") for x in (scene.image.double(), place))
-    size = (light.shape[-2] + 2 * half, light.shape[-1] + 2 * half)
-    out, room = torch.zeros_like(scene.image, dtype=torch.float64), torch.zeros_like(place)
-    covered = torch.zeros_like(coc)
+    light, place = (functional.pad(x, (half,) * 4, mode="replicate") for x in (image, place))
+    height, width = (n + 2 * half for n in image.shape[-2:])
+    size = [-(-(n + 2 * half) // 16) * 16 for n in image.shape[-2:]]  # of small factors, which is fast
+    out, room, covered = torch.zeros_like(image), torch.zeros_like(place), torch.zeros_like(image[:, :1])
     for k in reversed(range(len(nodes))):  # far to near
         share = (1.0 - (place - k).abs()).clamp_min(0.0)
         room = room + share
         stack = torch.cat([light * share, share, room], 1)
         spectrum = torch.fft.rfft2(stack, size) * torch.fft.rfft2(kernels[k], size)
-        blurred = torch.fft.irfft2(spectrum, size)[..., 2 * half : size[0] - 2 * half, 2 * half : size[1] - 2 * half]
+        blurred = torch.fft.irfft2(spectrum, size)[..., 2 * half : height, 2 * half : width]
         seen = blurred[:, -1:].clamp_min(1e-6)
         left = 1.0 - (blurred[:, -2:-1] / seen).clamp(0.0, 1.0)
         out = blurred[:, :-2].clamp_min(0.0) / seen + left * out
         covered = 1.0 - left + left * covered
-    return (out / covered.clamp_min(1e-6)).to(scene.image.dtype)
+    return out / covered.clamp_min(1e-6)
 
 
 def measure(name: str, image: Tensor, scene: Scene, margin_px: int = 0, known: Tensor | None = None) -> Score:

@@ -5,6 +5,7 @@ recorded or code is traced, the whole frame is one window.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -18,6 +19,7 @@ __all__ = ["Frame", "Sample", "Window"]
 
 TILE = 64
 _CELL = 16  # occupancy is known in cells of this many pixels
+_BLOCK = 4  # pixels a side that are looked at together to find occupied layers
 _AT_ONCE = 24  # tiles computed together: what fits the cache
 _CHANNELS = 16  # channels that are spread together
 
@@ -120,6 +122,7 @@ class Frame:
         ]
         self.known = None if extend else functional.pad(torch.ones_like(samples[0].x[:1]), ends)
         self._occupied: list[Tensor] = []
+        self._plain_tiles: dict[int, Tensor] = {}
 
     @classmethod
     def piece(cls, samples: Sequence[Sample], known: Tensor | None, margin: int, side: int) -> "Frame":
@@ -188,15 +191,33 @@ class Frame:
         if spans_frame or halo > TILE:
             yield places, self._window(halo, None, True)
             return
-        for border in (False, True):
-            chosen = places[inside != border]
+        plain = self._plain(halo)[places]
+        for border, single in itertools.product((False, True), repeat=2):
+            chosen = places[(inside != border) & (plain == single)]
             for some in chosen.split(_AT_ONCE) if len(chosen) else ():
-                yield some, self._window(halo, some, border)
+                yield some, self._window(halo, some, border, single)
 
-    def _window(self, halo: int, places: Tensor | None, known: bool) -> Window:
+    def _plain(self, halo: int) -> Tensor:
+        """Tiles that show the first sample alone, whole, as far as a halo reaches: ``[tiles]``."""
+        reach = -(-halo // _CELL)
+        if reach not in self._plain_tiles:
+            m, (height, width) = self.margin, self.area
+            other = torch.zeros(height // _CELL, width // _CELL, device=self.samples[0].x.device)
+            for i, s in enumerate(self.samples):
+                weight = torch.ones_like(s.x) if s.weight is None else s.weight
+                if i == 0 and s.weight is None:
+                    continue
+                there = weight[0, 0, m : m + height, m : m + width]
+                there = (1.0 - there if i == 0 else there).unflatten(0, (-1, _CELL)).amax(1)
+                other = torch.maximum(other, there.unflatten(1, (-1, _CELL)).amax(2))
+            wide = functional.max_pool2d(other[None, None], 2 * reach + 1, 1, reach)
+            self._plain_tiles[reach] = functional.max_pool2d(wide, TILE // _CELL).flatten() == 0
+        return self._plain_tiles[reach]
+
+    def _window(self, halo: int, places: Tensor | None, known: bool, single: bool = False) -> Window:
         samples = []
-        for s in self.samples:
-            weight = None if s.weight is None else self._cut(s.weight, halo, places)
+        for s in self.samples[:1] if single else self.samples:
+            weight = None if s.weight is None or single else self._cut(s.weight, halo, places)
             samples.append(Sample(self._cut(s.light, halo, places), self._cut(s.x, halo, places), weight))
         seen = self._cut(self.known, halo, places) if known and self.known is not None else None
         return Window(samples, seen, self.independent)
@@ -207,8 +228,9 @@ class Frame:
         if places is None:
             return values
         columns = self.area[1] // TILE
-        views = values[0].unfold(1, TILE + 2 * halo, TILE).unfold(2, TILE + 2 * halo, TILE)  # [C, rows, columns, t, t]
-        return views.permute(1, 2, 0, 3, 4)[places // columns, places % columns]
+        side = TILE + 2 * halo
+        corners = [(place // columns * TILE, place % columns * TILE) for place in places.tolist()]
+        return torch.stack([values[0, :, y : y + side, x : x + side] for y, x in corners])
 
     def any_share(self, plan: Plan, group: Sequence[int], halo: int) -> Tensor:
         """Whether a pixel of the frame, or up to ``halo`` outside it, lies in these layers, which are neighbours."""
@@ -220,26 +242,33 @@ class Frame:
     def _occupancy(self, plan: Plan, blurs: Sequence[Blur]) -> list[Tensor]:
         """For each layer, the tiles that its light can reach: ``[rows, columns]``."""
         height, width = self.area
-        rows, columns = height // _CELL, width // _CELL
-        nodes = torch.tensor(plan.nodes, device=self.samples[0].x.device, dtype=self.samples[0].x.dtype)
         count = len(plan.nodes)
-        present = torch.zeros(rows * columns * count, device=nodes.device)
-        cell = (torch.arange(height) // _CELL * columns)[:, None] + (torch.arange(width) // _CELL)[None, :]
-        cell = cell.to(nodes.device)
-        m = self.margin
+        nodes = torch.tensor(plan.nodes, device=self.samples[0].x.device, dtype=self.samples[0].x.dtype)
+        present = nodes.new_zeros(height // _CELL * (width // _CELL) * count)
+        row, column = (torch.arange(0, n, _BLOCK, device=nodes.device) // _CELL for n in (height, width))
+        cells = (row[:, None] * (width // _CELL) + column) * count
+
+        def mark(x: Tensor, at: Tensor) -> Tensor:
+            below = (torch.bucketize(x, nodes, right=True) - 1).clamp(0, count - 1)
+            for layer in (below, below + (x > nodes[below])):
+                present[(at + layer.clamp(max=count - 1)).flatten()] = 1.0
+            return below
+
+        m, first = self.margin, None
         for s in self.samples:
             x = s.x[0, 0, m : m + height, m : m + width]
-            below = (torch.bucketize(x.contiguous(), nodes, right=True) - 1).clamp(0, count - 1)
-            at = cell * count + below
-            above = at + (x > nodes[below])
-            if s.weight is not None:
-                there = s.weight[0, 0, m : m + height, m : m + width] > 0
-                at, above = at[there], above[there]
-            present[at.flatten()] = 1.0
-            present[above.flatten().clamp(max=present.numel() - 1)] = 1.0
-        cells = present.unflatten(0, (rows, columns, count)).permute(2, 0, 1)
+            if first is not None and s.weight is not None:  # what is not there counts as what is
+                x = torch.where(s.weight[0, 0, m : m + height, m : m + width] > 0, x, first)
+            first = x if first is None else first
+            blocks = x.unflatten(0, (-1, _BLOCK))
+            low, high = (most(most(blocks, 1).unflatten(1, (-1, _BLOCK)), 2) for most in (torch.amin, torch.amax))
+            # blocks that span neighbouring nodes are told by their ends, others are looked into
+            spanned = mark(high, cells) - mark(low, cells) > 1
+            r, c = spanned.nonzero(as_tuple=True)
+            pixels = blocks.unflatten(2, (-1, _BLOCK)).permute(0, 2, 1, 3)[r, c].flatten(1)
+            mark(pixels, cells[r, c, None])
         occupied = []
-        for layer, blur in zip(cells, blurs, strict=True):
+        for layer, blur in zip(present.unflatten(0, (height // _CELL, -1, count)).permute(2, 0, 1), blurs, strict=True):
             reach = -(-blur.halo // _CELL)
             wide = functional.max_pool2d(layer[None, None], 2 * reach + 1, 1, reach)
             occupied.append(functional.max_pool2d(wide, TILE // _CELL)[0, 0] > 0)

@@ -11,6 +11,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .plan import Blur
+from .pool import mean_of_four
 
 __all__ = ["Spread", "conv", "fold", "layers_by_conv", "layers_by_fold"]
 
@@ -79,7 +80,7 @@ def fold(light: Tensor, kernels: Tensor, shares: Tensor | None = None) -> Tensor
 def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     """The same scatter with one kernel a channel, by convolution.
 
-    Small kernels are applied directly, 16 channels at a time in ``channels_last``. Large ones go through a Fourier
+    Small kernels are applied directly, 16 channels at a time. Large ones go through a Fourier
     transform in float64: in float32 a highlight would leave rounding errors all over the frame.
 
     Args:
@@ -112,15 +113,22 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
         return _fourier(light, kernels)[..., halo : light.shape[-2] - halo, halo : light.shape[-1] - halo]
     batch, channels = light.shape[:2]
     together = _PACK // channels if not _traced() and batch > 1 and channels <= _PACK // 2 else 1
-    packed = light
     if together > 1:  # items as channels of one convolution
-        packed = functional.pad(packed, (0, 0, 0, 0, 0, 0, 0, (-batch) % together))
-        packed = packed.reshape(-1, together * channels, *light.shape[-2:])
-    spare = (-packed.shape[1]) % _PACK
-    packed = functional.pad(packed, (0, 0, 0, 0, 0, spare)).contiguous(memory_format=torch.channels_last)
-    weights = functional.pad(kernels.repeat(together, 1, 1), (0, 0, 0, 0, 0, spare)).unsqueeze(1)
-    out = functional.conv2d(packed, weights, padding=half - halo, groups=packed.shape[1])[:, : together * channels]
+        light = _filled(light, 0, together).reshape(-1, together * channels, *light.shape[-2:])
+    light = _filled(light, 1, _PACK)
+    weights = _filled(kernels.repeat(together, 1, 1), 0, _PACK).unsqueeze(1)
+    out = functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, : together * channels]
     return out.reshape(-1, channels, *out.shape[-2:])[:batch] if together > 1 else out
+
+
+def _filled(values: Tensor, dim: int, multiple: int) -> Tensor:
+    """Zeros appended up to a multiple of a length."""
+    spare = -values.shape[dim] % multiple
+    if not spare:
+        return values
+    shape = list(values.shape)
+    shape[dim] = spare
+    return torch.cat([values, values.new_zeros(shape)], dim)
 
 
 def layers_by_conv(light: Tensor, blurs: Sequence[tuple[Blur, int]], halo: int) -> Tensor:
@@ -131,7 +139,10 @@ def layers_by_conv(light: Tensor, blurs: Sequence[tuple[Blur, int]], halo: int) 
     half = kernels.shape[-1] // 2
     spare = halo - scale * (half + 1)
     light = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare]
-    coarse = conv(functional.avg_pool2d(light, scale), kernels, half)
+    coarse = light
+    while coarse.shape[-1] * scale > light.shape[-1]:
+        coarse = mean_of_four(coarse)
+    coarse = conv(coarse, kernels, half)
     fine = functional.interpolate(coarse, scale_factor=float(scale), mode="bilinear", align_corners=False)
     return fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
 
