@@ -18,7 +18,7 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from . import metrics, speed
+from . import metrics, peers, speed
 from .files import Picture, whole_file, write_image
 from .module import DepthOfField
 from .reference import lens_views
@@ -31,7 +31,7 @@ __all__ = ["Score", "bench", "ikoma", "layered_fft", "measure", "renderers"]
 
 Renderer = Callable[[Scene], Tensor]
 
-_SPEED, _ACCURACY = "Speed", "Accuracy"
+_SPEED, _ACCURACY, _PEERS = "Speed", "Accuracy", "Other tools"
 _TILE_PX = 128
 _ERROR_GAIN = 4.0
 _MEASURES = {
@@ -105,13 +105,14 @@ def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tens
     height, width = (n + 2 * half for n in image.shape[-2:])
     size = [-(-(n + 2 * half) // 16) * 16 for n in image.shape[-2:]]  # of small factors, which is fast
     out, room, covered = torch.zeros_like(image), torch.zeros_like(place), torch.zeros_like(image[:, :1])
+    least = 1e-6 if image.dtype == torch.float64 else 1e-3  # what is less is the noise of an FFT in float32
     for k in reversed(range(len(nodes))):  # far to near
         share = (1.0 - (place - k).abs()).clamp_min(0.0)
         room = room + share
         stack = torch.cat([light * share, share, room], 1)
         spectrum = torch.fft.rfft2(stack, size) * torch.fft.rfft2(kernels[k], size)
         blurred = torch.fft.irfft2(spectrum, size)[..., 2 * half : height, 2 * half : width]
-        seen = blurred[:, -1:].clamp_min(1e-6)
+        seen = blurred[:, -1:].clamp_min(least)
         left = 1.0 - (blurred[:, -2:-1] / seen).clamp(0.0, 1.0)
         out = blurred[:, :-2].clamp_min(0.0) / seen + left * out
         covered = 1.0 - left + left * covered
@@ -158,9 +159,10 @@ def bench(
         Path | None, typer.Argument(metavar="[DEPTH]", help="Its depth; not needed if IMAGE has a Z channel.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, or accuracy.csv, .md, .png.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, accuracy.csv, .md and .png, or peers.*."),
     ] = None,
-    repeat: Annotated[int, typer.Option(help="Timed renderings of each setting.", min=1, rich_help_panel=_SPEED)] = 5,
+    repeat: Annotated[int, typer.Option(help="Timed renderings of each setting or tool.", min=1)] = 5,
     focus_m: Annotated[
         float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=_SPEED)
     ] = None,
@@ -203,6 +205,19 @@ def bench(
             rich_help_panel=_ACCURACY,
         ),
     ] = False,
+    compared: Annotated[
+        Path | None,
+        typer.Option(
+            "--peers",
+            metavar="SCENES",
+            help="Folder with scenes as for --truth: time and distance from the truth, beside other tools.",
+            rich_help_panel=_PEERS,
+        ),
+    ] = None,
+    peers_folder: Annotated[
+        Path,
+        typer.Option(help="Where the other tools are described, a Python file each.", rich_help_panel=_PEERS),
+    ] = Path("examples/peers"),
 ) -> None:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
@@ -216,9 +231,18 @@ def bench(
 
     The picture of the latter shows, for each scene, the place where torchdof is farthest from the truth: sharp, truth,
     each renderer with its error below it, four times enlarged.
+
+    torchdof and what else is installed, GEGL, FFmpeg or Blender, in one run on the same scenes:
+
+        torchdof bench --peers scenes --out results
     """
     if out is not None and not out.is_dir():
         raise FileNotFoundError(f"{out}: there is no such folder; make it first")
+    if compared is not None:
+        if image is not None or truth is not None or views or inner:
+            raise ValueError("--peers measures the scenes of its folder; of the other options it takes --out, --repeat")
+        peers.compare(compared, peers_folder, out, repeat)
+        return
     if truth is not None:
         if image is not None:
             raise ValueError("--truth measures the scenes of its folder; leave IMAGE and DEPTH out")
