@@ -130,7 +130,7 @@ def check(peer: Peer, radius_px: float = 6.0) -> str | None:
     """Whether a peer blurs each of three dots by the circle of confusion it has: in focus, behind and in front.
 
     A dot must keep its light within 3 %, stay in its place within 0.75 px, and become as wide as a disc of its radius
-    (by second moments), within 10 %; or within 1 px in focus.
+    (by second moments), within 5 %; or within 1 px in focus.
 
     Returns:
         None, or what is wrong.
@@ -155,7 +155,7 @@ def check(peer: Peer, radius_px: float = 6.0) -> str | None:
             return f"a dot at {radius:g} px moves by {x:.2f}, {y:.2f} px"
         square = float((dot * ((place[:, None] - y) ** 2 + (place - x) ** 2)).sum()) / light
         found = math.sqrt(max(2.0 * (square - 1.0 / 6.0), 0.0))  # a pixel itself has 1 / 6
-        if abs(found - abs(radius)) > (0.1 * abs(radius) or 1.0):
+        if abs(found - abs(radius)) > (0.05 * abs(radius) or 1.0):
             return f"a dot at {radius:g} px is blurred as by a disc of {found:.2f} px"
     return None
 
@@ -241,8 +241,13 @@ def _times(rows: Sequence[Row]) -> list[list[str]]:
     """Lines of the table of times: a case each."""
     lines: dict[str, list[str]] = {}
     for row in rows:
-        lines.setdefault(row.case, [row.case]).append(f"{1e3 * row.median_s:.0f} ± {1e3 * row.spread_s:.0f}")
+        lines.setdefault(row.case, [row.case]).append(_milliseconds(row))
     return list(lines.values())
+
+
+def _milliseconds(row: Row) -> str:
+    digits = 0 if row.median_s >= 0.1 else 1
+    return f"{1e3 * row.median_s:.{digits}f} ± {1e3 * row.spread_s:.{digits}f}"
 
 
 def _errors(rows: Sequence[Row]) -> list[list[str]]:

@@ -1,5 +1,6 @@
 """Blender's Defocus node, float32: discs of a radius per pixel; the radius map is fed to it as it is."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -16,21 +17,19 @@ NOTE = (
     "compositor without it; without process start and file i/o."
 )
 _WORKER = Path(__file__).with_name("_blender_worker.py")
-_NEEDS = "bpy.types.Scene.bl_rna.properties['compositing_node_group']"  # Blender 5
 
 
 def available() -> str | None:
     """None, or what to install."""
-    done = subprocess.run([_python(), "-c", f"import bpy; {_NEEDS}"], capture_output=True)
-    if done.returncode == 0:
-        return None
-    return "pip install 'bpy>=5', or set BPY_PYTHON to an interpreter that has it"
+    return None if version() else "pip install 'bpy>=5' (which wants NumPy 1); BPY_PYTHON names the interpreter with it"
 
 
+@functools.cache
 def version() -> str:
-    """Version of Blender."""
-    command = [_python(), "-c", "import bpy; print('version', bpy.app.version_string)"]
-    return subprocess.run(command, capture_output=True, text=True).stdout.split("version ")[-1].split()[0]
+    """Version of Blender, from 5 on; empty if there is none."""
+    script = "import bpy; bpy.types.Scene.bl_rna.properties['compositing_node_group']; print(bpy.app.version_string)"
+    done = subprocess.run([_python(), "-c", script], capture_output=True, text=True)
+    return "" if done.returncode else done.stdout.split()[-1]
 
 
 def render(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
