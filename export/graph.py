@@ -104,13 +104,13 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     Raises:
         ValueError: If the channels do not fit the table.
     """
-    table, size = portable.dof.table, (2, 400, 300)
+    table, size = portable.dof.table, (2, 64, 64)
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
     image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0
     example = (image, map_, *(torch.full(size[:1], value) for value in (1.5, 2.8)[: len(INPUTS[portable.inputs]) - 2]))
-    # Fills the cache of kernels, which the trace then takes as constants.
-    portable.blurs(size[1:])
+    # Fills the cache of kernels, none of them cut to a frame, which the trace then takes as constants.
+    portable.blurs((2**30, 2**30))
     free = torch.export.Dim.AUTO
     batch, frame = {0: free}, {0: free, 2: free, 3: free}
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))

@@ -277,3 +277,38 @@ def test_bad_parameters_are_refused_by_name(family: str, params: dict[str, Any],
 def test_a_size_that_is_not_odd_is_refused(size: int) -> None:
     with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
         kernel.disc(2.0, size=size)
+
+
+LARGE: dict[str, dict[str, Any]] = {
+    "gaussian": {"sigma": 60.0},
+    "ring": {"sigma": 40.0, "r_c": 90.0},
+    "disc": {"radius": 280.3},
+    "softm": {"radius": 220.0, "sigma": 12.0, "b": 0.5, "m": 3.0},
+    "radial": {"values": torch.linspace(1.0, 0.0, 9), "radius": 280.0},
+}
+
+
+@pytest.mark.parametrize(("family", "params"), LARGE.items())
+@pytest.mark.parametrize("window", [1, 41])
+def test_the_window_of_a_large_kernel_is_the_middle_of_the_whole(
+    family: str, params: dict[str, Any], window: int
+) -> None:
+    whole, part = kernel.render(family, params), kernel.render(family, params, window=window)
+    spare = (whole.shape[-1] - window) // 2
+    assert spare > 200
+    torch.testing.assert_close(part, whole[spare : spare + window, spare : spare + window], rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize(("family", "params"), LARGE.items())
+def test_a_window_computes_no_more_than_itself(family: str, params: dict[str, Any]) -> None:
+    """A kernel of 1e8 pixels a side; its window holds its share of the light, and is flat but for a ring's hole."""
+    huge = {k: v * 1e6 if k in kernel.LENGTHS else v for k, v in params.items()}
+    part, smaller = kernel.render(family, huge, window=9), kernel.render(family, params, window=1)
+    assert part.shape == (9, 9)
+    torch.testing.assert_close(1e12 * part, smaller.expand(9, 9), rtol=3e-2, atol=0.0)
+
+
+def test_a_window_wider_than_the_kernel_is_the_kernel() -> None:
+    assert torch.equal(kernel.disc(3.0), kernel.render("disc", {"radius": 3.0}, window=99))
+    with pytest.raises(ValueError, match="positive odd number of pixels, got 4"):
+        kernel.render("disc", {"radius": 3.0}, window=4)

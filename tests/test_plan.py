@@ -5,7 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchdof.kernel import disc
 from torchdof.plan import Plan, spacing
+from torchdof.table import BlurTable
 
 TOLERANCE = st.sampled_from([0.0, 1 / 1000, 1 / 255, 1 / 60, 1 / 20, 0.5])
 
@@ -69,3 +71,31 @@ def test_a_bad_coc_does_not_plan() -> None:
     assert Plan.of_scene(coc_map(math.nan, 3.0, 3.0), 1 / 255).nodes[-1] == pytest.approx(2.5)
     reaching = Plan.of_scene(coc_map(-math.inf, math.inf), 1 / 20)
     assert all(math.isfinite(x) for x in reaching.nodes)
+
+
+@pytest.mark.parametrize("name", ["disc", "sato_j15"])
+@pytest.mark.parametrize("coc", [300.0, -90.0, 40.0, 5.0])
+def test_kernels_wider_than_a_frame_are_cut_to_it_and_keep_their_values(name: str, coc: float) -> None:
+    table = BlurTable.disc() if name == "disc" else BlurTable.load(name)
+    size, plan = (20, 31), Plan((math.copysign(abs(coc) - 0.5, coc),), 1 / 255)
+    (blur,) = plan.blurs(table, size, torch.float64, torch.device("cpu"), coarse=True)
+    whole = table.kernels(torch.tensor([coc], dtype=torch.float64), size[1])[0]
+    spare = max(0, whole.shape[-1] // 2 - 30)
+    expected = whole[:, spare : whole.shape[-1] - spare, spare : whole.shape[-1] - spare]
+    torch.testing.assert_close(blur.kernel, expected, rtol=1e-6, atol=0.0)
+    assert spare > 0 or abs(coc) < 30
+
+
+def test_coarse_layers_leave_out_what_the_coarser_pixel_blurs() -> None:
+    """The shrinkage of a large kernel is that of the formula, whichever kernel its second moment is taken from."""
+    table, coc = BlurTable.disc(), 1200.0
+    (blur,) = (
+        b
+        for b in Plan((-0.5, coc - 0.5), 1 / 255).blurs(
+            table, (700, 700), torch.float64, torch.device("cpu"), coarse=True
+        )
+        if b.scale > 1
+    )
+    variance = (coc / blur.scale) ** 2 / 4
+    radius = coc / blur.scale * math.sqrt(1 - (1 / 3 - 1 / (12 * blur.scale**2)) / variance)
+    torch.testing.assert_close(blur.kernel[0], disc(radius), rtol=1e-6, atol=1e-12)

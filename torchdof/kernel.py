@@ -36,6 +36,9 @@ _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 _SMALLEST = 1e-4  # px; a length below it is rendered as this, which is a kernel of one pixel
 _CACHED_HALF_WIDTH = 64
 _LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
+_ALWAYS_WHOLE = 256  # px on each side of the centre; a kernel up to there is computed whole, whatever its window
+_AT_ONCE = 2**20  # slices computed together
+_RINGS = 2**14  # the whole of a larger kernel is summed in so many; agrees with its pixels' sum to 1e-6
 
 Number = float | Tensor
 
@@ -136,7 +139,7 @@ def radial(values: Tensor, radius: Number, size: int | None = None) -> Tensor:
     return render("radial", {"values": values, "radius": radius}, size)
 
 
-def render(family: str, params: Mapping[str, Number], size: int | None = None) -> Tensor:
+def render(family: str, params: Mapping[str, Number], size: int | None = None, window: int | None = None) -> Tensor:
     """Kernel of a family by name.
 
     Args:
@@ -144,32 +147,37 @@ def render(family: str, params: Mapping[str, Number], size: int | None = None) -
         params: Its parameters by name; lengths in pixels, floats or ``[...]`` (``values``: ``[..., P]``), which
             broadcast against each other.
         size: Odd width of the kernel; None takes the smallest that holds the largest kernel asked for.
+        window: Odd width of the middle part that is wanted; None is all. Only that is computed of a large kernel.
 
     Returns:
         ``[..., size, size]``, float64, non-negative, each kernel summing to 1. What lies beyond ``size`` is cut off.
+        With a smaller ``window``, that part of it: ``[..., window, window]``, summing to its share of the light.
 
     Raises:
         ValueError: If the family, a parameter or the size is not as described.
     """
     given = _checked(family, params)
-    size = width_of(family, given, size)
-    half = size // 2
+    if window is None:
+        whole = part = width_of(family, given, size) // 2
+    else:
+        whole = half_width(support(family, given)) if size is None else width_of(family, given, size) // 2
+        part = min(whole, width_of(family, given, window) // 2)
+    half = whole if whole <= _ALWAYS_WHOLE else part
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in given.items()}
     if family == "gaussian":
         quadrant = _gaussian_quadrant(lengths["sigma"], half)
     elif family == "disc":
         quadrant = _disc_quadrant(lengths["radius"], half)
     else:
-        inner, outer, area = _slices(half, lengths[FAMILIES[family][-1]].device)
-        mean = _slice_means(family, lengths, inner, outer)
-        quadrant = (mean * area).sum(-1).unflatten(-1, (half + 1, half + 1))
+        quadrant = _sliced_quadrant(family, lengths, half, whole)
     kernel = torch.cat([quadrant[..., 1:, :].flip(-2), quadrant], -2)
     kernel = torch.cat([kernel[..., 1:].flip(-1), kernel], -1)
-    total = kernel.sum((-2, -1), keepdim=True)
+    total = kernel.sum((-2, -1), keepdim=True) if half == whole else _mass(family, lengths, whole)[..., None, None]
     centre = torch.zeros_like(kernel)
     centre[..., half, half] = 1.0
     # too small to hold any light in float64, or all of it beyond size: a single pixel
-    return torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
+    kernel = torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
+    return kernel[..., half - part : half + part + 1, half - part : half + part + 1]
 
 
 def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
@@ -208,16 +216,7 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
 
 def support(family: str, params: Mapping[str, Number]) -> float:
     """Radius in pixels beyond which a kernel holds less than 4e-6 of its light (for the largest parameters given)."""
-    given = _checked(family, params)
-    if family == "gaussian":
-        reach = 5.0 * given["sigma"]
-    elif family == "ring":
-        reach = given["r_c"] + 5.0 * given["sigma"]
-    elif family == "softm":
-        reach = given["radius"] + 4.5 * given["sigma"]
-    else:
-        reach = given["radius"]
-    return float(reach.detach().max())
+    return float(_reach(family, _checked(family, params)).detach().max())
 
 
 def width_of(family: str, params: Mapping[str, Number], size: int | None) -> int:
@@ -279,6 +278,16 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
     return torch.tensor(value, dtype=torch.float64, device=device)
 
 
+def _reach(family: str, given: Mapping[str, Tensor]) -> Tensor:
+    if family == "gaussian":
+        return 5.0 * given["sigma"]
+    if family == "ring":
+        return given["r_c"] + 5.0 * given["sigma"]
+    if family == "softm":
+        return given["radius"] + 4.5 * given["sigma"]
+    return given["radius"]
+
+
 def _tilt(r: Tensor, given: Mapping[str, Tensor]) -> Tensor:
     return (1.0 + given["b"] * (r / given["radius"]) ** given["m"]).clamp_min(0.0)
 
@@ -309,6 +318,34 @@ def _twice(index: Tensor) -> Tensor:
     """How often a pixel's area in the quadrant counts: one on an axis reaches as far to the other side of it."""
     twice = torch.where(index == 0, 2.0, 1.0)
     return twice[:, None] * twice[None, :]
+
+
+def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, whole: int) -> Tensor:
+    # finer slices where a pixel is a larger part of the kernel
+    slices = 64 if whole <= 4 else 32 if whole <= 12 else 16 if whole <= 64 else 8
+    rows = max(1, _AT_ONCE // ((half + 1) * slices))
+    strips = []
+    for top in range(0, half + 1, rows):
+        cut = _cut_quadrant if half <= _CACHED_HALF_WIDTH else _cut_quadrant.__wrapped__
+        inner, outer, area = (
+            t.to(lengths[FAMILIES[family][-1]].device) for t in cut(half, slices, top, min(top + rows, half + 1))
+        )
+        strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
+    return torch.cat(strips, -2)
+
+
+def _mass(family: str, lengths: Mapping[str, Tensor], half: int) -> Tensor:
+    """Sum over the pixels of a kernel with so many of them on each side of its centre, from rings: ``[...]``."""
+    reach = _reach(family, lengths)
+    side = torch.full_like(reach, half + 0.5)
+    if family == "gaussian":
+        return (2.0 * torch.erf(side / (math.sqrt(2) * lengths["sigma"]))) ** 2
+    if family == "disc":
+        return 4.0 * _corner_area(side, side, lengths["radius"])
+    share = torch.linspace(0.0, 1.0, _RINGS + 1, dtype=torch.float64, device=reach.device)
+    r = torch.minimum(2.0 * reach, math.sqrt(2) * side).detach()[..., None, None] * share  # [..., 1, rings]
+    area = 4.0 * _corner_area(side[..., None, None], side[..., None, None], r).diff(dim=-1)
+    return (_slice_means(family, lengths, r[..., :-1], r[..., 1:]) * area).sum((-2, -1))
 
 
 def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Tensor) -> Tensor:
@@ -351,33 +388,24 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     return (start + left * part + (right - left) * part * part / 2) * radius / last
 
 
-def _slices(half: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Slices of the pixels of a quadrant: inner and outer radius and area, each ``[pixels, slices]``."""
-    cut = _cut_quadrant if half <= _CACHED_HALF_WIDTH else _cut_quadrant.__wrapped__
-    inner, outer, area = cut(half)
-    return inner.to(device), outer.to(device), area.to(device)
-
-
 @functools.lru_cache(maxsize=2 * _CACHED_HALF_WIDTH)
 @torch.inference_mode(False)  # what is kept must serve autograd as well
-def _cut_quadrant(half: int) -> tuple[Tensor, Tensor, Tensor]:
-    # finer slices where a pixel is a larger part of the kernel
-    slices = 64 if half <= 4 else 32 if half <= 12 else 16 if half <= 64 else 8
+def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Slices of the pixels of a quadrant's rows: inner and outer radius and area, each ``[pixels, slices]``."""
     index = torch.arange(half + 1, dtype=torch.float64)
     low, high = (index - 0.5).clamp_min(0.0), index + 0.5
-    nearest = torch.hypot(low[:, None], low[None, :]).flatten()
-    farthest = torch.hypot(high[:, None], high[None, :]).flatten()
+    low_y, low_x = (v.flatten()[:, None] for v in torch.meshgrid(low[top:bottom], low, indexing="ij"))
+    high_y, high_x = (v.flatten()[:, None] for v in torch.meshgrid(high[top:bottom], high, indexing="ij"))
+    nearest, farthest = torch.hypot(low_y, low_x), torch.hypot(high_y, high_x)
     share = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64)
-    r = nearest[:, None] + (farthest - nearest)[:, None] * share
-    low_y, low_x = (v.flatten()[:, None] for v in torch.meshgrid(low, low, indexing="ij"))
-    high_y, high_x = (v.flatten()[:, None] for v in torch.meshgrid(high, high, indexing="ij"))
+    r = nearest + (farthest - nearest) * share
     covered = (
         _corner_area(high_x, high_y, r)
         - _corner_area(low_x, high_y, r)
         - _corner_area(high_x, low_y, r)
         + _corner_area(low_x, low_y, r)
     )
-    covered = covered * _twice(index).flatten()[:, None]
+    covered = covered * _twice(index)[top:bottom].flatten()[:, None]
     return r[:, :-1].contiguous(), r[:, 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
 
 

@@ -16,6 +16,7 @@ _FINEST_SPACING = 0.5
 _SPACING = 2.5  # measured, as the next: keeps the RMS error below the tolerance on every ray-traced scene
 _COARSE_RADIUS = 4.5  # at a tolerance of 1/255 half resolution starts at twice this radius, a quarter at four times
 _COARSEST = 4
+_MOMENT_REACH = 64.0  # px; second moments of kernels that large are those of the continuous profile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,8 +88,8 @@ class Plan:
             parts = flat.split([shape[0] * shape[1] * shape[2] for shape in shapes])
             bank = [_masked(k.reshape(shape), size) for k, shape in zip(parts, shapes, strict=True)]
         else:
-            bank = [_kernel(table, c, width, s) for c, s in zip(self.coc_px, scales, strict=True)]
-            bank = [_cut(kernel, size).to(device, dtype) for kernel in bank]
+            bank = [_cut(table, c, width, s, max(size)) for c, s in zip(self.coc_px, scales, strict=True)]
+            bank = [kernel.to(device, dtype) for kernel in bank]
         return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
 
     @property
@@ -153,16 +154,20 @@ def _span(coc_px: Tensor) -> tuple[float, float]:
 
 @functools.lru_cache(maxsize=512)
 @torch.inference_mode(False)  # what is kept must serve autograd as well
-def _kernel(table: BlurTable, coc_px: float, width: int, scale: int) -> Tensor:
+def _kernel(table: BlurTable, coc_px: float, width: int, scale: int, window: int | None) -> Tensor:
     coc = torch.tensor([coc_px / scale], dtype=torch.float64)
-    kernel = table.kernels(coc, width / scale)[0]
     if scale > 1:
         # averaging, interpolation and the coarser pixel blur as well: leave that much out, by second moments
-        axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
-        variance = float((kernel.mean(0).sum(0) * axis**2).sum()) - 1 / 12
-        shrink = math.sqrt(max(0.25, 1 - (1 / 3 - 1 / (12 * scale**2)) / variance))
-        kernel = table.kernels(coc * shrink, width / scale)[0]
-    return kernel
+        coc = coc * math.sqrt(max(0.25, 1 - (1 / 3 - 1 / (12 * scale**2)) / _variance(table, coc, width / scale)))
+    return table.kernels(coc, width / scale, window=window)[0]
+
+
+def _variance(table: BlurTable, coc_px: Tensor, width: float) -> float:
+    """Second moment of a kernel along an axis; that of a large one from a smaller one of the same shape."""
+    smaller = max(1.0, min(table.reach_px(float(coc_px), width) / _MOMENT_REACH, float(coc_px.abs())))
+    kernel = table.kernels(coc_px / smaller, width / smaller)[0]
+    axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
+    return smaller**2 * (float((kernel.mean(0).sum(0) * axis**2).sum()) - 1 / 12)
 
 
 # one constant each: a compiled graph cannot hold several results of one such function
@@ -170,18 +175,23 @@ def _kernel(table: BlurTable, coc_px: float, width: int, scale: int) -> Tensor:
 def _constant_shapes(
     table: BlurTable, coc_px: tuple[float, ...], width: int, scales: tuple[int, ...]
 ) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(_kernel(table, c, width, s).shape) for c, s in zip(coc_px, scales, strict=True))
+    return tuple(tuple(_kernel(table, c, width, s, None).shape) for c, s in zip(coc_px, scales, strict=True))
 
 
 @torch.compiler.assume_constant_result
 def _constant_bank(table: BlurTable, coc_px: tuple[float, ...], width: int, scales: tuple[int, ...]) -> Tensor:
-    return torch.cat([_kernel(table, c, width, s).flatten() for c, s in zip(coc_px, scales, strict=True)])
+    return torch.cat([_kernel(table, c, width, s, None).flatten() for c, s in zip(coc_px, scales, strict=True)])
 
 
-def _cut(kernel: Tensor, size: tuple[int, int]) -> Tensor:
-    """A kernel without the taps that no pixel of a frame reaches another one with."""
-    spare = max(0, kernel.shape[-1] // 2 - (max(size) - 1))
-    return kernel[..., spare : kernel.shape[-1] - spare, spare : kernel.shape[-1] - spare]
+def _cut(table: BlurTable, coc_px: float, width: int, scale: int, longest: int) -> Tensor:
+    """A kernel without the taps that no pixel of a frame, ``longest`` pixels long, reaches another one with."""
+    wide = _reach(table, coc_px, width, scale) > longest - 0.5
+    return _kernel(table, coc_px, width, scale, 2 * longest - 1 if wide else None)
+
+
+@functools.lru_cache(maxsize=4096)
+def _reach(table: BlurTable, coc_px: float, width: int, scale: int) -> float:
+    return table.reach_px(coc_px / scale, width / scale)
 
 
 def _masked(kernel: Tensor, size: tuple[int, int]) -> Tensor:

@@ -171,7 +171,7 @@ class BlurTable:
                 mixed[name] = mixed[name] * scale
         return mixed
 
-    def kernels(self, coc_px: Tensor, width: float, size: int | None = None) -> Tensor:
+    def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
         """Pixel-integrated kernels at a signed coc.
 
         A blur below the resolution of a pixel passes light through unchanged: for ``|coc_px| <= 0.5`` the kernel is a
@@ -181,6 +181,7 @@ class BlurTable:
             coc_px: Signed coc in pixels ``[n]``.
             width: Width in pixels of the image.
             size: Odd width of the kernels; None takes the smallest that holds them all.
+            window: Odd width of the middle part that is wanted, which then holds its share of the light; None is all.
 
         Returns:
             ``[n, channels, size, size]``, float64, non-negative, each summing to 1. Differentiable in ``coc_px``.
@@ -192,7 +193,7 @@ class BlurTable:
         params = self.params(coc_px, width)
         if coc_px.ndim != 1 or not coc_px.numel():
             raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
-        kernels = kernel.render(self.family, params, size).transpose(0, 1)
+        kernels = kernel.render(self.family, params, size, window).transpose(0, 1)
         if self.family == "disc" and self.reach_px(0.5, width) <= 0.5 + 1e-9:
             return kernels
         share = (2 * coc_px.to(torch.float64).abs() - 1).clamp(0.0, 1.0)[:, None, None, None]
