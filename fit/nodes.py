@@ -32,6 +32,7 @@ _FINEST = 3.0  # cycles a pixel; kernels are sampled on the pixel grid, so frequ
 _BETWEEN = (0.25, 0.5, 0.75)  # where between two nodes spots are traced for the joint fit
 _SWEEPS = 6
 _PULL = 1e-4  # weight of a ray histogram where spots say nothing (details far below a pixel)
+_NARROW = 0.01  # pixels of coc; an interval that narrow is not divided
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +122,11 @@ def _hats(frequency: Array, radius: float, points: int) -> tuple[Array, Array]:
 
 
 def place_nodes(tracer: Tracer, near: float, far: float, nodes: int) -> list[float]:
-    """Signed coc of the nodes: intervals are halved where the table's interpolation is worst in the middle."""
+    """Signed coc of the nodes: intervals are halved where the table's interpolation is worst in the middle.
+
+    Raises:
+        ValueError: If there are no more intervals to halve.
+    """
     places = [near, near / 2, 0.0, far / 2, far] if far > 0 else [near, near / 2, 0.0]
     alone: dict[float, Array] = {}
 
@@ -133,7 +138,7 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int) -> list[flo
 
     def gap(left: float, right: float) -> float:
         radii = tracer.node(left).radius, tracer.node(right).radius
-        if max(radii) <= 0.5:
+        if max(radii) <= 0.5 or right - left < _NARROW * tracer.pixel:
             return 0.0
         between = tracer.sample((left + right) / 2, sum(radii) / 2)
         return between.error((values(left) + values(right)) / 2)
@@ -141,6 +146,11 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int) -> list[flo
     gaps = [gap(*pair) for pair in zip(places, places[1:], strict=False)]
     while len(places) < nodes:
         worst = int(np.argmax(gaps))
+        if gaps[worst] == 0.0:
+            raise ValueError(
+                f"nodes must be at most {len(places)} for this lens and width_px, got {nodes}: between those the spots "
+                "stay within one pixel, or hardly differ; take fewer nodes or a larger width_px"
+            )
         left, right = places[worst], places[worst + 1]
         middle = (left + right) / 2
         places.insert(worst + 1, middle)

@@ -43,7 +43,7 @@ def trace_table(
 
     Nodes are keyed by the signed coc that :class:`torchdof.Camera` computes with the lens's paraxial focal length,
     ``f_number`` and ``focus_m``: use that camera to render with the table. Nodes are placed where interpolation between
-    them would be worst; intervals whose spots stay within one pixel are not divided.
+    them would be worst; intervals whose spots stay within one pixel are not divided, nor those of a hundredth of one.
 
     The table is exact for its focus and f-number. At another focus of the same f-number it holds as far as the lens's
     aberrations do not change with distance; at another f-number it does not.
@@ -73,7 +73,7 @@ def trace_table(
         A table in millimetres of the sensor, with provenance and the relative residual of each node.
 
     Raises:
-        ValueError: If an argument is not as described.
+        ValueError: If an argument is not as described, or there are more nodes than intervals to divide.
 
     Example:
         >>> lens = Lens.read("double_gauss_50mm")
@@ -88,10 +88,8 @@ def trace_table(
     number("field_mm", field_mm, -1e6, 1e6)
     if nodes < (5 if math.isfinite(focus_m) else 3):
         raise ValueError(f"nodes must be at least 5 (3 for a focus at infinity), got {nodes}")
-    for value in (sensor_width_mm, width_px):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e9:
-            told = f"got {show(sensor_width_mm)} and {show(width_px)}"
-            raise ValueError(f"sensor_width_mm and width_px must be positive, {told}")
+    number("sensor_width_mm", sensor_width_mm, 0, 1e9)
+    number("width_px", width_px, 0, 1e9, unit="pixels")
     if wavelengths_um is not None and not lens.dispersive:
         raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
     stopped = lens.with_f_number(f_number)

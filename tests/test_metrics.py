@@ -59,7 +59,7 @@ def test_flip_is_zero_for_equal_images_and_largest_where_they_differ() -> None:
 
 @pytest.mark.parametrize("measure", [metrics.psnr, metrics.ssim])
 def test_different_shapes_are_refused(measure: Callable[[torch.Tensor, torch.Tensor], float]) -> None:
-    with pytest.raises(ValueError, match=r"same shape, got \[1, 3, 9, 8\] and \[1, 3, 8, 8\]"):
+    with pytest.raises(ValueError, match=r"same shape and device, got \[1, 3, 9, 8\] on cpu and \[1, 3, 8, 8\]"):
         measure(torch.zeros(1, 3, 9, 8), torch.zeros(1, 3, 8, 8))
 
 
@@ -67,3 +67,33 @@ def test_different_shapes_are_refused(measure: Callable[[torch.Tensor, torch.Ten
 def test_flip_refuses_what_is_not_one_rgb_image() -> None:
     with pytest.raises(ValueError, match="one RGB image"):
         metrics.flip(torch.zeros(2, 3, 8, 8), torch.zeros(2, 3, 8, 8))
+
+
+IMAGE = torch.zeros(1, 3, 8, 8)
+BAD = IMAGE.clone()
+BAD[0, 0, 2, 3] = math.nan
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: metrics.display(3.0), "linear must be a tensor of linear light, got 3.0"),  # type: ignore[arg-type]
+        (lambda: metrics.display(IMAGE.int()), "linear must be a floating-point tensor"),
+        (lambda: metrics.psnr(IMAGE.numpy(), IMAGE), r"image must be a tensor \[B, C, H, W\]"),  # type: ignore[arg-type]
+        (lambda: metrics.psnr(IMAGE, IMAGE.int()), "truth must be a floating-point tensor"),
+        (lambda: metrics.psnr(IMAGE[0], IMAGE[0]), r"image must be \[B, C, H, W\] .*got \[3, 8, 8\]"),
+        (lambda: metrics.psnr(BAD, IMAGE), "image and truth must be finite, got 1 of 64 pixels"),
+        (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[:, :1]), "mask must be a bool tensor"),
+        (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[0] > 0), r"mask must be \[1 or 1, 1, 8, 8\], got \[3, 8, 8\]"),
+        (lambda: metrics.ssim(IMAGE, BAD), "truth must be finite, got 1 of 192 values"),
+        (lambda: metrics.ssim(IMAGE[..., :5], IMAGE[..., :5]), "SSIM needs at least 6 pixels a side"),
+        (lambda: metrics.flip(BAD, IMAGE), "image must be finite"),
+    ],
+)
+def test_bad_input_is_refused_by_name(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_what_a_mask_leaves_out_may_be_anything() -> None:
+    assert metrics.psnr(BAD, IMAGE, torch.isfinite(BAD).all(1, keepdim=True)) == math.inf

@@ -573,3 +573,38 @@ def test_a_wrong_coc_is_refused(coc: Tensor, message: str) -> None:
 def test_a_table_of_other_channels_than_the_image_is_refused() -> None:
     with pytest.raises(ValueError, match="the table blurs 3 channels, the image has 1"):
         blur_by_coc(torch.rand(1, 1, 4, 5), torch.zeros(1, 1, 4, 5), table=TABLES["colours"])
+
+
+@pytest.mark.parametrize("wrong", [3, "plan", (0.0, 1.0), Plan((), 0.1), Plan((1.0, 0.0), 0.1), Plan(5, 0.1)])  # type: ignore[arg-type]
+def test_what_is_no_plan_is_refused(wrong: Any) -> None:
+    image, depth, camera = torch.rand(1, 3, 6, 7), torch.full((1, 1, 6, 7), 3.0), Camera(focus_m=1.0)
+    for call in (
+        lambda: DepthOfField(camera)(image, depth, plan=wrong),
+        lambda: depth_of_field(image, depth, camera, plan=wrong),
+        lambda: blur_by_coc(image, depth, plan=wrong),
+    ):
+        with pytest.raises(ValueError, match=r"plan must (be a Plan, as|hold layers).* got "):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera": None}, "camera of the state must be a dict, got None"),
+        ({"camera": {"focal_length_mm": 50.0}}, "camera of the state must have the fields .*'f_number' is missing"),
+        ({"camera": {**Camera().__dict__, "f_number": -1.0}}, "camera of the state: f_number must be"),
+        ({"table": {"schema": "other"}}, "table of the state: schema must be"),
+        ({"tolerance": "fine"}, "the state of a DepthOfField: tolerance must be a number"),
+        ({"forward": print}, "must have the fields .*'forward' is not one of them"),
+    ],
+)
+def test_a_bad_state_is_refused_by_field_and_changes_nothing(change: dict[str, Any], message: str) -> None:
+    dof = DepthOfField(Camera(focus_m=1.0), tolerance=0.1)
+    before = repr(dof)
+    state = {"_extra_state": {**dof.get_extra_state(), "method": "fold", **change}}
+    with pytest.raises(ValueError, match=message):
+        dof.load_state_dict(state)
+    assert repr(dof) == before
+    for wrong in (None, 5, {}):
+        with pytest.raises(ValueError, match="the state of a DepthOfField must"):
+            dof.set_extra_state(wrong)  # type: ignore[arg-type]

@@ -1,12 +1,16 @@
 """Checks at the public boundary: what was expected, what came, what to do."""
 
 import dataclasses
-from typing import Literal
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from .arguments import real_tensor, show
+from .camera import Camera
+from .plan import Plan
 from .table import BlurTable
 
 __all__ = [
@@ -18,7 +22,9 @@ __all__ = [
     "image_and_coc",
     "image_and_depth",
     "image_and_map",
+    "plan",
     "stack",
+    "state",
 ]
 
 Method = Literal["layered", "fold"]
@@ -61,6 +67,63 @@ class Options:
         reach = self.max_coc_px
         if isinstance(reach, bool) or not isinstance(reach, int | float) or not 0.5 < reach < 1e300:
             raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(reach)}")
+
+
+def plan(layers: Plan | None) -> None:
+    """Refuse what is not a plan, or one without layers in order.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    if layers is None:
+        return
+    if not isinstance(layers, Plan):
+        raise ValueError(
+            f"plan must be a Plan, as DepthOfField.plan(image, depth) gives, or None, got {show(layers)}; "
+            "leave it out to plan for this image"
+        )
+    nodes = layers.nodes
+    plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in nodes)
+    if not plain or not nodes or any(low >= high for low, high in zip(nodes, nodes[1:], strict=False)):
+        raise ValueError(f"plan must hold layers as a tuple of strictly increasing numbers, got {show(nodes)}")
+
+
+def state(given: Any) -> tuple[Camera, Options]:
+    """What a module's state describes.
+
+    Returns:
+        The camera, and the options with the table.
+
+    Raises:
+        ValueError: Naming the field that is missing, unknown or makes no sense.
+    """
+    names = ["camera", *(field.name for field in dataclasses.fields(Options))]
+    if not isinstance(given, Mapping):
+        raise ValueError(f"the state of a DepthOfField must be a dict, as state_dict() gives, got {show(given)}")
+    _fields("the state of a DepthOfField", given, names)
+    camera = given["camera"]
+    if not isinstance(camera, Mapping):
+        raise ValueError(f"camera of the state must be a dict, got {show(camera)}")
+    _fields("camera of the state", camera, list(Camera.__dataclass_fields__))
+    try:
+        made = Camera(**camera)
+    except ValueError as error:
+        raise ValueError(f"camera of the state: {error}") from error
+    try:
+        table = BlurTable.from_dict(given["table"])
+    except ValueError as error:
+        raise ValueError(f"table of the state: {error}") from error
+    try:
+        return made, Options(**{**{name: given[name] for name in names[1:]}, "table": table})
+    except ValueError as error:
+        raise ValueError(f"the state of a DepthOfField: {error}") from error
+
+
+def _fields(what: str, given: Mapping[str, Any], names: list[str]) -> None:
+    missing, unknown = [n for n in names if n not in given], [n for n in given if n not in names]
+    if missing or unknown:
+        wrong = f"{missing[0]!r} is missing" if missing else f"{show(unknown[0])} is not one of them"
+        raise ValueError(f"{what} must have the fields {', '.join(names)}; {wrong}")
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:

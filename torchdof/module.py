@@ -1,5 +1,6 @@
 """Depth of field as a module and as functions: the chain of the other rooms and nothing else."""
 
+import dataclasses
 from typing import Any
 
 import torch
@@ -175,11 +176,15 @@ class DepthOfField(nn.Module):
         return {"camera": camera, "table": self.table.to_dict(), **self._options(table=False)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
-        state = dict(state)
-        self.camera, self.table = Camera(**state.pop("camera")), BlurTable.from_dict(state.pop("table"))
-        for name, value in state.items():
-            setattr(self, name, value)
+        """Restore what :meth:`get_extra_state` gave, all of it or nothing.
+
+        Raises:
+            ValueError: Naming the field that is missing, unknown or makes no sense.
+        """
+        camera, options = checks.state(state)
+        self.camera = camera
+        for field in dataclasses.fields(options):
+            setattr(self, field.name, getattr(options, field.name))
 
     def extra_repr(self) -> str:
         """Camera, table and options, as ``repr`` shows them."""
@@ -275,6 +280,7 @@ def blur_by_coc(
     table = BlurTable.disc() if table is None else table
     options = Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)
     checks.image_and_coc(image, coc_px, table, values=check)
+    checks.plan(plan)
     behind = checks.background(image, background, background_coc_px, table, options)
     if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
         with torch.autocast(image.device.type, enabled=False):

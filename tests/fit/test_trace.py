@@ -207,9 +207,10 @@ def test_command_in_the_provenance_makes_the_table_again() -> None:
     [
         ({"family": "square"}, "family must be one of gaussian, ring, disc, softm, radial, got 'square'"),
         ({"nodes": 4}, "nodes must be at least 5"),
+        ({"nodes": 40, "width_px": 20}, "nodes must be at most [0-9]+ for this lens and width_px, got 40"),
         ({"points": 2}, "points must be at least 3, got 2"),
-        ({"width_px": 0}, "sensor_width_mm and width_px must be positive"),
-        ({"sensor_width_mm": math.nan}, "sensor_width_mm and width_px must be positive"),
+        ({"width_px": 0}, "width_px must be a number of pixels > 0"),
+        ({"sensor_width_mm": math.nan}, "sensor_width_mm must be a number > 0"),
         ({"wavelengths_um": RGB_UM}, "wavelengths_um need a lens with Abbe numbers"),
         ({"f_number": 1.0}, "f_number must be at least 2.03"),
         ({"f_number": math.nan}, "f_number must be positive"),
