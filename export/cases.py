@@ -52,6 +52,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         ("highlight of 6.5e4", (1, 61, 75), _ramp(-0.7, 0.7)),
         ("infinitely far", (1, 40, 50), _ramp(-0.5, 1.0)),
         ("bad depths", (2, 41, 50), _ramp(-0.8, 0.8)),
+        ("several tiles", (1, 140, 270), _ramp(-0.5, 0.9)),
     ]
     if large:
         frames.append(("960 x 540", (1, 540, 960), _steps))

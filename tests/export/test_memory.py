@@ -1,0 +1,55 @@
+"""A file traced at 64 x 64 renders a frame of 1080p in bounded memory."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchdof import blur_by_coc
+from torchdof.plan import Plan
+
+pytestmark = pytest.mark.hard
+
+LIMIT_GB = 3.0
+SIZE = (1080, 1920)
+
+RENDER = """
+import json, sys
+import numpy as np
+from torchdof import memory
+from torchdof.export import timing
+session = timing.session(sys.argv[1], threads=1)
+feed = timing.feed(session, (int(sys.argv[2]), int(sys.argv[3])), "blurred background")
+(out,) = session.run(None, feed)
+print(json.dumps({"peak_gb": memory.peak_mb() * 2**20 / 1e9}))
+np.savez(sys.argv[4], out=out, **feed)
+"""
+
+
+def test_1080p_is_rendered_right_with_less_than_3_gb(layered: Any, tmp_path: Path) -> None:
+    assert layered.dof.max_coc_px == 32.0
+    call = [sys.executable, "-c", RENDER, str(layered.path), *map(str, SIZE), str(tmp_path / "out.npz")]
+    done = subprocess.run(call, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    peak_gb = json.loads(done.stdout.splitlines()[-1])["peak_gb"]
+    print(f"peak memory {peak_gb:.2f} GB")
+    assert 0.3 < peak_gb < LIMIT_GB
+
+    data = {name: torch.from_numpy(value) for name, value in np.load(tmp_path / "out.npz").items()}
+    out, image = data["out"], data["image"]
+    assert out.shape == (1, 3, *SIZE)
+    assert torch.equal(out[..., :900], image[..., :900]), "the left half is in focus"
+    coc = layered.dof.coc_px(image, data["depth"], data["focus_m"], data["f_number"])
+    assert 30.0 < coc.max() <= 32.0
+    rows, columns = slice(400, 640), slice(1280, 1600)  # of the blurred half, on the coarse layers' grid
+    part = [tensor[..., rows, columns].contiguous() for tensor in (image, coc)]
+    with torch.no_grad():
+        expected = blur_by_coc(*part, plan=Plan.all(32.0, layered.dof.tolerance), **layered.dof._options())
+    inner = (..., slice(80, -80), slice(80, -80))  # where the part's border is out of reach
+    assert (expected - part[0])[inner].abs().max() > 0.3
+    torch.testing.assert_close(out[..., rows, columns][inner], expected[inner], atol=1e-5, rtol=0)
