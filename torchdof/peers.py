@@ -281,7 +281,7 @@ _RATIOS = f"Against ours at {_LEVELS[-1]:g}/255: median over the cases (least to
 
 
 def _machine() -> str:
-    threads = f"{os.cpu_count()} CPUs, {torch.get_num_threads()} threads for each renderer"
+    threads = f"{os.cpu_count()} CPUs, threads for each renderer: {torch.get_num_threads()}"
     versions = f"torchdof {importlib.metadata.version('torchdof')}, torch {torch.__version__}"
     return (
         f"{platform.processor() or platform.machine()}, {threads}; {versions}, Python {platform.python_version()}, "
@@ -302,7 +302,7 @@ def _markdown(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, s
     head = ["case", *_names(rows)]
     parts = [
         "# Beside other tools\n",
-        f"{_machine()}. {repeat} renderings each, in turns, after one more.\n",
+        f"{_machine()}. Timed renderings of each, in turns, after one more: {repeat}.\n",
         *(f"- {peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared),
         *(f"- {name}: {reason}" for name, reason in absent.items()),
     ]
@@ -324,7 +324,7 @@ def _show(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, str],
         for line in lines:
             table.add_row(*line)
         console.print(table)
-    console.print(f"{_machine()}; {repeat} renderings each, in turns.", markup=False, highlight=False)
+    console.print(f"{_machine()}; timed renderings of each: {repeat}.", markup=False, highlight=False)
     for peer in compared[len(_LEVELS) :]:
         console.print(f"{peer.name} {peer.version}: {peer.note}", markup=False, highlight=False)
     for name, reason in absent.items():
