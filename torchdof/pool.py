@@ -15,11 +15,10 @@ def max_around(values: Tensor) -> Tensor:
     """
     for dim in (-2, -1):
         size = values.shape[dim]
-        if size == 1:
-            continue
-        pair = torch.maximum(values.narrow(dim, 0, size - 1), values.narrow(dim, 1, size - 1))
-        first, last = pair.narrow(dim, 0, 1), pair.narrow(dim, size - 2, 1)
-        values = torch.maximum(torch.cat([first, pair], dim), torch.cat([pair, last], dim))
+        first, last = values.narrow(dim, 0, 1), values.narrow(dim, size - 1, 1)
+        padded = torch.cat([first, values, last], dim)
+        either = torch.maximum(padded.narrow(dim, 0, size), padded.narrow(dim, 2, size))
+        values = torch.maximum(values, either)
     return values
 
 
