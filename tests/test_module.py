@@ -605,6 +605,7 @@ def test_a_bad_state_is_refused_by_field_and_changes_nothing(change: dict[str, A
     with pytest.raises(ValueError, match=message):
         dof.load_state_dict(state)
     assert repr(dof) == before
-    for wrong in (None, 5, {}):
+    nothing: list[Any] = [None, 5, {}]
+    for wrong in nothing:
         with pytest.raises(ValueError, match="the state of a DepthOfField must"):
-            dof.set_extra_state(wrong)  # type: ignore[arg-type]
+            dof.set_extra_state(wrong)
