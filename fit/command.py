@@ -76,6 +76,7 @@ def fit(
         plots.mkdir(parents=True, exist_ok=True)
     if lens is not None:
         table = _trace(lens, f_number, focus_m, nodes, console)
+        _lens_summary(table, console)
         _write(table, output, console)
         if plots is not None:
             _draw_table(table, plots, output.stem, console)
@@ -143,6 +144,20 @@ def _summary(one: Captures, result: TableFit, doubts: list[str], console: Consol
     )
     for doubt in doubts:
         console.print(f"warning: {doubt}", style="yellow", markup=False, highlight=False)
+
+
+def _lens_summary(table: BlurTable, console: Console) -> None:
+    facts, places = table.provenance, table.coc.tolist()
+    console.print(
+        f"{facts['lens']}: {facts['focal_length_mm']:g} mm, f/{facts['f_number']:g}, focus {facts['focus_m']} m; "
+        f"{len(places)} distances from {facts['nearest_m']:.3g} m to infinity, circles of confusion "
+        f"from {places[0]:+.3f} to {places[-1]:+.3f} mm",
+        markup=False,
+        highlight=False,
+    )
+    if table.residual is not None:
+        middle, most = 100 * float(table.residual.median()), 100 * float(table.residual.max())
+        console.print(f"family: {table.family}, residual {middle:.2f} %, {most:.2f} % at most", highlight=False)
 
 
 def _write(table: BlurTable, target: Path, console: Console) -> None:

@@ -40,6 +40,8 @@ def test_a_lens_becomes_a_table(tmp_path):
     result = run("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
     assert result.exit_code == 0, result.output
     assert BlurTable.load(tmp_path / "lens.json").unit == "mm"
+    told = " ".join(result.output.split())
+    assert "50.3582 mm, f/4, focus 2.0 m; 5 distances from" in told and "family: radial, residual" in told
 
 
 @pytest.mark.parametrize(
