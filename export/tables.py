@@ -1,8 +1,8 @@
 """The verification of four tables with both methods: ``python -m torchdof.export.tables``.
 
 The disc, a double Gauss traced and fitted as soft discs (``softm``), the ring of Sato et al. and the shipped double
-Gauss (``radial``), each as a file for layers up to 3 pixels, compared with its module. It takes some ten minutes, most of
-it tracing.
+Gauss (``radial``), each as a file for layers up to 3 pixels, compared with its module. It takes some ten minutes,
+most of it tracing.
 """
 
 import argparse
