@@ -11,6 +11,7 @@ from rich.console import Console
 
 from torchdof import Camera, DepthOfField
 from torchdof.render import load_table
+from torchdof.tolerance import from_text
 
 from .conversion import OPSET, to_onnx
 from .metadata import describe
@@ -39,9 +40,13 @@ def export(
         float, typer.Option(help="Largest radius in pixels that the file holds.", rich_help_panel=_BLUR)
     ] = 32.0,
     tolerance: Annotated[
-        float,
-        typer.Option(help="Accepted RMS error on display, of 1; larger is faster, 0 is exact.", rich_help_panel=_BLUR),
-    ] = 1 / 255,
+        str,
+        typer.Option(
+            help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
+            "exact.",
+            rich_help_panel=_BLUR,
+        ),
+    ] = "final",
     no_occlusion: Annotated[
         bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=_BLUR)
     ] = False,
@@ -102,7 +107,7 @@ def export(
     dof = DepthOfField(
         camera,
         load_table(table),
-        tolerance=tolerance,
+        tolerance=from_text(tolerance),
         occlusion=not no_occlusion,
         method=method,
         border=border,

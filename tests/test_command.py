@@ -170,6 +170,7 @@ def test_ready_circles_of_confusion_need_no_camera(scene: Path) -> None:
         (("--table", "gaussian"), {"table": torchdof.BlurTable.gaussian()}),
         (("--table", "sato_j15"), {"table": torchdof.BlurTable.load("sato_j15")}),
         (("--tolerance", "0"), {"tolerance": 0.0}),
+        (("--tolerance", "draft"), {"tolerance": 8 / 255}),
     ],
 )
 def test_options_of_the_blur_are_those_of_the_function(
@@ -309,7 +310,8 @@ def test_missing_depth_frame_is_found_before_anything_is_rendered(scene: Path) -
         (("image.exr", "depth.npy", "--focus-m", "2", "--aperture-radius-m", "0.1"), "goes with --fov-deg"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--fov-deg", "40", "--focal-length-mm", "50"), "say the same"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--table", "nowhere"), "nowhere"),
-        (("image.exr", "depth.npy", "--focus-m", "2", "--tolerance", "-1"), "tolerance"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--tolerance", "-1"), "tolerance must be"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--tolerance", "best"), "one of 'draft', 'preview', 'final'"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--device", "warp"), "--device warp: there is no such device"),
         (
             ("image.exr", "depth.npy", "--focus-m", "2", "--fill-depth", "x"),

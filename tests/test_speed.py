@@ -45,8 +45,8 @@ def measured() -> tuple[list[speed.Row], speed.Subject]:
 
 def test_every_setting_has_its_row(measured: tuple[list[speed.Row], speed.Subject]) -> None:
     rows, _ = measured
-    assert [r.setting.name for r in rows] == [*LEVELS, *LEVELS, "fold 1/255", "fold 1/255"]
-    assert [r.setting.occlusion for r in rows] == [True] * 6 + [False] * 6 + [True, False]
+    assert [r.setting.name for r in rows] == [*LEVELS, *LEVELS, "1/255 looked at", "fold 1/255", "fold 1/255"]
+    assert [r.setting.occlusion for r in rows] == [True] * 6 + [False] * 6 + [True, True, False]
     assert all(r.median_s > 0 and r.units > 0 and r.spread_s == 0 for r in rows)
     assert all(r.megapixels_s == pytest.approx(r.width * r.height / 1e6 / r.median_s) for r in rows)
     assert all(r.keeps for r in rows)
@@ -54,7 +54,7 @@ def test_every_setting_has_its_row(measured: tuple[list[speed.Row], speed.Subjec
 
 def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed.Row], speed.Subject]) -> None:
     rows, subject = measured
-    for r in (r for r in rows if r.setting.method == "layered"):
+    for r in (r for r in rows if r.setting.method == "layered" and not r.setting.attention):
         out, wanted = (
             metrics.display(
                 speed.blur_by_coc(subject.image, subject.coc_px, tolerance=t, occlusion=r.setting.occlusion)
@@ -64,6 +64,17 @@ def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed
         assert r.rms_255 == pytest.approx(255 * float((out - wanted).square().mean().sqrt()), abs=1e-5)
         assert r.psnr_db == pytest.approx(metrics.psnr(out, wanted), abs=1e-3)
         assert r.rms_255 > 0.1 or r.setting.tolerance < 4 / 255  # so that there is something to compare
+
+
+def test_where_the_viewer_looks_the_error_is_that_of_the_tolerance() -> None:
+    subject = speed.shipped(192, 320)
+    look = speed.Setting("layered", True, 1 / 255, attention=(160.0, 96.0, 12.0))
+    wanted = speed.exact(subject, occlusion=True)
+    row = speed.measure(subject, look, wanted, 1, 1.0)
+    everywhere = speed.measure(subject, speed.Setting("layered", True, 1 / 255), wanted, 1, 1.0)
+    assert row.keeps and row.rms_255 > 2 * everywhere.rms_255, "nothing was loosened"
+    wrong = wanted + 0.1 * (speed.weight_map(look.attention, wanted) == 1)
+    assert not speed.measure(subject, look, wrong, 1, 1.0).keeps
 
 
 def test_a_wrong_exact_shows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,8 +179,8 @@ def test_bench_measures_ones_own_scene_and_writes(files: tuple[Path, Path], tmp_
     assert sorted(p.name for p in out.iterdir()) == ["speed.csv", "speed.md", "speed.png"]
     with (out / "speed.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [r["setting"] for r in rows] == [*LEVELS, *LEVELS, "fold 1/255", "fold 1/255"]
-    assert [r["crop"] for r in rows] == ["False"] * 12 + ["True"] * 2
+    assert [r["setting"] for r in rows] == [*LEVELS, *LEVELS, "1/255 looked at", "fold 1/255", "fold 1/255"]
+    assert [r["crop"] for r in rows] == ["False"] * 13 + ["True"] * 2
     text = (out / "speed.md").read_text()
     for fact in (f"torchdof {importlib.metadata.version('torchdof')}", f"torch {torch.__version__}", " threads; "):
         assert fact in text

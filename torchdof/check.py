@@ -12,11 +12,13 @@ from .arguments import real_tensor, show
 from .camera import Camera
 from .plan import Plan
 from .table import BlurTable
+from .tolerance import tolerance_of
 
 __all__ = [
     "Border",
     "Method",
     "Options",
+    "attention",
     "background",
     "both_or_none",
     "image_and_coc",
@@ -52,9 +54,7 @@ class Options:
         if not isinstance(self.table, BlurTable):
             got = type(self.table).__name__
             raise ValueError(f"table must be a torchdof.BlurTable, got {got}; read a file with BlurTable.load()")
-        tolerance = self.tolerance
-        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not 0 <= tolerance < 1:
-            raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, got {show(tolerance)}")
+        tolerance_of(self.tolerance)
         for name in ("occlusion", "normalize", "check"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
@@ -86,6 +86,20 @@ def plan(layers: Plan | None) -> None:
     plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in nodes)
     if not plain or not nodes or any(low >= high for low, high in zip(nodes, nodes[1:], strict=False)):
         raise ValueError(f"plan must hold layers as a tuple of strictly increasing numbers, got {show(nodes)}")
+
+
+def attention(where: object, layers: Plan | None) -> None:
+    """Refuse attention where it cannot be paid.
+
+    Raises:
+        ValueError: If a plan, which holds one tolerance, comes with it, or code is traced.
+    """
+    if where is None:
+        return
+    if layers is not None:
+        raise ValueError("attention plans for two tolerances; leave plan out, or attention")
+    if _traced():
+        raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")
 
 
 def state(given: Any) -> tuple[Camera, Options]:

@@ -15,9 +15,10 @@ from torch import Tensor
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
 
-__all__ = ["Frame", "Sample", "Window"]
+__all__ = ["TILE", "Frame", "Sample", "Window"]
 
 TILE = 64
+"""Pixels of a tile along each axis."""
 _CELL = 16  # occupancy is known in cells of this many pixels
 _BLOCK = 4  # pixels a side that are looked at together to find occupied layers
 _AT_ONCE = 24  # tiles computed together: what fits the cache
@@ -161,7 +162,7 @@ class Frame:
         """Layers that are spread together, far to near: in a whole frame as many as fill the channels."""
         order = list(reversed(range(len(plan.nodes))))
         if self.tiled:
-            self._occupied = self._occupancy(plan, blurs)
+            self._occupied = self.occupancy(plan, blurs)
             return [[k] for k in order if bool(self._occupied[k].any())]
         if not _traced():
             order = [k for k in order if bool(self.any_share(plan, [k], self.margin))]
@@ -239,7 +240,7 @@ class Frame:
         places = [self._cut(s.x, halo, None) for s in self.samples]
         return torch.stack([((x > low) & (x < high)).any() for x in places]).any()
 
-    def _occupancy(self, plan: Plan, blurs: Sequence[Blur]) -> list[Tensor]:
+    def occupancy(self, plan: Plan, blurs: Sequence[Blur]) -> list[Tensor]:
         """For each layer, the tiles that its light can reach: ``[rows, columns]``."""
         height, width = self.area
         count = len(plan.nodes)

@@ -8,10 +8,13 @@ from torch import Tensor, nn
 
 from . import check as checks
 from . import pipeline
+from .attention import Attention
 from .camera import Camera
 from .check import Border, Method, Options
 from .plan import Plan
+from .survey import survey
 from .table import BlurTable
+from .tolerance import Tolerance, tolerance_of
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -23,7 +26,8 @@ class DepthOfField(nn.Module):
         camera: The camera; its focus and f-number can be overridden in each call.
         table: Blur measured from a lens; None takes the ideal disc.
         tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
-            and full resolution. 0 asks for that rendering itself.
+            and full resolution. 0 asks for that rendering itself; ``"draft"`` is 8/255, ``"preview"`` 4/255 and
+            ``"final"`` 1/255.
         occlusion: True composites layers far to near, so that blurred foregrounds cover what is behind and sharp ones
             are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
         normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.
@@ -51,7 +55,7 @@ class DepthOfField(nn.Module):
         self,
         camera: Camera,
         table: BlurTable | None = None,
-        tolerance: float = 1 / 255,
+        tolerance: Tolerance = 1 / 255,
         occlusion: bool = True,
         normalize: bool = True,
         method: Method = "layered",
@@ -62,7 +66,7 @@ class DepthOfField(nn.Module):
         super().__init__()
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
-        table = BlurTable.disc() if table is None else table
+        table, tolerance = BlurTable.disc() if table is None else table, tolerance_of(tolerance)
         Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)  # says what is wrong
         self.camera, self.table = camera, table
         self.tolerance, self.occlusion, self.normalize = float(tolerance), bool(occlusion), bool(normalize)
@@ -77,6 +81,7 @@ class DepthOfField(nn.Module):
         plan: Plan | None = None,
         background: Tensor | None = None,
         background_depth: Tensor | None = None,
+        attention: Attention | None = None,
     ) -> Tensor:
         """Render.
 
@@ -90,6 +95,8 @@ class DepthOfField(nn.Module):
                 is known; it takes the place of the guess that fills what a blurred foreground uncovers.
             background_depth: Its depth in metres, ``[B, 1, H, W]`` or ``[1, 1, H, W]``; nowhere nearer than the image's
                 own, or it counts as that.
+            attention: Where the viewer looks: ``(x, y, radius)`` in pixels, or a map ``[B, 1, H, W]`` of 0 to 1. There
+                the tolerance is kept; elsewhere a draft's is enough.
 
         Returns:
             ``[B, C, H, W]`` in the image's dtype. Differentiable with respect to image, depth, focus and f-number.
@@ -104,7 +111,15 @@ class DepthOfField(nn.Module):
         if background is not None and background_depth is not None:
             behind = self.coc_px(background, background_depth, focus_m, f_number)
         checks.both_or_none(background, background_depth)  # here it is the depth that is missing
-        return blur_by_coc(image, coc, plan=plan, background=background, background_coc_px=behind, **self._options())
+        return blur_by_coc(
+            image,
+            coc,
+            plan=plan,
+            background=background,
+            background_coc_px=behind,
+            attention=attention,
+            **self._options(),
+        )
 
     def layers(
         self,
@@ -166,9 +181,20 @@ class DepthOfField(nn.Module):
         focus_m: float | Tensor | None = None,
         f_number: float | Tensor | None = None,
     ) -> Plan:
-        """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`."""
+        """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`.
+
+        ``print`` tells which layers there are, where in the frame, at which resolution, and what they cost;
+        :attr:`torchdof.plan.Plan.survey` holds the same as numbers.
+
+        Example:
+            >>> dof = DepthOfField(Camera(focus_m=1.0, f_number=1.0))
+            >>> depth = torch.linspace(1, 9, 96).expand(1, 1, 64, 96)
+            >>> print(dof.plan(torch.rand(1, 3, 64, 96), depth))  # doctest: +ELLIPSIS
+            96 x 64, tolerance 1/255, predicted error ...
+        """
         coc = self.coc_px(image, depth, focus_m, f_number)
-        return Plan.of_scene(coc, self.tolerance)
+        plan = Plan.of_scene(coc, self.tolerance)
+        return dataclasses.replace(plan, survey=survey(plan, coc, self.table, self.method == "layered", self.occlusion))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""
@@ -205,6 +231,7 @@ def depth_of_field(
     focus_m: float | Tensor | None = None,
     f_number: float | Tensor | None = None,
     plan: Plan | None = None,
+    attention: Attention | None = None,
     **options: Any,
 ) -> Tensor:
     """Functional form of :class:`DepthOfField`; the options are those of its constructor.
@@ -217,6 +244,7 @@ def depth_of_field(
         focus_m: Overrides the camera's focus distance, float or ``[B]``.
         f_number: Overrides the camera's f-number, float or ``[B]``.
         plan: Layers to render with; None plans for this image.
+        attention: Where the viewer looks, as in :meth:`DepthOfField.forward`.
         **options: Of :class:`DepthOfField`.
 
     Returns:
@@ -230,7 +258,7 @@ def depth_of_field(
         >>> depth_of_field(image, depth, Camera(focus_m=1.0)).shape
         torch.Size([1, 3, 8, 12])
     """
-    return DepthOfField(camera, table, **options)(image, depth, focus_m, f_number, plan)
+    return DepthOfField(camera, table, **options)(image, depth, focus_m, f_number, plan, attention=attention)
 
 
 def blur_by_coc(
@@ -238,7 +266,7 @@ def blur_by_coc(
     coc_px: Tensor,
     *,
     table: BlurTable | None = None,
-    tolerance: float = 1 / 255,
+    tolerance: Tolerance = 1 / 255,
     occlusion: bool = True,
     normalize: bool = True,
     method: Method = "layered",
@@ -248,6 +276,7 @@ def blur_by_coc(
     plan: Plan | None = None,
     background: Tensor | None = None,
     background_coc_px: Tensor | None = None,
+    attention: Attention | None = None,
 ) -> Tensor:
     """Depth of field for pipelines that hold a map of the circle of confusion already.
 
@@ -265,6 +294,7 @@ def blur_by_coc(
         plan: Layers to render with; None plans for this image.
         background: As in :meth:`DepthOfField.forward`.
         background_coc_px: Its signed radius in pixels.
+        attention: As in :meth:`DepthOfField.forward`.
 
     Returns:
         ``[B, C, H, W]`` in the image's dtype.
@@ -278,11 +308,12 @@ def blur_by_coc(
         torch.Size([1, 3, 8, 12])
     """
     table = BlurTable.disc() if table is None else table
-    options = Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)
+    options = Options(table, tolerance_of(tolerance), occlusion, normalize, method, border, max_coc_px, check)
     checks.image_and_coc(image, coc_px, table, values=check)
     checks.plan(plan)
     behind = checks.background(image, background, background_coc_px, table, options)
+    checks.attention(attention, plan)
     if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
         with torch.autocast(image.device.type, enabled=False):
-            return pipeline.blur(image, coc_px, plan, options, behind)
-    return pipeline.blur(image, coc_px, plan, options, behind)
+            return pipeline.blur_attended(image, coc_px, plan, options, behind, attention)
+    return pipeline.blur_attended(image, coc_px, plan, options, behind, attention)

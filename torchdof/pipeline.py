@@ -1,20 +1,25 @@
 """The chain: surfaces of a scene, layers, scatter, composite."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from . import background, composite, highlights, layers
+from .attention import Attention, box_around, weight_map
 from .check import Options
 from .frame import Frame, Sample
 from .loop import side, tile_by_tile
 from .plan import Blur, Plan
 from .spread import layers_by_conv, layers_by_fold
+from .tolerance import NAMED
 
-__all__ = ["blur", "blur_stack"]
+__all__ = ["blur", "blur_attended", "blur_stack"]
 
+_REACH = 4.0  # blur radii within which what lies around a pixel can change it: its light, and what is filled in behind
 _SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
 
 Surface = tuple[Tensor, Tensor, Tensor | None]
@@ -47,6 +52,39 @@ def blur(
     for item in zip(*(t.split(1) for t in maps), strict=True):
         items.append(_render(Plan.of_scene(torch.cat(item[1::2]), options.tolerance), options, *item))
     return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
+
+
+def blur_attended(
+    image: Tensor,
+    coc_px: Tensor,
+    plan: Plan | None,
+    options: Options,
+    behind: tuple[Tensor, Tensor] | None,
+    attention: Attention | None,
+) -> Tensor:
+    """:func:`blur` that keeps the tolerance where the viewer looks; elsewhere that of a draft is enough."""
+    if attention is None:
+        return blur(image, coc_px, plan, options, behind)
+    weight = weight_map(attention, image)
+    loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED["draft"]))
+    known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
+    box = box_around(weight, _REACH * float(known.abs().amax()))
+    if box is None or loose.tolerance == options.tolerance:
+        return blur(image, coc_px, None, loose, behind)
+    part = (..., *box)
+    if image[part].shape == image.shape and bool((weight == 1).all()):
+        return blur(image, coc_px, None, options, behind)
+    around = blur(image, coc_px, None, loose, behind)
+    there = None if behind is None else (behind[0][part], behind[1][part])
+    looked_at = blur(image[part], coc_px[part], None, options, there)
+    share = functional.pad(weight[part], _ends(image, box)).to(image.dtype)
+    return torch.lerp(around, functional.pad(looked_at, _ends(image, box)), share)
+
+
+def _ends(image: Tensor, box: tuple[slice, slice]) -> tuple[int, int, int, int]:
+    """Pixels of the image on each side of a part of it, as ``pad`` takes them."""
+    rows, columns = box
+    return columns.start, image.shape[-1] - columns.stop, rows.start, image.shape[-2] - rows.stop
 
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:

@@ -3,12 +3,16 @@
 import dataclasses
 import functools
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from .layers import blur_axis, from_blur_axis
 from .table import BlurTable
+
+if TYPE_CHECKING:
+    from .survey import Survey
 
 __all__ = ["Blur", "Plan"]
 
@@ -28,11 +32,16 @@ class Plan:
         tolerance: What the plan was made for.
         rays: Highlights are traced (:mod:`torchdof.highlights`) where layers would not do; False spreads them with
             their layers, as plans for every scene do.
+        survey: What the plan means for the scene it was made for; ``print`` shows it.
     """
 
     nodes: tuple[float, ...]
     tolerance: float
     rays: bool = True
+    survey: "Survey | None" = dataclasses.field(default=None, compare=False, repr=False)
+
+    def __str__(self) -> str:
+        return repr(self) if self.survey is None else str(self.survey)
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":

@@ -20,6 +20,7 @@ from rich.progress import (
 
 from .render import RenderSettings, load_table, pick_device, render_frame
 from .sequence import FramePattern, parse_focus, parse_frames
+from .tolerance import from_text
 
 __all__ = ["render"]
 
@@ -100,9 +101,13 @@ def render(
         typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=_BLUR),
     ] = "disc",
     tolerance: Annotated[
-        float,
-        typer.Option(help="Accepted RMS error on display, of 1; larger is faster, 0 is exact.", rich_help_panel=_BLUR),
-    ] = 1 / 255,
+        str,
+        typer.Option(
+            help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
+            "exact.",
+            rich_help_panel=_BLUR,
+        ),
+    ] = "final",
     no_occlusion: Annotated[
         bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=_BLUR)
     ] = False,
@@ -178,7 +183,7 @@ def render(
         depth_channel=depth_channel,
         fill=None if fill_depth is None else _fill(fill_depth),
         table=load_table(table),
-        tolerance=tolerance,
+        tolerance=from_text(tolerance),
         occlusion=not no_occlusion,
         method=method,
         device=pick_device(device),

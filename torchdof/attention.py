@@ -1,0 +1,60 @@
+"""Attention: the tolerance is kept where the viewer looks, and loosened to that of a draft outside.
+
+Reference:
+    Mulder, van Liere, "Fast perception-based depth of field rendering", VRST 2000.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .arguments import show
+
+__all__ = ["Attention", "box_around", "weight_map"]
+
+Attention = tuple[float, float, float] | Tensor
+"""``(x, y, radius)`` in pixels of what the viewer looks at, or a map ``[B, 1, H, W]`` or ``[1, 1, H, W]``, 0 to 1."""
+
+_FADE = 0.25  # of the radius, outside of it
+_ALIGN = 64  # the part is cut where tiles and cells of the whole frame begin
+
+
+def weight_map(attention: Any, image: Tensor) -> Tensor:
+    """How far the viewer looks at each pixel: ``[B or 1, 1, H, W]``, 0 to 1.
+
+    Raises:
+        ValueError: If it is neither three numbers with a radius > 0 nor a map that belongs to the image.
+    """
+    batch, _, height, width = image.shape
+    if isinstance(attention, Tensor):
+        fits = attention.ndim == 4 and attention.shape[0] in (1, batch) and attention.shape[1:] == (1, height, width)
+        if not fits or not attention.is_floating_point() or not bool(((attention >= 0) & (attention <= 1)).all()):
+            raise ValueError(
+                f"attention must be a map [{batch} or 1, 1, {height}, {width}] of floating point values from 0 to 1, "
+                f"or (x, y, radius) in pixels, got {attention.dtype} {list(attention.shape)}"
+            )
+        return attention.to(image.device)
+    numbers = attention if isinstance(attention, tuple | list) and len(attention) == 3 else ()
+    plain = [isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in numbers]
+    if not plain or not all(plain) or not numbers[2] > 0:
+        raise ValueError(f"attention must be (x, y, radius) in pixels, radius > 0, or a map, got {show(attention)}")
+    x, y, radius = (float(v) for v in numbers)
+    rows = torch.arange(height, device=image.device, dtype=torch.float64)[:, None] + 0.5 - y
+    columns = torch.arange(width, device=image.device, dtype=torch.float64) + 0.5 - x
+    beyond = ((rows**2 + columns**2).sqrt() - radius) / (_FADE * radius)
+    return (1.0 - beyond).clamp(0.0, 1.0)[None, None]
+
+
+def box_around(weight: Tensor, reach_px: float) -> tuple[slice, slice] | None:
+    """Rows and columns of what a viewer looks at and all that reaches into it; None if that is nothing."""
+    seen = (weight > 0).flatten(0, 1).any(0)
+    if not bool(seen.any()):
+        return None
+    box = []
+    for dim in (1, 0):
+        at = seen.any(dim).nonzero()[:, 0]
+        first, last = int(at[0]) - math.ceil(reach_px), int(at[-1]) + 1 + math.ceil(reach_px)
+        box.append(slice(max(0, first // _ALIGN * _ALIGN), min(-(-last // _ALIGN) * _ALIGN, seen.shape[1 - dim])))
+    return box[0], box[1]
