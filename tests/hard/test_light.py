@@ -134,3 +134,8 @@ def test_the_ring_of_the_paper_keeps_a_highlight_inside_its_support() -> None:
     out, without = (blur_by_coc(image, coc, table=table)[..., outside] for image in (lit, dark))
     assert outside.any()
     assert_close(out, without, rtol=1e-6, atol=0.0)
+
+
+def test_a_plane_of_nearly_the_largest_float_does_not_overflow() -> None:
+    bright = torch.full((1, 1, 24, 32), 3e38)
+    torch.testing.assert_close(blur_by_coc(bright, torch.full((1, 1, 24, 32), 4.0)), bright, rtol=1e-6, atol=0.0)
