@@ -21,7 +21,7 @@ from torchdof.export.verification import session
 
 
 class Exported:
-    """One exported module, 15 layers up to 6 pixels, and the eager module of the same layers.
+    """One exported module, layers up to 6 pixels, and the eager module of the same layers.
 
     Args:
         folder: Where the file is written.
