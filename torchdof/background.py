@@ -94,12 +94,13 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     gap = (far - near).clamp_min(1e-6)
     clean = (1.0 - edge + _UNCLEAN) if valid is None else (1.0 - edge + _UNCLEAN) * valid
 
+    surroundings = torch.cat([light, coc_px, clean], 1)
+
     def weights() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        around = zip(_around(light, at), _around(coc_px, at), _around(clean, at), _distances(), strict=True)
-        for its_light, its_coc, its_clean, squared in around:
-            weight = its_clean[0] * math.exp(-squared / 4.5)
-            nearness = (far - its_coc[0]) / gap
-            yield its_light, weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
+        for its, squared in zip(_around(surroundings, at), _distances(), strict=True):
+            weight = its[-1] * math.exp(-squared / 4.5)
+            nearness = (far - its[-2]) / gap
+            yield its[:-2], weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
 
     behind, behind_spread = _mean((seen, w) for seen, _, w in weights())
     # a thin foreground has no clean pixel: trust the one that differs most from what is behind
@@ -359,8 +360,9 @@ def _around(values: Tensor, at: Tensor) -> Iterator[Tensor]:
     """The pixels around each position, one offset after the other, in the order of :func:`_distances`."""
     height, width = values.shape[-2:]
     item, row, column = _places(at, height, width)
-    flat = values.transpose(0, 1).flatten(1)
-    for dy in range(-_REACH, _REACH + 1):
-        for dx in range(-_REACH, _REACH + 1):
-            where = ((row + dy).clamp(0, height - 1) + item * height) * width + (column + dx).clamp(0, width - 1)
-            yield flat.index_select(1, where)
+    flat, reach = values.transpose(0, 1).flatten(1), range(-_REACH, _REACH + 1)
+    columns = [(column + dx).clamp(0, width - 1) for dx in reach]
+    for dy in reach:
+        line = ((row + dy).clamp(0, height - 1) + item * height) * width
+        for across in columns:
+            yield flat.index_select(1, line + across)

@@ -18,6 +18,8 @@ from .tolerance import Tolerance, tolerance_of
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
+_DISC = BlurTable.disc()  # one for all: what was computed of a table is kept with it
+
 
 class DepthOfField(nn.Module):
     """The photograph a real lens would have taken, from an all-in-focus image and its depth.
@@ -66,7 +68,7 @@ class DepthOfField(nn.Module):
         super().__init__()
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
-        table, tolerance = BlurTable.disc() if table is None else table, tolerance_of(tolerance)
+        table, tolerance = _DISC if table is None else table, tolerance_of(tolerance)
         Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)  # says what is wrong
         self.camera, self.table = camera, table
         self.tolerance, self.occlusion, self.normalize = float(tolerance), bool(occlusion), bool(normalize)
@@ -307,7 +309,7 @@ def blur_by_coc(
         >>> blur_by_coc(image, torch.linspace(-2, 2, 12).expand(1, 1, 8, 12)).shape
         torch.Size([1, 3, 8, 12])
     """
-    table = BlurTable.disc() if table is None else table
+    table = _DISC if table is None else table
     options = Options(table, tolerance_of(tolerance), occlusion, normalize, method, border, max_coc_px, check)
     checks.image_and_coc(image, coc_px, table, values=check)
     checks.plan(plan)

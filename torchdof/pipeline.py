@@ -40,7 +40,7 @@ def blur(
     """
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
-    maps = [t.to(wide).expand(image.shape[0], -1, -1, -1) for t in maps]
+    maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]
     if plan is None and _traced():
         plan = Plan.all(_constant(options.max_coc_px), _constant(options.tolerance))
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):

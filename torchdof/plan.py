@@ -97,7 +97,7 @@ class Plan:
             parts = flat.split([shape[0] * shape[1] * shape[2] for shape in shapes])
             bank = [_masked(k.reshape(shape), size) for k, shape in zip(parts, shapes, strict=True)]
         else:
-            bank = [_cut(table, c, width, s, max(size)) for c, s in zip(self.coc_px, scales, strict=True)]
+            bank = [_cut(table, c, width, s, -(-max(size) // s)) for c, s in zip(self.coc_px, scales, strict=True)]
             bank = [kernel.to(device, dtype) for kernel in bank]
         return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
 

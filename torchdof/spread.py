@@ -85,7 +85,7 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
 
     Args:
         light: ``[B, C, H, W]``.
-        kernels: ``[C, k, k]``, symmetric under a half turn, k odd.
+        kernels: ``[1 or C, k, k]``, symmetric under a half turn, k odd.
         halo: Pixels on each side that scatter light into the result but are not part of it.
 
     Returns:
@@ -102,6 +102,7 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
         True
     """
     _check(light, kernels)
+    kernels = kernels.expand(light.shape[1], -1, -1)
     half = kernels.shape[-1] // 2
     if halo > half:
         spare = halo - half
@@ -110,7 +111,7 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     if half == 0:
         return light * kernels[:, 0, 0, None, None]
     if (2 * half + 1) ** 2 > _DIRECT_TAPS and not _traced():
-        return _fourier(light, kernels)[..., halo : light.shape[-2] - halo, halo : light.shape[-1] - halo]
+        return _fourier(light, kernels, halo)
     batch, channels = light.shape[:2]
     together = _PACK // channels if not _traced() and batch > 1 and channels <= _PACK // 2 else 1
     if together > 1:  # items as channels of one convolution
@@ -160,14 +161,18 @@ def _side_by_side(blurs: Sequence[tuple[Blur, int]]) -> Tensor:
     return torch.cat([k.repeat(channels // k.shape[0], 1, 1) for k, (_, channels) in zip(kernels, blurs, strict=True)])
 
 
-def _fourier(light: Tensor, kernels: Tensor) -> Tensor:
-    height, width = light.shape[-2:]
-    half = kernels.shape[-1] // 2
-    area = [_smooth_length(height + 2 * half), _smooth_length(width + 2 * half)]
-    wide = _widest(light.device)
-    spectrum = torch.fft.rfft2(light.to(wide), s=area) * torch.fft.rfft2(kernels.to(wide), s=area)
-    spread = torch.fft.irfft2(spectrum, s=area)[..., half : half + height, half : half + width]
-    return spread.to(light.dtype)
+def _fourier(light: Tensor, kernels: Tensor, halo: int) -> Tensor:
+    """Channel by channel, for these transforms are large. What would wrap around falls into the halo."""
+    half, wide = kernels.shape[-1] // 2, _widest(light.device)
+    area = [_smooth_length(n + 2 * (half - halo)) for n in light.shape[-2:]]
+    rows, columns = (slice(half + halo, half + n - halo) for n in light.shape[-2:])
+    spectrum, channels = kernels.new_empty(0), []
+    for i, kernel in enumerate(kernels):
+        if i == 0 or kernels.requires_grad or not torch.equal(kernel, kernels[i - 1]):
+            spectrum = torch.fft.rfft2(kernel.to(wide), s=area)
+        scattered = torch.fft.irfft2(torch.fft.rfft2(light[:, i].to(wide), s=area) * spectrum, s=area)
+        channels.append(scattered[:, rows, columns].to(light.dtype))
+    return torch.stack(channels, 1)
 
 
 def _widest(device: torch.device) -> torch.dtype:
