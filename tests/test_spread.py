@@ -223,15 +223,15 @@ def test_fold_of_a_1080p_frame_at_radius_16_stays_within_2_gb() -> None:
 
 @pytest.mark.parametrize("radius", [2.5, 14.0])
 def test_one_kernel_serves_all_channels(radius: float) -> None:
-    light, kernel = torch.rand(2, 3, 20, 24), disc(radius).float()[None]
-    torch.testing.assert_close(conv(light, kernel), conv(light, kernel.repeat(3, 1, 1)), rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(conv(light, kernel), fold(light, kernel), rtol=1e-5, atol=1e-6)
+    light, psf = torch.rand(2, 3, 20, 24), kernel.disc(radius).float()[None]
+    assert_close(spread.conv(light, psf), spread.conv(light, psf.repeat(3, 1, 1)), rtol=1e-6, atol=1e-6)
+    assert_close(spread.conv(light, psf), spread.fold(light, psf), rtol=1e-5, atol=1e-6)
 
 
 def test_a_large_kernel_uses_the_halo_as_if_the_frame_went_on() -> None:
-    light, kernels = torch.rand(1, 2, 90, 100), torch.stack([disc(12.0), disc(11.0)]).float()
+    light, kernels = torch.rand(1, 2, 90, 100), torch.stack([kernel.disc(12.0), kernel.disc(11.0)]).float()
     half = kernels.shape[-1] // 2
-    whole = conv(light, kernels)[..., half:-half, half:-half]
-    torch.testing.assert_close(conv(light, kernels, half), whole, rtol=1e-5, atol=1e-6)
-    some = conv(light, kernels, 5)
-    torch.testing.assert_close(some, conv(light, kernels)[..., 5:-5, 5:-5], rtol=1e-5, atol=1e-6)
+    whole = spread.conv(light, kernels)[..., half:-half, half:-half]
+    assert_close(spread.conv(light, kernels, half), whole, rtol=1e-5, atol=1e-6)
+    some = spread.conv(light, kernels, 5)
+    assert_close(some, spread.conv(light, kernels)[..., 5:-5, 5:-5], rtol=1e-5, atol=1e-6)
