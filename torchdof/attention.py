@@ -36,9 +36,9 @@ def weight_map(attention: Any, image: Tensor) -> Tensor:
                 f"or (x, y, radius) in pixels, got {attention.dtype} {list(attention.shape)}"
             )
         return attention.to(image.device)
-    numbers = attention if isinstance(attention, tuple | list) and len(attention) == 3 else ()
+    numbers: list[Any] = list(attention) if isinstance(attention, tuple | list) else []
     plain = [isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in numbers]
-    if not plain or not all(plain) or not numbers[2] > 0:
+    if len(plain) != 3 or not all(plain) or not numbers[2] > 0:
         raise ValueError(f"attention must be (x, y, radius) in pixels, radius > 0, or a map, got {show(attention)}")
     x, y, radius = (float(v) for v in numbers)
     rows = torch.arange(height, device=image.device, dtype=torch.float64)[:, None] + 0.5 - y
