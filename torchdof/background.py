@@ -6,8 +6,7 @@ are split between their surfaces (:func:`split_mixed`), without touching texture
 
 Where a foreground blurs, what is behind it shows through, and no pixel of the image holds it. A hidden sample, filled
 from the farther surfaces around (:func:`fill_hidden`), stands in with a weight so small that it speaks only where
-nothing
-visible does.
+nothing visible does.
 
 Both give the second sample of a pixel: its light, coc and weight. Work is done at the pixels that need it. Their number
 depends on the data, which compiled graphs do not allow for, so these call :func:`surfaces` as one opaque operator.
@@ -53,8 +52,7 @@ def surfaces(
 
     Returns:
         Light ``[B, C, H, W]`` and weight ``[B, 1, H, W]`` of each pixel's own surface; light, coc and weight of its
-        second
-        one, which is mixed into the pixel or hidden behind it.
+        second one, which is mixed into the pixel or hidden behind it.
     """
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
         own, seen, other, other_coc, share = _surfaces_operator(light, coc_px, valid, levels)
@@ -66,8 +64,7 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     """Split pixels at depth edges between the surface they are attributed to and the one across the edge.
 
     With F and B the light of the two surfaces near the pixel, the share of F in a pixel is the least-squares
-    solution of
-    ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on that surface)
+    solution of ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on that surface)
     and drawn towards no split at all where the contrast of the two is small against the texture of each, or where the
     texture of the pixel's own surface explains it and moves little light. The light of the two parts sums to the
     pixel's.
@@ -156,8 +153,7 @@ def fill_hidden(
 
     A pyramid averages at each step only the farthest of four children. A pixel takes the mean of the levels that show
     something behind it, finer ones first, and of the four samples around it there only those that do; it looks no
-    farther
-    than its own blur reaches, for deeper inside nothing of what is hidden can show.
+    farther than its own blur reaches, for deeper inside nothing of what is hidden can show.
 
     Args:
         light: Own light of each pixel ``[B, C, H, W]``.

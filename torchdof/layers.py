@@ -1,11 +1,9 @@
 """Signed circle of confusion to soft layers: how much of each pixel's light each layer carries.
 
 Layers sit at nodes of signed coc, ``nodes[0] < nodes[1] < ...``, so from the nearest to the farthest. A pixel between
-two
-nodes is shared linearly, which makes the picture continuous and differentiable in depth, focus and aperture. All of it
-follows from one ramp: the share of a pixel at or behind node k is ``clamp((x - nodes[k-1]) / (nodes[k] -
-nodes[k-1]))``;
-the share in layer k is the difference of two ramps.
+two nodes is shared linearly, which makes the picture continuous and differentiable in depth, focus and aperture. All of
+it follows from one ramp: the share of a pixel at or behind node k is
+``clamp((x - nodes[k-1]) / (nodes[k] - nodes[k-1]))``; the share in layer k is the difference of two ramps.
 
 Nodes live on the *blur axis* ``x = sign(coc) * max(|coc| - 0.5, 0)``: everything within half a pixel of focus passes
 through unchanged and is one layer, at x = 0.
