@@ -3,8 +3,7 @@
 Layers know how much of the lens a blurred foreground covers, not which part. For ordinary light that is enough; in the
 disc of a highlight everybody sees it, for a post in front of a lamp draws a crisp line through its disc. A ray from a
 pixel at ``p`` with coc ``c`` through the point ``u`` of the lens lands at ``p + c u``, and it passes a nearer surface
-with
-coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sharp image itself tells which rays pass.
+with coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sharp image itself tells which rays pass.
 
 Highlights are few. What exceeds the ordinary light around it is taken out of the layers, and added again as rays:
 where something nearer could stand in the way, where its layer is too coarse for a crisp edge, and at the frame's
