@@ -92,7 +92,7 @@ def test_coarse_layers_leave_out_what_the_coarser_pixel_blurs() -> None:
     (blur,) = (
         b
         for b in Plan((-0.5, coc - 0.5), 1 / 255).blurs(
-            table, (700, 700), torch.float64, torch.device("cpu"), coarse=True
+            table, (2800, 2800), torch.float64, torch.device("cpu"), coarse=True
         )
         if b.scale > 1
     )

@@ -63,11 +63,11 @@ def surfaces(
 def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Split pixels at depth edges between the surface they are attributed to and the one across the edge.
 
-    With F and B the light of the two surfaces near the pixel, the share of F in a pixel is the least-squares
-    solution of ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on that surface)
-    and drawn towards no split at all where the contrast of the two is small against the texture of each, or where the
-    texture of the pixel's own surface explains it and moves little light. The light of the two parts sums to the
-    pixel's.
+    With F and B the light of the two surfaces near the pixel, the share of F in a pixel is the least-squares solution
+    of ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on that
+    surface) and drawn towards no split at all where the contrast of the two is small against the texture of each, or
+    where the texture of the pixel's own surface explains it and moves little light. The light of the two parts sums to
+    the pixel's.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -173,7 +173,8 @@ def fill_hidden(
     colour = torch.where(mixed, other_light, light)
     # a highlight is in one place: what is hidden beside it is no highlight
     most, brightest = highlights.ordinary(colour, valid), colour.amax(1, keepdim=True)
-    colour = colour * torch.where(brightest > most, most / brightest, 1.0)
+    bright = brightest > most
+    colour = colour * torch.where(bright, most / torch.where(bright, brightest, 1.0), 1.0)
     weight = torch.where(mixed, share, 1.0 - share)
     if valid is not None:
         depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid

@@ -6,8 +6,8 @@ Sign and axis conventions are stated here once; every other module links to this
 * The circle of confusion (coc) is a signed **radius** in pixels of the image at hand: negative in front of the focus
   plane, 0 on it, positive behind it.
 * ``coc_px = (A / 2) * F * (1/s - 1/z)`` with ``A`` the aperture diameter [m], ``s`` the focus distance [m] and ``F``
-  the image distance over the pixel pitch [px]. For a camera of focal length ``f``, f-number ``n`` and sensor width ``w``:
-  ``A = f / n``, image distance ``s f / (s - f)``, pitch ``w / width``.
+  the image distance over the pixel pitch [px]. For a camera of focal length ``f``, f-number ``n`` and sensor width
+  ``w``: ``A = f / n``, image distance ``s f / (s - f)``, pitch ``w / width``.
 
 Reference: Potmesil and Chakravarty, "A lens and aperture camera model for synthetic image generation", SIGGRAPH 1981.
 """

@@ -95,7 +95,8 @@ class Plan:
             shapes = _constant_shapes(table, self.coc_px, width, tuple(scales))
             flat = _constant_bank(table, self.coc_px, width, tuple(scales)).to(device, dtype)
             parts = flat.split([shape[0] * shape[1] * shape[2] for shape in shapes])
-            bank = [_masked(k.reshape(shape), size) for k, shape in zip(parts, shapes, strict=True)]
+            longest = [(torch.sym_max(*size) + s - 1) // s for s in scales]
+            bank = [_masked(k.reshape(shape), n) for k, shape, n in zip(parts, shapes, longest, strict=True)]
         else:
             bank = [_cut(table, c, width, s, -(-max(size) // s)) for c, s in zip(self.coc_px, scales, strict=True)]
             bank = [kernel.to(device, dtype) for kernel in bank]
@@ -203,8 +204,8 @@ def _reach(table: BlurTable, coc_px: float, width: int, scale: int) -> float:
     return table.reach_px(coc_px / scale, width / scale)
 
 
-def _masked(kernel: Tensor, size: tuple[int, int]) -> Tensor:
+def _masked(kernel: Tensor, longest: int) -> Tensor:
     """The same for traced code, whose kernels keep their size: these taps are 0."""
     half = kernel.shape[-1] // 2
-    within = (torch.arange(-half, half + 1, device=kernel.device).abs() < torch.sym_max(*size)).to(kernel.dtype)
+    within = (torch.arange(-half, half + 1, device=kernel.device).abs() < longest).to(kernel.dtype)
     return kernel * within * within[:, None]

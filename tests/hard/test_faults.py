@@ -283,11 +283,22 @@ def frames(folder: Path, count: int) -> list[str]:
     return ["shot.####.exr", "depth.npy", "-o", "out.####.exr", "--focus-m", "2"]
 
 
+def heed_interrupts() -> None:
+    """Tests that run in the background of a shell are told to ignore them, and so would be what they start."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_an_interrupted_sequence_keeps_what_is_whole_and_resumes(tmp_path: Path) -> None:
     count = 400
     arguments = frames(tmp_path, count)
     command = [sys.executable, "-m", "torchdof", "render", *arguments]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=heed_interrupts,
+    ) as run:
         deadline = time.monotonic() + 60
         while len(list(tmp_path.glob("out.*"))) < 5 and time.monotonic() < deadline and run.poll() is None:
             time.sleep(0.002)
