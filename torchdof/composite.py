@@ -12,8 +12,13 @@ from .spread import Spread, fold
 
 __all__ = ["accumulate", "accumulate_once", "over"]
 
-Canvas = tuple[Tensor, Tensor]  # light and coverage
-Lay = Callable[[Tensor, Tensor, list[Tensor]], Canvas]
+Lay = Callable[[Tensor, Tensor], Tensor]
+"""What lies on a canvas, and a scattered layer -> what lies on it then.
+
+A canvas is light ``[B, C, H, W]`` and, after it, its coverage: one for all colours, or one each where they have kernels
+of their own. A layer is scattered light, share, room (the share at or behind the layer) and the share that was seen,
+where any was not.
+"""
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 
@@ -40,19 +45,22 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
 
-    def lay(out: Tensor, covered: Tensor, parts: list[Tensor]) -> Canvas:
-        light, share, room = parts[0], parts[1], parts[2].clamp_min(_LEAST)
-        coverage = (share / room).clamp(0.0, 1.0)
-        colour = light / room
-        if len(parts) > 3:  # light that was not seen: the colour of what was, fading out with the last of it
-            floor = share.clamp(_LEAST**2, _LEAST)
-            colour = colour * (share / torch.maximum(parts[3], floor))
-            coverage = coverage * (parts[3] / floor).clamp(max=1.0)
-        left = 1.0 - coverage
-        return torch.addcmul(colour, left, out), 1.0 - left + left * covered
+    colours, each = frame.colours, blurs[0].kernel.shape[0]
 
-    out, covered = _lay_all(frame, plan, blurs, spread, True, lay)
-    return frame.image(torch.where(covered > _LEAST, out / covered.clamp_min(_LEAST), 0.0))
+    def lay(canvas: Tensor, layer: Tensor) -> Tensor:
+        light_and_share, room, seen = layer.tensor_split((colours + each, colours + 2 * each), 1)
+        room = room.clamp_min(_LEAST)
+        if seen.shape[1]:  # light that was not seen: the colour of what was, fading out with the last of it
+            light, share = light_and_share.tensor_split((colours,), 1)
+            floor = share.clamp(_LEAST**2, _LEAST)
+            light = light * (share / torch.maximum(seen, floor))
+            light_and_share = torch.cat([light, share * (seen / floor).clamp(max=1.0)], 1)
+        laid = light_and_share / _each(room, colours)
+        left = (1.0 - laid[:, colours:]).clamp_min(0.0)
+        return torch.addcmul(laid, _each(left, colours), canvas)
+
+    canvas = _lay_all(frame, plan, blurs, spread, True, lay)
+    return frame.image(_mean(canvas, colours))
 
 
 def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, normalize: bool) -> Tensor:
@@ -72,13 +80,13 @@ def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, norm
         Sato, Dobashi, Yamamoto, section 3.
     """
 
-    def lay(total: Tensor, weight: Tensor, parts: list[Tensor]) -> Canvas:
-        return total + parts[0], weight + parts[1]
+    colours = frame.colours
 
-    total, weight = _lay_all(frame, plan, blurs, spread, False, lay)
-    if normalize:
-        total = torch.where(weight > _LEAST, total / weight.clamp_min(_LEAST), 0.0)
-    return frame.image(total)
+    def lay(canvas: Tensor, layer: Tensor) -> Tensor:
+        return canvas + layer
+
+    canvas = _lay_all(frame, plan, blurs, spread, False, lay)
+    return frame.image(_mean(canvas, colours) if normalize else canvas[:, :colours])
 
 
 def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool) -> Tensor:
@@ -108,61 +116,57 @@ def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool
     else:
         scattered = fold(torch.cat([light, known], 1), kernels.repeat(1, 2, 1, 1), torch.cat(terms, 1))
     scattered = scattered[..., halo : scattered.shape[-2] - halo, halo : scattered.shape[-1] - halo]
-    total, weight = scattered[:, : light.shape[1]], scattered[:, light.shape[1] :]
-    if normalize:
-        total = torch.where(weight > _LEAST, total / weight.clamp_min(_LEAST), 0.0)
-    return frame.image(total)
+    return frame.image(_mean(scattered, frame.colours) if normalize else scattered[:, : frame.colours])
 
 
-def _lay_all(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, lay: Lay) -> Canvas:
+def _mean(canvas: Tensor, colours: int) -> Tensor:
+    """Light over its coverage; 0 where nothing is known."""
+    light, covered = canvas.tensor_split((colours,), 1)
+    return torch.where(covered > _LEAST, light / covered.clamp_min(_LEAST), 0.0)
+
+
+def _each(share: Tensor, colours: int) -> Tensor:
+    """One value for light and coverage, or those of the colours twice."""
+    return share if share.shape[1] == 1 else share.repeat(1, 2, 1, 1)
+
+
+def _lay_all(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, lay: Lay) -> Tensor:
     """Lay all layers, far to near, on an empty canvas."""
     canvas = frame.canvas(blurs[0].kernel.shape[0])
     for group in frame.groups(plan, blurs):
 
-        def laid(out: Tensor, covered: Tensor, group: list[int] = group) -> Canvas:
-            for tiles, parts in _spread_group(frame, plan, blurs, spread, with_room, group):
+        def laid(canvas: Tensor, group: list[int] = group) -> Tensor:
+            for tiles, layer in _spread_group(frame, plan, blurs, spread, with_room, group):
                 if tiles is None:
-                    out, covered = lay(out, covered, parts)
+                    canvas = lay(canvas, layer)
                 else:
-                    out[tiles], covered[tiles] = lay(out[tiles], covered[tiles], parts)
-            return out, covered
+                    canvas.index_copy_(0, tiles, lay(canvas.index_select(0, tiles), layer))
+            return canvas
 
         if torch.compiler.is_exporting():  # a graph cannot choose its work beforehand: each group becomes a branch
             needed = frame.any_share(plan, group, max(blurs[k].halo for k in group))
-            canvas = torch.cond(needed, _dense(laid), _untouched, canvas)
+            canvas = torch.cond(needed, _dense(laid), torch.clone, (canvas,))
         else:
-            canvas = laid(*canvas)
+            canvas = laid(canvas)
     return canvas
 
 
-def _dense(laid: Callable[[Tensor, Tensor], Canvas]) -> Callable[[Tensor, Tensor], Canvas]:
+def _dense(laid: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
     """Both branches of a condition must lie in memory the same way."""
-
-    def dense(out: Tensor, covered: Tensor) -> Canvas:
-        out, covered = laid(out, covered)
-        kept = torch.contiguous_format
-        return out.clone(memory_format=kept), covered.clone(memory_format=kept)
-
-    return dense
-
-
-def _untouched(out: Tensor, covered: Tensor) -> Canvas:
-    return out.clone(), covered.clone()
+    return lambda canvas: laid(canvas).clone(memory_format=torch.contiguous_format)
 
 
 def _spread_group(
     frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, group: list[int]
-) -> Iterator[tuple[Tensor | None, list[Tensor]]]:
-    """Scattered light, share, room (share at or behind) and seen share of layers, far to near, tiles by tiles."""
+) -> Iterator[tuple[Tensor | None, Tensor]]:
+    """Scattered layers, far to near, tiles by tiles."""
     halo = max(blurs[k].halo for k in group)
     for tiles, window in frame.windows(group, halo):
         terms = [window.terms(plan.nodes, k, with_room) for k in group]
         if blurs[group[0]].kernel.shape[0] > 1:
-            colours = terms[0][0].shape[1]
-            terms = [[part.expand(-1, colours, -1, -1) for part in parts] for parts in terms]
-        lengths = [part.shape[1] for parts in terms for part in parts]
-        kernels = [(blurs[k], sum(p.shape[1] for p in parts)) for k, parts in zip(group, terms, strict=True)]
-        scattered = spread(torch.cat([p for parts in terms for p in parts], 1), kernels, halo).split(lengths, 1)
-        each = len(terms[0])
-        for i in range(0, len(scattered), each):
-            yield tiles, [frame.at(part, tiles) for part in scattered[i : i + each]]
+            terms = [[part.expand(-1, frame.colours, -1, -1) for part in parts] for parts in terms]
+        lengths = [sum(part.shape[1] for part in parts) for parts in terms]
+        kernels = [(blurs[k], length) for k, length in zip(group, lengths, strict=True)]
+        scattered = spread(torch.cat([part for parts in terms for part in parts], 1), kernels, halo)
+        for layer in scattered.split(lengths, 1):
+            yield tiles, frame.at(layer, tiles)

@@ -134,18 +134,21 @@ class Frame:
         frame.independent = False
         return frame
 
-    def canvas(self, kernels: int = 1) -> tuple[Tensor, Tensor]:
-        """Nothing yet: light and coverage to lay layers on; ``kernels`` is 1, or C where each colour has its own."""
+    @property
+    def colours(self) -> int:
+        """C of the samples."""
+        return int(self.samples[0].light.shape[1])
+
+    def canvas(self, kernels: int = 1) -> Tensor:
+        """Nothing yet: light, and after it its coverage; ``kernels`` is 1, or C where each colour has its own."""
         light = self.samples[0].light
         if self.tiled:
             count = self.area[0] // TILE * (self.area[1] // TILE)
-            return light.new_zeros(count, light.shape[1], TILE, TILE), light.new_zeros(count, kernels, TILE, TILE)
-        return light.new_zeros(light.shape[0], light.shape[1], *self.area), light.new_zeros(
-            light.shape[0], kernels, *self.area
-        )
+            return light.new_zeros(count, self.colours + kernels, TILE, TILE)
+        return light.new_zeros(light.shape[0], self.colours + kernels, *self.area)
 
     def image(self, canvas: Tensor) -> Tensor:
-        """The image on a canvas, ``[B, C, H, W]``."""
+        """What a canvas, or a part of its channels, shows: ``[B, C, H, W]``."""
         if self.tiled:
             rows, columns = self.area[0] // TILE, self.area[1] // TILE
             canvas = canvas.unflatten(0, (rows, columns)).permute(2, 0, 3, 1, 4).reshape(1, -1, *self.area)
