@@ -6,19 +6,23 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .frame import Frame
+from .coarse import Coarse
+from .frame import TILE, Frame
 from .plan import Blur, Plan
 from .spread import Spread, fold
 
 __all__ = ["accumulate", "accumulate_once", "over"]
 
-Lay = Callable[[Tensor, Tensor], Tensor]
-"""What lies on a canvas, and a scattered layer -> what lies on it then.
+Settle = Callable[[Tensor], Tensor]
+"""A scattered layer -> what it puts on a canvas.
 
-A canvas is light ``[B, C, H, W]`` and, after it, its coverage: one for all colours, or one each where they have kernels
-of their own. A layer is scattered light, share, room (the share at or behind the layer) and the share that was seen,
-where any was not.
+A layer is scattered light ``[B, C, H, W]`` and, after it, share, room (the share at or behind the layer) and the share
+that was seen, where any was not. A canvas is light and its coverage: one for all colours, or one each where they have
+kernels of their own.
 """
+
+Join = Callable[[Tensor, Tensor], Tensor]
+"""What is in front, and the canvas behind it -> both on one canvas."""
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 
@@ -44,10 +48,9 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
-
     colours, each = frame.colours, blurs[0].kernel.shape[0]
 
-    def lay(canvas: Tensor, layer: Tensor) -> Tensor:
+    def settle(layer: Tensor) -> Tensor:
         light_and_share, room, seen = layer.tensor_split((colours + each, colours + 2 * each), 1)
         room = room.clamp_min(_LEAST)
         if seen.shape[1]:  # light that was not seen: the colour of what was, fading out with the last of it
@@ -55,11 +58,13 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
             floor = share.clamp(_LEAST**2, _LEAST)
             light = light * (share / torch.maximum(seen, floor))
             light_and_share = torch.cat([light, share * (seen / floor).clamp(max=1.0)], 1)
-        laid = light_and_share / _each(room, colours)
-        left = (1.0 - laid[:, colours:]).clamp_min(0.0)
-        return torch.addcmul(laid, _each(left, colours), canvas)
+        return light_and_share / _each(room, colours)
 
-    canvas = _lay_all(frame, plan, blurs, spread, True, lay)
+    def join(front: Tensor, canvas: Tensor) -> Tensor:
+        left = (1.0 - front[:, colours:]).clamp_min(0.0)
+        return torch.addcmul(front, _each(left, colours), canvas)
+
+    canvas = _lay_all(frame, plan, blurs, spread, True, settle, join)
     return frame.image(_mean(canvas, colours))
 
 
@@ -79,13 +84,8 @@ def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, norm
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
     """
-
     colours = frame.colours
-
-    def lay(canvas: Tensor, layer: Tensor) -> Tensor:
-        return canvas + layer
-
-    canvas = _lay_all(frame, plan, blurs, spread, False, lay)
+    canvas = _lay_all(frame, plan, blurs, spread, False, lambda layer: layer, torch.add)
     return frame.image(_mean(canvas, colours) if normalize else canvas[:, :colours])
 
 
@@ -130,43 +130,98 @@ def _each(share: Tensor, colours: int) -> Tensor:
     return share if share.shape[1] == 1 else share.repeat(1, 2, 1, 1)
 
 
-def _lay_all(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, lay: Lay) -> Tensor:
-    """Lay all layers, far to near, on an empty canvas."""
-    canvas = frame.canvas(blurs[0].kernel.shape[0])
-    for group in frame.groups(plan, blurs):
+def _lay_all(
+    frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, settle: Settle, join: Join
+) -> Tensor:
+    """Lay all layers, far to near, on an empty canvas.
 
-        def laid(canvas: Tensor, group: list[int] = group) -> Tensor:
-            for tiles, layer in _spread_group(frame, plan, blurs, spread, with_room, group):
-                if tiles is None:
-                    canvas = lay(canvas, layer)
-                else:
-                    canvas.index_copy_(0, tiles, lay(canvas.index_select(0, tiles), layer))
-            return canvas
-
-        if torch.compiler.is_exporting():  # a graph cannot choose its work beforehand: each group becomes a branch
-            needed = frame.any_share(plan, group, max(blurs[k].halo for k in group))
-            canvas = torch.cond(needed, _dense(laid), torch.clone, (canvas,))
+    Neighbouring layers of one coarser resolution are laid on a canvas of that resolution first.
+    """
+    exporting, kernels = torch.compiler.is_exporting(), blurs[0].kernel.shape[0]
+    canvas = frame.canvas(kernels)
+    for groups in _runs(frame.groups(plan, blurs), blurs):
+        scale = blurs[groups[0][0]].scale
+        part: Frame | Coarse = frame
+        if frame.tiled and scale > 1:
+            part = Coarse(frame, scale, max(blurs[k].half for group in groups for k in group), with_room)
+            own = part.canvas(kernels)
         else:
-            canvas = laid(canvas)
+            own = canvas if scale == 1 else frame.canvas(kernels, scale)
+        for group in groups:
+
+            def laid(canvas: Tensor, part: Frame | Coarse = part, group: list[int] = group) -> Tensor:
+                for tiles, layer in _scattered(part, plan, blurs, spread, with_room, group):
+                    if tiles is None:
+                        canvas = join(settle(layer), canvas)
+                    else:
+                        canvas.index_copy_(0, tiles, join(settle(layer), canvas.index_select(0, tiles)))
+                return canvas
+
+            own = _where_needed(laid, frame, plan, blurs, group, own) if exporting else laid(own)
+        if scale == 1:
+            canvas = own
+        elif isinstance(part, Coarse):
+            _join_finer(part.image(own), scale, canvas, frame, join)
+        else:
+
+            def joined(canvas: Tensor, own: Tensor = own, scale: int = scale) -> Tensor:
+                return join(_finer(own, scale), canvas)
+
+            every = [k for group in groups for k in group]
+            canvas = _where_needed(joined, frame, plan, blurs, every, canvas) if exporting else joined(canvas)
     return canvas
 
 
-def _dense(laid: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
-    """Both branches of a condition must lie in memory the same way."""
-    return lambda canvas: laid(canvas).clone(memory_format=torch.contiguous_format)
+def _runs(groups: list[list[int]], blurs: list[Blur]) -> list[list[list[int]]]:
+    """Neighbouring groups of one resolution together."""
+    runs: list[list[list[int]]] = []
+    for group in groups:
+        if runs and blurs[runs[-1][0][0]].scale == blurs[group[0]].scale:
+            runs[-1].append(group)
+        else:
+            runs.append([group])
+    return runs
 
 
-def _spread_group(
-    frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, group: list[int]
+def _where_needed(
+    laid: Callable[[Tensor], Tensor], frame: Frame, plan: Plan, blurs: list[Blur], group: list[int], canvas: Tensor
+) -> Tensor:
+    """A graph cannot choose its work beforehand: each group becomes a branch, taken where its light falls."""
+    needed = frame.any_share(plan, group, max(blurs[k].halo for k in group))
+
+    def dense(canvas: Tensor) -> Tensor:  # both branches must lie in memory the same way
+        return laid(canvas).clone(memory_format=torch.contiguous_format)
+
+    return torch.cond(needed, dense, torch.clone, (canvas,))
+
+
+def _finer(canvas: Tensor, scale: int) -> Tensor:
+    """A coarser canvas, which has a pixel more on each side, at the frame's resolution."""
+    fine = functional.interpolate(canvas, scale_factor=float(scale), mode="bilinear", align_corners=False)
+    return fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
+
+
+def _join_finer(front: Tensor, scale: int, canvas: Tensor, frame: Frame, join: Join) -> None:
+    """Join what is on a coarser canvas with one in tiles, a row of tiles at a time."""
+    columns, step = frame.area[1] // TILE, TILE // scale
+    for row in range(frame.area[0] // TILE):
+        strip = front[..., row * step : (row + 1) * step + 2, :]
+        if bool(strip.any()):
+            fine = _finer(strip, scale)[0].unflatten(2, (-1, TILE)).permute(2, 0, 1, 3)
+            tiles = slice(row * columns, (row + 1) * columns)
+            canvas[tiles] = join(fine, canvas[tiles])
+
+
+def _scattered(
+    part: Frame | Coarse, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, group: list[int]
 ) -> Iterator[tuple[Tensor | None, Tensor]]:
     """Scattered layers, far to near, tiles by tiles."""
-    halo = max(blurs[k].halo for k in group)
-    for tiles, window in frame.windows(group, halo):
-        terms = [window.terms(plan.nodes, k, with_room) for k in group]
-        if blurs[group[0]].kernel.shape[0] > 1:
-            terms = [[part.expand(-1, frame.colours, -1, -1) for part in parts] for parts in terms]
-        lengths = [sum(part.shape[1] for part in parts) for parts in terms]
+    half, each = max(blurs[k].half for k in group), blurs[group[0]].kernel.shape[0]
+    for tiles, layers in part.terms(plan, blurs, group, with_room):
+        if each > 1:
+            layers = [[term.expand(-1, each, -1, -1) for term in terms] for terms in layers]
+        lengths = [sum(term.shape[1] for term in terms) for terms in layers]
         kernels = [(blurs[k], length) for k, length in zip(group, lengths, strict=True)]
-        scattered = spread(torch.cat([part for parts in terms for part in parts], 1), kernels, halo)
+        scattered = spread(torch.cat([term for terms in layers for term in terms], 1), kernels, half)
         for layer in scattered.split(lengths, 1):
-            yield tiles, frame.at(layer, tiles)
+            yield tiles, part.at(layer, tiles) if isinstance(part, Frame) else layer

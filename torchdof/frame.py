@@ -14,14 +14,16 @@ from torch import Tensor
 
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
+from .pool import mean_of_four
 
-__all__ = ["TILE", "Frame", "Sample", "Window"]
+__all__ = ["TILE", "TILES_AT_ONCE", "Frame", "Sample", "Window"]
 
 TILE = 64
 """Pixels of a tile along each axis."""
+TILES_AT_ONCE = 24
+"""Tiles computed together: what fits the cache."""
 _CELL = 16  # occupancy is known in cells of this many pixels
 _BLOCK = 4  # pixels a side that are looked at together to find occupied layers
-_AT_ONCE = 24  # tiles computed together: what fits the cache
 _CHANNELS = 16  # channels that are spread together
 
 
@@ -139,13 +141,20 @@ class Frame:
         """C of the samples."""
         return int(self.samples[0].light.shape[1])
 
-    def canvas(self, kernels: int = 1) -> Tensor:
-        """Nothing yet: light, and after it its coverage; ``kernels`` is 1, or C where each colour has its own."""
-        light = self.samples[0].light
+    def canvas(self, kernels: int, scale: int = 1) -> Tensor:
+        """Nothing yet: light, and after it its coverage.
+
+        Args:
+            kernels: 1, or C where each colour has its own.
+            scale: Every so many pixels count; a canvas coarser than the frame has one pixel more on each side. Not for
+                frames in tiles.
+        """
+        light, ring = self.samples[0].light, 0 if scale == 1 else 1
         if self.tiled:
             count = self.area[0] // TILE * (self.area[1] // TILE)
             return light.new_zeros(count, self.colours + kernels, TILE, TILE)
-        return light.new_zeros(light.shape[0], self.colours + kernels, *self.area)
+        size = [n // scale + 2 * ring for n in self.area]
+        return light.new_zeros(light.shape[0], self.colours + kernels, *size)
 
     def image(self, canvas: Tensor) -> Tensor:
         """What a canvas, or a part of its channels, shows: ``[B, C, H, W]``."""
@@ -181,10 +190,33 @@ class Frame:
                 groups.append([k])
         return groups
 
+    def terms(
+        self, plan: Plan, blurs: Sequence[Blur], group: Sequence[int], with_room: bool
+    ) -> Iterator[tuple[Tensor | None, list[list[Tensor]]]]:
+        """What the layers of a group scatter, at their resolution, with a halo as wide as their kernels reach.
+
+        Yields the tiles it belongs to, None if it is the frame, and for each layer what :meth:`Window.terms` returns.
+        """
+        scale = blurs[group[0]].scale
+        for tiles, window in self.windows(group, max(blurs[k].halo for k in group)):
+            layers = [window.terms(plan.nodes, k, with_room) for k in group]
+            each, lengths = len(layers[0]), [part.shape[1] for parts in layers for part in parts]
+            if scale > 1:
+                means = torch.cat([part for parts in layers for part in parts], 1)
+                for _ in range(scale.bit_length() - 1):
+                    means = mean_of_four(means)
+                parts = means.split(lengths, 1)
+                layers = [list(parts[i : i + each]) for i in range(0, len(parts), each)]
+            yield tiles, layers
+
+    def whole(self, halo: int) -> Window:
+        """The frame as one window."""
+        return self._window(halo, None, True)
+
     def windows(self, group: Sequence[int], halo: int) -> Iterator[tuple[Tensor | None, Window]]:
         """Windows in which a group's light falls, with a halo of so many pixels, and their places on the canvas."""
         if not self.tiled:
-            yield None, self._window(halo, None, True)
+            yield None, self.whole(halo)
             return
         places = self._occupied[group[0]].flatten().nonzero()[:, 0]
         columns = self.area[1] // TILE
@@ -193,12 +225,12 @@ class Frame:
         inside &= ((row + 1) * TILE + halo <= self.size[0]) & ((column + 1) * TILE + halo <= self.size[1])
         spans_frame = len(places) * (TILE + 2 * halo) ** 2 > (self.area[0] + 2 * halo) * (self.area[1] + 2 * halo)
         if spans_frame or halo > TILE:
-            yield places, self._window(halo, None, True)
+            yield places, self.whole(halo)
             return
         plain = self._plain(halo)[places]
         for border, single in itertools.product((False, True), repeat=2):
             chosen = places[(inside != border) & (plain == single)]
-            for some in chosen.split(_AT_ONCE) if len(chosen) else ():
+            for some in chosen.split(TILES_AT_ONCE) if len(chosen) else ():
                 yield some, self._window(halo, some, border, single)
 
     def _plain(self, halo: int) -> Tensor:

@@ -180,7 +180,8 @@ def _composite(surfaces: Sequence[Surface], plan: Plan, options: Options, indepe
     samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
     moves = torch.is_grad_enabled() and any(t.requires_grad for s in surfaces for t in s[:2])
     exporting = torch.compiler.is_exporting()
-    margin, align = max(blur.halo for blur in blurs), max(blur.scale for blur in blurs)
+    align = max(blur.scale for blur in blurs)
+    margin = -(-max(blur.halo for blur in blurs) // align) * align
     frame = Frame(
         samples,
         margin=margin,

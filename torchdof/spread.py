@@ -11,7 +11,6 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .plan import Blur
-from .pool import mean_of_four
 
 __all__ = ["Spread", "conv", "fold", "layers_by_conv", "layers_by_fold"]
 
@@ -133,23 +132,12 @@ def _filled(values: Tensor, dim: int, multiple: int) -> Tensor:
 
 
 def layers_by_conv(light: Tensor, blurs: Sequence[tuple[Blur, int]], halo: int) -> Tensor:
-    """Scatter layers side by side, by convolution and each at its resolution (one for all of them)."""
-    scale, kernels = blurs[0][0].scale, _side_by_side(blurs)
-    if scale == 1:
-        return conv(light, kernels, halo)
-    half = kernels.shape[-1] // 2
-    spare = halo - scale * (half + 1)
-    light = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare]
-    coarse = light
-    while coarse.shape[-1] * scale > light.shape[-1]:
-        coarse = mean_of_four(coarse)
-    coarse = conv(coarse, kernels, half)
-    fine = functional.interpolate(coarse, scale_factor=float(scale), mode="bilinear", align_corners=False)
-    return fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
+    """Scatter layers side by side, by convolution."""
+    return conv(light, _side_by_side(blurs), halo)
 
 
 def layers_by_fold(light: Tensor, blurs: Sequence[tuple[Blur, int]], halo: int) -> Tensor:
-    """Scatter layers side by side, literally; at full resolution."""
+    """Scatter layers side by side, literally."""
     spreaded = fold(light, _side_by_side(blurs))
     return spreaded[..., halo : spreaded.shape[-2] - halo, halo : spreaded.shape[-1] - halo]
 

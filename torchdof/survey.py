@@ -128,8 +128,8 @@ def survey(plan: Plan, coc_px: Tensor, table: BlurTable, layered: bool, occlusio
 
 
 def _tiles(x: Tensor, plan: Plan, blurs: list[Blur]) -> list[Tensor]:
-    margin = max(blur.halo for blur in blurs)
     align = max(blur.scale for blur in blurs)
+    margin = -(-max(blur.halo for blur in blurs) // align) * align
     return Frame([Sample(x, x)], margin, align, tiled=True, extend=False).occupancy(plan, blurs)
 
 

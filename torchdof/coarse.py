@@ -1,0 +1,148 @@
+"""Layers that are spread at a coarser resolution, on frames in tiles.
+
+What a layer scatters is averaged to its resolution before anything else. Its own pixels are few, so only blocks of
+pixels that it lies in are looked at; all else is known from the least and the largest coc of a block.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .frame import TILE, TILES_AT_ONCE, Frame
+from .layers import share_at_or_behind
+from .plan import Blur, Plan
+from .pool import mean_of_four
+
+__all__ = ["Coarse"]
+
+_PIXELS_AT_ONCE = 2**18  # of blocks that are averaged together: what fits the cache
+
+
+class Coarse:
+    """A frame at every ``scale``-th pixel, and one such pixel beyond it on each side.
+
+    Args:
+        frame: The frame, in tiles.
+        scale: A power of two.
+        half: Pixels of that resolution which the widest kernel reaches.
+        with_room: As in :meth:`torchdof.frame.Frame.terms`.
+    """
+
+    def __init__(self, frame: Frame, scale: int, half: int, with_room: bool) -> None:
+        self.frame, self.scale, self.half, self.with_room = frame, scale, half, with_room
+        self.size = tuple(n // scale + 2 for n in frame.area)
+        self.area = tuple(-(-n // TILE) * TILE for n in self.size)
+        channels = frame.colours + (1 if not with_room else 2 if frame.known is None else 3)
+        height, width = (n + 2 * half for n in self.area)
+        self.plane = frame.samples[0].light.new_zeros(channels, height, width)
+        self.samples = [] if frame.independent else [_Blocks(self, i) for i in range(len(frame.samples))]
+
+    def blocks(self, values: Tensor) -> Tensor:
+        """``[1, C, ...]`` of the frame with its margin -> ``[C, scale, scale, rows, columns]``."""
+        start, count = self.frame.margin - self.scale * (1 + self.half), [n + 2 * self.half for n in self.size]
+        rows, columns = (slice(start, start + self.scale * n) for n in count)
+        parts = values[0, :, rows, columns].unflatten(1, (-1, self.scale)).unflatten(3, (-1, self.scale))
+        return parts.permute(0, 2, 4, 1, 3)
+
+    def canvas(self, kernels: int) -> Tensor:
+        """As :meth:`torchdof.frame.Frame.canvas`, in tiles of this resolution."""
+        count = self.area[0] // TILE * (self.area[1] // TILE)
+        return self.plane.new_zeros(count, self.frame.colours + kernels, TILE, TILE)
+
+    def image(self, canvas: Tensor) -> Tensor:
+        """A canvas in one piece: ``[1, C, rows, columns]`` with one pixel beyond the frame on each side."""
+        rows, columns = self.area[0] // TILE, self.area[1] // TILE
+        canvas = canvas.unflatten(0, (rows, columns)).permute(2, 0, 3, 1, 4).reshape(1, -1, *self.area)
+        return canvas[..., : self.size[0], : self.size[1]]
+
+    def terms(
+        self, plan: Plan, blurs: Sequence[Blur], group: Sequence[int], with_room: bool
+    ) -> Iterator[tuple[Tensor, list[list[Tensor]]]]:
+        """As :meth:`torchdof.frame.Frame.terms`, for one layer."""
+        (k,) = group
+        self._fill(plan.nodes, k)
+        half, colours = blurs[k].half, self.frame.colours
+        spare = self.half - half
+        height, width = self.plane.shape[-2:]
+        plane = self.plane[:, spare : height - spare, spare : width - spare]
+        side = TILE + 2 * half
+        tiles = functional.max_pool2d(plane[None, colours : colours + 1], side, TILE)[0, 0]
+        places = tiles.flatten().nonzero()[:, 0]
+        columns = self.area[1] // TILE
+        row, column = places // columns * TILE - half - 1, places % columns * TILE - half - 1
+        inside = (row >= 0) & (row + side <= self.frame.size[0] // self.scale)
+        inside &= (column >= 0) & (column + side <= self.frame.size[1] // self.scale)
+        for border in (False, True):
+            lengths = [colours, 1, 1, 1] if border and len(plane) > colours + 2 else [colours, 1, 1]
+            lengths = lengths if with_room else [colours, 1]
+            for some in places[inside != border].split(TILES_AT_ONCE):
+                corners = [(place // columns * TILE, place % columns * TILE) for place in some.tolist()]
+                if corners:
+                    part = plane[: sum(lengths)]
+                    cut = torch.stack([part[:, y : y + side, x : x + side] for y, x in corners])
+                    yield some, [list(cut.split(lengths, 1))]
+
+    def _fill(self, nodes: Sequence[float], k: int) -> None:
+        """Means of what layer k scatters, over blocks."""
+        rows, columns = (n + 2 * self.half for n in self.size)
+        if not self.samples:
+            halo = self.scale * (1 + self.half)
+            terms = torch.cat(self.frame.whole(halo).terms(nodes, k, self.with_room), 1)
+            while terms.shape[-1] > columns:
+                terms = mean_of_four(terms)
+            self.plane[:, :rows, :columns] = terms[0]
+            return
+        self.plane.zero_()
+        below = nodes[k - 1] if k > 0 else -torch.inf
+        above = nodes[k + 1] if k + 1 < len(nodes) else torch.inf
+        for sample in self.samples:
+            sample.add(self.plane[:, :rows, :columns], nodes, k, below, above)
+
+
+class _Blocks:
+    """One sample of a frame, in blocks."""
+
+    def __init__(self, coarse: Coarse, which: int) -> None:
+        sample, frame = coarse.frame.samples[which], coarse.frame
+        self.light, self.x = coarse.blocks(sample.light), coarse.blocks(sample.x)[0]
+        self.weight = None if sample.weight is None else coarse.blocks(sample.weight)[0]
+        self.known = None if frame.known is None else coarse.blocks(frame.known)[0]
+        self.area, self.with_room = coarse.scale**2, coarse.with_room
+        self.row = self.column = None
+        low, high = self.x.amin((0, 1)), self.x.amax((0, 1))
+        mean = torch.ones_like(low) if self.weight is None else self.weight.mean((0, 1))
+        if which > 0 and self.weight is not None:  # only in few places
+            self.row, self.column = mean.nonzero(as_tuple=True)
+            low, high, mean = (t[self.row, self.column] for t in (low, high, mean))
+        self.low, self.high, self.mean = low, high, mean
+
+    def add(self, plane: Tensor, nodes: Sequence[float], k: int, below: float, above: float) -> None:
+        """Adds the means of layer k to ``[C, rows, columns]``."""
+        colours = self.light.shape[0]
+        partly = (self.high > below) & (self.low < above)
+        if self.with_room:
+            room = self.mean * (self.low >= above)
+            if self.row is None or self.column is None:
+                plane[colours + 1] += room
+            else:
+                plane[colours + 1, self.row, self.column] += room
+        places = partly.nonzero(as_tuple=True)
+        if self.row is not None and self.column is not None:
+            places = (self.row[places], self.column[places])
+        for row, column in zip(*(p.split(_PIXELS_AT_ONCE // self.area) for p in places), strict=True):
+            at = (..., row, column)
+            x = self.x[at]
+            here = share_at_or_behind(x, nodes, k)
+            mine = here - share_at_or_behind(x, nodes, k + 1)
+            # divided first, lest a sum overflows
+            weight = 1.0 / self.area if self.weight is None else self.weight[at] / self.area
+            here, mine = here * weight, mine * weight
+            parts = [(self.light[at] * mine).sum((1, 2))]
+            seen = mine if self.known is None else mine * self.known[at]
+            if self.with_room:
+                parts += [mine.sum((0, 1))[None], here.sum((0, 1))[None]]
+            if not self.with_room or self.known is not None:
+                parts.append(seen.sum((0, 1))[None])
+            plane[at] += torch.cat(parts)
