@@ -36,6 +36,7 @@ _FALL = 0.7  # weight of a level of the pyramid against the finer one before
 _UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
 _TRUST = 4.0  # how much local contrast discredits a split
 _DOUBT = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
+_AT_ONCE = 2**16  # positions looked at together
 _LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
 
 
@@ -190,21 +191,33 @@ def fill_hidden(
     padded = functional.pad(coc_px, extra, mode="replicate")
     may_hide = _may_hide(padded, [depth for _, depth, _ in pyramid])[..., :height, :width]
     at = _positions(may_hide & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT))
+    levels_ = [
+        (torch.cat(level, 1).transpose(0, 1).flatten(1), (level[1].shape[-2], level[1].shape[-1])) for level in pyramid
+    ]
+    found = [_hidden(levels_, light, coc_px, some) for some in _in_parts(at)]
+    at, seen = torch.cat([some for some, _ in found]), torch.cat([seen for _, seen in found], 1)
+    hidden = torch.full_like(seen[0], HIDDEN_WEIGHT)
+    return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden)
+
+
+def _hidden(
+    levels: Sequence[tuple[Tensor, tuple[int, int]]], light: Tensor, coc_px: Tensor, at: Tensor
+) -> tuple[Tensor, Tensor]:
+    """What is behind pixels, by the levels of a pyramid ``[C + 2, P]`` and their sizes.
+
+    Returns:
+        The pixels for which there is something, and its light and coc ``[C + 1, P]``.
+    """
     here = _pick(coc_px, at)[0]
-    item, row, column = _places(at, height, width)
-    total = torch.zeros_like(here)
-    seen = torch.cat([_pick(light, at), here[None]])
-    for level, (colour, depth, weight) in enumerate(pyramid, 1):
-        coarse = torch.cat([colour, depth, weight], 1).transpose(0, 1).flatten(1)
-        size = (depth.shape[-2], depth.shape[-1])
-        behind, any_behind = _behind(coarse, size, item, row, column, here, 2**level)
+    item, row, column = _places(at, coc_px.shape[-2], coc_px.shape[-1])
+    total, seen = torch.zeros_like(here), torch.cat([_pick(light, at), here[None]])
+    for level, (values, size) in enumerate(levels, 1):
+        behind, any_behind = _behind(values, size, item, row, column, here, 2**level)
         vote = torch.where((any_behind > 0) & (_least_px(level) <= here.abs()), _FALL**level, 0.0)
         total = total + vote
         seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
     some = _positions(total > 0)
-    at, seen = at[some], seen.index_select(1, some)
-    hidden = torch.full_like(seen[0], HIDDEN_WEIGHT)
-    return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden)
+    return at[some], seen.index_select(1, some)
 
 
 def _surfaces(
@@ -318,6 +331,11 @@ def _mean(weighted: Iterator[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
 def _positions(wanted: Tensor) -> Tensor:
     """Flat indices of the wanted pixels of ``[B, 1, H, W]``."""
     return wanted.flatten().nonzero()[:, 0]
+
+
+def _in_parts(at: Tensor) -> Sequence[Tensor]:
+    """Positions, as many at once as fit the cache. A graph does not know how many there are."""
+    return [at] if torch.compiler.is_exporting() else at.split(_AT_ONCE)
 
 
 def _places(at: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,7 +7,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .coarse import Coarse
-from .frame import TILE, Frame
+from .frame import TILE, Frame, alike
 from .plan import Blur, Plan
 from .spread import Spread, fold
 
@@ -139,7 +139,7 @@ def _lay_all(
     """
     exporting, kernels = torch.compiler.is_exporting(), blurs[0].kernel.shape[0]
     canvas = frame.canvas(kernels)
-    for groups in _runs(frame.groups(plan, blurs), blurs):
+    for groups in _runs(frame.groups(plan, blurs), plan, blurs):
         scale = blurs[groups[0][0]].scale
         part: Frame | Coarse = frame
         if frame.tiled and scale > 1:
@@ -172,11 +172,11 @@ def _lay_all(
     return canvas
 
 
-def _runs(groups: list[list[int]], blurs: list[Blur]) -> list[list[list[int]]]:
+def _runs(groups: list[list[int]], plan: Plan, blurs: list[Blur]) -> list[list[list[int]]]:
     """Neighbouring groups of one resolution together."""
     runs: list[list[list[int]]] = []
     for group in groups:
-        if runs and blurs[runs[-1][0][0]].scale == blurs[group[0]].scale:
+        if runs and alike(plan, blurs, runs[-1][0][0], group[0]):
             runs[-1].append(group)
         else:
             runs.append([group])

@@ -16,7 +16,7 @@ from .layers import share_at_or_behind
 from .plan import Blur, Plan
 from .pool import mean_of_four
 
-__all__ = ["TILE", "TILES_AT_ONCE", "Frame", "Sample", "Window"]
+__all__ = ["TILE", "TILES_AT_ONCE", "Frame", "Sample", "Window", "alike"]
 
 TILE = 64
 """Pixels of a tile along each axis."""
@@ -182,7 +182,7 @@ class Frame:
         groups: list[list[int]] = []
         for k in order:
             last = groups[-1] if groups else []
-            fits = last and (len(last) + 1) * each <= _CHANNELS and blurs[k].scale == blurs[last[0]].scale
+            fits = last and (len(last) + 1) * each <= _CHANNELS and alike(plan, blurs, last[0], k)
             widths = [blurs[j].kernel.shape[-1] for j in [*last, k]]
             if fits and max(widths) ** 2 <= 2 * min(widths) ** 2:
                 last.append(k)
@@ -309,6 +309,11 @@ class Frame:
             wide = functional.max_pool2d(layer[None, None], 2 * reach + 1, 1, reach)
             occupied.append(functional.max_pool2d(wide, TILE // _CELL)[0, 0] > 0)
         return occupied
+
+
+def alike(plan: Plan, blurs: Sequence[Blur], j: int, k: int) -> bool:
+    """Whether two layers are of one resolution and on one side of the focus; so it does not matter what is between."""
+    return blurs[j].scale == blurs[k].scale and (plan.nodes[j] < 0) == (plan.nodes[k] < 0)
 
 
 def _traced() -> bool:

@@ -137,6 +137,7 @@ def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int)
     margin = max(_half(table, float(some.coc_px.detach().abs().max()), height, width) for some in rays)
     area = (height + 2 * margin) * (width + 2 * margin)
     out = rays[0].light.new_zeros(channels, batch * area)
+    surfaces = _Surfaces(coc_px)
     for some, sorted_ in zip(rays, order, strict=True):
         for chunk in _chunks(some.coc_px.detach()[sorted_], table, height, width):
             chosen = sorted_[chunk]
@@ -146,13 +147,13 @@ def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int)
             kernels = _kernels(table, coc, width, max(height, width)).to(light.dtype)  # [n, 1 or C, k, k]
             half = kernels.shape[-1] // 2
             step = torch.arange(-half, half + 1, device=at.device)
-            passes = 1.0 - _blocked(coc, item, row, column, step, coc_px)
+            passes = 1.0 - surfaces.blocked(coc, item, row, column, step)
             spread = kernels * passes.unsqueeze(1)
             lands = (row[:, None, None] + margin + step[:, None]) * (width + 2 * margin)
             lands = (item * area)[:, None, None] + lands + column[:, None, None] + margin + step
             for channel in range(channels):
                 tap = spread[:, channel % spread.shape[1]] * light[channel, :, None, None]
-                out = out.index_put((torch.tensor(channel, device=at.device), lands.flatten()), tap.flatten(), True)
+                out[channel].index_add_(0, lands.flatten(), tap.flatten())
     frame = out.unflatten(1, (batch, height + 2 * margin, width + 2 * margin)).transpose(0, 1)
     return frame[..., margin : margin + height, margin : margin + width]
 
@@ -209,32 +210,42 @@ def _something_nearer(coc: Tensor, nearest_px: Tensor) -> Tensor:
     return found
 
 
-def _blocked(coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor, coc_px: Tensor) -> Tensor:
-    """Share of each ray ``[n, k, k]`` that nearer surfaces take."""
-    height, width = coc_px.shape[-2:]
-    blocked = coc.new_zeros(len(coc), len(step), len(step))
-    low, high = float(coc_px.detach().min()), float(coc.detach().max()) - _NEARER_PX
-    if low > high:
-        return blocked
-    y, x = row[:, None].to(coc.dtype), column[:, None].to(coc.dtype)
-    place = (coc_px[:, 0] - low).flatten()  # in bins of 1 px
-    for k in range(math.floor(high - low) + 1):
-        meets = coc - _NEARER_PX >= low + k
-        share = (1.0 - (place - k).abs()).clamp_min(0.0)
-        if not bool(meets.any()) or not bool((share > 0).any()):
-            continue
-        scale = (1.0 - (low + k) / coc[meets])[:, None]
-        at_y = (y[meets] + step * scale).clamp(0, height - 1)  # surfaces go on beyond the border
-        at_x = (x[meets] + step * scale).clamp(0, width - 1)
-        top, left = at_y.floor(), at_x.floor()
-        down, right = (at_y - top)[:, :, None], (at_x - left)[:, None, :]
-        first = item[meets][:, None] * height
-        rows = [(first + r.long().clamp(max=height - 1)) * width for r in (top, top + 1)]
-        columns = [c.long().clamp(max=width - 1) for c in (left, left + 1)]
-        upper, lower = (
-            share[r[:, :, None] + columns[0][:, None, :]] * (1 - right)
-            + share[r[:, :, None] + columns[1][:, None, :]] * right
-            for r in rows
-        )
-        blocked = blocked.index_add(0, meets.nonzero()[:, 0], upper * (1 - down) + lower * down)
-    return blocked.clamp(max=1.0)
+class _Surfaces:
+    """What an image shows, in bins of 1 px of coc."""
+
+    def __init__(self, coc_px: Tensor) -> None:
+        self.size = (int(coc_px.shape[-2]), int(coc_px.shape[-1]))
+        self.low = float(coc_px.detach().min())
+        self.place = (coc_px[:, 0] - self.low).flatten()
+        below = self.place.detach().floor().long()
+        self.bins = (torch.bincount(below) > 0).nonzero()[:, 0].tolist()
+        self.bins = sorted({*self.bins, *(k + 1 for k in self.bins)})
+
+    def blocked(self, coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor) -> Tensor:
+        """Share of each ray ``[n, k, k]`` that nearer surfaces take."""
+        height, width = self.size
+        blocked = coc.new_zeros(len(coc), len(step), len(step))
+        y, x = row[:, None].to(coc.dtype), column[:, None].to(coc.dtype)
+        for k in self.bins:
+            meets = coc - _NEARER_PX >= self.low + k
+            if not bool(meets.any()):
+                break
+            scale = (1.0 - (self.low + k) / coc[meets])[:, None]
+            at_y = (y[meets] + step * scale).clamp(0, height - 1)  # surfaces go on beyond the border
+            at_x = (x[meets] + step * scale).clamp(0, width - 1)
+            top, left = at_y.floor(), at_x.floor()
+            down, right = (at_y - top)[:, :, None], (at_x - left)[:, None, :]
+            first = item[meets][:, None] * height
+            rows = [(first + r.long().clamp(max=height - 1)) * width for r in (top, top + 1)]
+            columns = [c.long().clamp(max=width - 1) for c in (left, left + 1)]
+            upper, lower = (
+                self._share(r[:, :, None] + columns[0][:, None, :], k) * (1 - right)
+                + self._share(r[:, :, None] + columns[1][:, None, :], k) * right
+                for r in rows
+            )
+            blocked = blocked.index_add(0, meets.nonzero()[:, 0], upper * (1 - down) + lower * down)
+        return blocked.clamp(max=1.0)
+
+    def _share(self, at: Tensor, k: int) -> Tensor:
+        """How much of pixels lies in bin k."""
+        return (1.0 - (self.place[at] - k).abs()).clamp_min(0.0)
