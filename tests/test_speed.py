@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typer.testing import CliRunner, Result
 
-from torchdof import Camera, DepthOfField, metrics, speed
+from torchdof import Camera, DepthOfField, growth, metrics, speed
 from torchdof.command import app
 from torchdof.files import Picture, read_image, write_image
 
@@ -108,7 +108,7 @@ def test_a_rendering_that_is_not_finite_breaks_the_promise(monkeypatch: pytest.M
 
 def test_one_run_more_warms_up() -> None:
     calls: list[int] = []
-    assert len(speed._times(lambda: calls.append(1), 3)) == 3
+    assert len(speed.times(lambda: calls.append(1), 3)) == 3
     assert len(calls) == 4
 
 
@@ -228,6 +228,8 @@ def test_alpha_is_left_out(tmp_path: Path) -> None:
         (["TINY", "TINY", "--depth-kind", "z"], "from 16 pixels a side on"),
         (["--focus-m", "2"], "the built-in scene has its own camera"),
         (["--truth", "."], "give a folder with --out"),
+        (["--truth", ".", "--scan"], "leave IMAGE and DEPTH out, and --onnx and --scan"),
+        (["--peers", ".", "--onnx"], "of the other options it takes --out, --repeat"),
     ],
 )
 def test_bad_arguments_are_refused_in_a_sentence(
@@ -240,6 +242,40 @@ def test_bad_arguments_are_refused_in_a_sentence(
     assert result.exit_code == 2
     assert message in result.output
     assert result.output.count("\n") == 1
+
+
+def test_an_exported_file_has_its_row() -> None:
+    subject = speed.shipped(64, 160)
+    found = [s for s in speed.settings(subject, onnx=True) if s.runtime == "onnxruntime"]
+    assert [(s.name, s.occlusion) for s in found] == [("onnx 1/255", True), ("onnx 1/255", False)]
+    wanted = speed.exact(subject, occlusion=False)
+    here = speed.measure(subject, found[1], wanted, 1, 1.0)
+    assert here.keeps and 0 < here.rms_255 < 1
+    assert not speed.measure(subject, found[1], wanted + 0.1, 1, 1.0).keeps
+
+
+def test_scans_change_the_radius_or_the_frame_alone() -> None:
+    subject = speed.shipped(64, 128)
+    scenes = growth.scenes(subject)
+    assert [name for name, _ in scenes] == ["radius"] * 5 + ["size"] * 3
+    for radius, (_, scene) in zip((4, 8, 16, 32, 64), scenes, strict=False):
+        assert float(scene.coc_px.abs().max()) == pytest.approx(radius)
+        assert torch.equal(scene.image, subject.image)
+    widest = [float(s.coc_px.abs().max()) / s.image.shape[-1] for _, s in scenes[5:]]
+    assert widest == pytest.approx([widest[-1]] * 3, rel=0.05)
+    assert torch.equal(scenes[-1][1].image, subject.image)
+    assert growth.scenes(speed.Subject("sharp", subject.image, torch.zeros(1, 1, 64, 128))) == []
+
+
+def test_the_scan_is_printed_and_written(files: tuple[Path, Path], tmp_path: Path) -> None:
+    result = run(*files, "--repeat", 1, "--out", tmp_path, "--f-number", 1.4, "--sensor-width-mm", 6, "--scan")
+    assert result.exit_code == 0, result.output
+    assert "How cost grows" in result.output
+    text = (tmp_path / "speed.md").read_text()
+    table = text.split("## How cost grows")[1].strip().splitlines()[2:]
+    assert len(table) == 2 + 8
+    assert [line.split(" | ")[2] for line in table[2:7]] == ["4", "8", "16", "32", "64"]
+    assert all(float(line.split(" | ")[3]) > 0 for line in table[2:])
 
 
 def test_without_matplotlib_it_says_so_before_it_measures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

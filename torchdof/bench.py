@@ -20,6 +20,7 @@ from torch import Tensor
 
 from . import metrics, peers, speed
 from .files import Picture, whole_file, write_image
+from .growth import lines, measure_growth, show_growth
 from .module import DepthOfField
 from .reference import lens_views
 from .render import RenderSettings
@@ -181,6 +182,16 @@ def bench(
         Literal["nearest", "far"] | None,
         typer.Option(help="Fill pixels without depth; else they are refused.", rich_help_panel=_SPEED),
     ] = None,
+    onnx: Annotated[
+        bool,
+        typer.Option(
+            "--onnx", help="Also export and time the file in onnxruntime; takes minutes.", rich_help_panel=_SPEED
+        ),
+    ] = False,
+    scan: Annotated[
+        bool,
+        typer.Option("--scan", help="Also show how cost grows with radius and frame size.", rich_help_panel=_SPEED),
+    ] = False,
     truth: Annotated[
         Path | None,
         typer.Option(
@@ -221,7 +232,8 @@ def bench(
 ) -> None:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
-    Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU:
+    Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU; with --onnx also an
+    exported file, with --scan also how cost grows with blur and frame:
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
@@ -239,13 +251,15 @@ def bench(
     if out is not None and not out.is_dir():
         raise FileNotFoundError(f"{out}: there is no such folder; make it first")
     if compared is not None:
-        if image is not None or truth is not None or views or inner:
+        if image is not None or truth is not None or views or inner or onnx or scan:
             raise ValueError("--peers measures the scenes of its folder; of the other options it takes --out, --repeat")
         peers.compare(compared, peers_folder, out, repeat)
         return
     if truth is not None:
-        if image is not None:
-            raise ValueError("--truth measures the scenes of its folder; leave IMAGE and DEPTH out")
+        if image is not None or onnx or scan:
+            raise ValueError(
+                "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx and --scan"
+            )
         if out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
         _accuracy(truth, out, views, inner)
@@ -266,11 +280,17 @@ def bench(
         raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
     if out is not None and importlib.util.find_spec("matplotlib") is None:  # before the time is spent
         raise ModuleNotFoundError("no matplotlib", name="matplotlib")
+    if onnx and importlib.util.find_spec("onnxruntime") is None:
+        raise ModuleNotFoundError("no onnxruntime", name="onnxruntime")
     subject = speed.shipped() if image is None else speed.from_files(image, depth, how)
-    rows, unit = speed.measure_all(subject, repeat, Console(stderr=True))
+    console = Console(stderr=True)
+    rows, unit = speed.measure_all(subject, repeat, console, onnx)
     speed.show(rows, subject, unit)
+    grown = measure_growth(subject, repeat, unit, console) if scan else []
+    if grown:
+        show_growth(grown)
     if out is not None:
-        speed.write(out, rows, subject, unit, repeat)
+        speed.write(out, rows, subject, unit, repeat, lines(grown) if grown else ())
 
 
 def _accuracy(truth: Path, out: Path, views: Sequence[int] | None, inner: bool) -> None:

@@ -9,9 +9,11 @@ import math
 import os
 import platform
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as functional
@@ -28,7 +30,7 @@ from .camera import Camera
 from .check import Method
 from .depthmap import depth_from_values, resolve_holes
 from .files import read_image, read_values, whole_file
-from .module import blur_by_coc
+from .module import DepthOfField, blur_by_coc
 from .render import RenderSettings
 from .scenes import posts, waves
 
@@ -41,9 +43,12 @@ __all__ = [
     "measure",
     "measure_all",
     "pareto",
+    "render",
+    "renderer",
     "settings",
     "shipped",
     "show",
+    "times",
     "unit_s",
     "write",
 ]
@@ -98,6 +103,7 @@ class Setting:
         tolerance: As there.
         side: Largest side of a crop; None is the frame.
         attention: Where the viewer looks, as in :meth:`torchdof.DepthOfField.forward`.
+        runtime: ``onnxruntime`` renders with an exported file.
     """
 
     method: Method
@@ -105,12 +111,14 @@ class Setting:
     tolerance: float
     side: int | None = None
     attention: tuple[float, float, float] | None = None
+    runtime: Literal["torch", "onnxruntime"] = "torch"
 
     @property
     def name(self) -> str:
         """For the report, such as ``1/255`` or ``fold 1/255``."""
         level = f"{self.tolerance * 255:g}/255" if self.tolerance else "exact"
         level += " looked at" if self.attention else ""
+        level = f"onnx {level}" if self.runtime == "onnxruntime" else level
         return level if self.method == "layered" else f"{self.method} {level}"
 
 
@@ -137,10 +145,11 @@ class Row:
     keeps: bool
 
 
-def settings(subject: Subject) -> list[Setting]:
+def settings(subject: Subject, onnx: bool = False) -> list[Setting]:
     """What is compared on a subject: from coarse to exact with and without occlusion, and the literal scatter.
 
-    That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB.
+    That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB. With
+    ``onnx`` also exported files.
     """
     taps = (2 * math.ceil(float(subject.coc_px.abs().max())) + 3) ** 2
     bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
@@ -148,6 +157,7 @@ def settings(subject: Subject) -> list[Setting]:
     found = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
     height, width = subject.image.shape[-2:]
     found.append(Setting("layered", True, 1 / 255, attention=(width / 2, height / 2, height / _LOOKED_AT)))
+    found += [Setting("layered", seen, 1 / 255, runtime="onnxruntime") for seen in (True, False)] if onnx else []
     return [*found, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
 
 
@@ -199,7 +209,7 @@ def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:
 
 def exact(subject: Subject, occlusion: bool) -> Tensor:
     """The rendering that errors are measured against: exact kernels, dense layers, full resolution."""
-    return _render(subject, Setting("layered", occlusion, 0.0))
+    return render(subject, Setting("layered", occlusion, 0.0))
 
 
 def unit_s(repeat: int = 5) -> float:
@@ -209,7 +219,54 @@ def unit_s(repeat: int = 5) -> float:
     """
     frame = torch.rand(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
     weight = torch.rand(16, 1, 17, 17)
-    return statistics.median(_times(lambda: functional.conv2d(frame, weight, padding=8, groups=16), repeat))
+    return statistics.median(times(lambda: functional.conv2d(frame, weight, padding=8, groups=16), repeat))
+
+
+def render(subject: Subject, setting: Setting) -> Tensor:
+    """A subject as a setting of PyTorch says: ``[1, C, H, W]``."""
+    with torch.inference_mode():
+        return blur_by_coc(
+            subject.image,
+            subject.coc_px,
+            tolerance=setting.tolerance,
+            occlusion=setting.occlusion,
+            method=setting.method,
+            attention=setting.attention,
+        )
+
+
+def times(work: Callable[[], object], repeat: int) -> list[float]:
+    """Seconds of so many calls, after one more to warm up."""
+    work()
+    found = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        work()
+        found.append(time.perf_counter() - start)
+    return found
+
+
+def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
+    """What renders a subject: a function without arguments, once all is prepared.
+
+    Raises:
+        ModuleNotFoundError: If onnxruntime is asked for and missing.
+        ValueError: If the exported file does not render as the module does.
+    """
+    if setting.runtime == "torch":
+        return lambda: render(subject, setting)
+    from torchdof.export import to_onnx
+    from torchdof.export.timing import session
+
+    reach = max(1.0, float(math.ceil(float(subject.coc_px.abs().max()))))
+    options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
+    dof = DepthOfField(Camera(), max_coc_px=reach, check=False, **options)
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/dof.onnx"
+        to_onnx(dof, path, inputs="coc_px", channels=subject.image.shape[1])
+        runner = session(path, torch.get_num_threads())
+    feed = {"image": subject.image.numpy(), "coc_px": subject.coc_px.numpy()}
+    return lambda: torch.from_numpy(runner.run(None, feed)[0])
 
 
 def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, unit: float) -> Row:
@@ -222,30 +279,34 @@ def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, uni
         repeat: How often, at least 1.
         unit: Unit Y in seconds.
     """
+    work = renderer(subject, setting)
     start = memory.reset_peak()
-    out = _render(subject, setting)
+    out = work()
     peak_mb = memory.peak_mb() - start
     shown, truth = metrics.display(out), metrics.display(wanted)
     squares = (shown.double() - truth.double()).square()
     rms = math.sqrt(float(squares.mean()))
     looked_at = squares if setting.attention is None else squares[..., weight_map(setting.attention, out)[0, 0] == 1]
     keeps = bool(torch.isfinite(out).all()) and math.sqrt(float(looked_at.mean())) <= setting.tolerance + _ROUNDING
-    times = _times(lambda: _render(subject, setting), repeat)
-    median = statistics.median(times)
-    low, high = torch.tensor(times, dtype=torch.float64).quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
+    taken = times(work, repeat)
+    median = statistics.median(taken)
+    low, high = torch.tensor(taken, dtype=torch.float64).quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
     height, width = out.shape[-2:]
     speed = (median, float(high - low), median / unit, width * height / 1e6 / median, peak_mb)
     error = (255 * rms, metrics.psnr(shown, truth), metrics.ssim(shown, truth))
     return Row(setting, width, height, *speed, *error, keeps)
 
 
-def measure_all(subject: Subject, repeat: int = 5, console: Console | None = None) -> tuple[list[Row], float]:
+def measure_all(
+    subject: Subject, repeat: int = 5, console: Console | None = None, onnx: bool = False
+) -> tuple[list[Row], float]:
     """Every setting on a subject.
 
     Args:
         subject: What is rendered.
         repeat: How often each.
         console: Where to show progress; None shows none.
+        onnx: Also export, and render with onnxruntime; needs the extra ``export`` and minutes.
 
     Returns:
         A row for each setting, and unit Y in seconds.
@@ -257,7 +318,7 @@ def measure_all(subject: Subject, repeat: int = 5, console: Console | None = Non
     unit, rows = unit_s(repeat), []
     references: dict[tuple[int | None, bool], Tensor] = {}
     silent = console is None or not console.is_terminal
-    for setting in track(settings(subject), "settings", console=console, transient=True, disable=silent):
+    for setting in track(settings(subject, onnx), "settings", console=console, transient=True, disable=silent):
         part = subject if setting.side is None else subject.crop(setting.side)
         key = (setting.side, setting.occlusion)
         if key not in references:
@@ -286,8 +347,23 @@ def pareto(rows: Sequence[Row]) -> list[Row]:
     return sorted(front, key=lambda row: row.median_s)
 
 
-def write(folder: Path, rows: Sequence[Row], subject: Subject, unit: float, repeat: int) -> None:
+def write(
+    folder: Path,
+    rows: Sequence[Row],
+    subject: Subject,
+    unit: float,
+    repeat: int,
+    growth: Sequence[Sequence[str]] = (),
+) -> None:
     """Writes ``speed.csv``, ``speed.md`` and ``speed.png``: all of them or none.
+
+    Args:
+        folder: Where.
+        rows: What was measured.
+        subject: On what.
+        unit: Unit Y in seconds.
+        repeat: How often each.
+        growth: A further table for ``speed.md``, of how cost grows: its columns and its lines.
 
     Raises:
         OSError: If a file cannot be written.
@@ -299,7 +375,7 @@ def write(folder: Path, rows: Sequence[Row], subject: Subject, unit: float, repe
         )
         _plot(png_file, rows, subject)
         csv_file.write_text(_csv(rows), encoding="utf-8")
-        md_file.write_text(_markdown(rows, subject, unit, repeat), encoding="utf-8")
+        md_file.write_text(_markdown(rows, subject, unit, repeat, growth), encoding="utf-8")
 
 
 def show(rows: Sequence[Row], subject: Subject, unit: float) -> None:
@@ -321,36 +397,14 @@ def show(rows: Sequence[Row], subject: Subject, unit: float) -> None:
     console.print(f"* on the Pareto front; kept: RMS within the tolerance. {_remarks(rows)}", markup=False)
 
 
-def _render(subject: Subject, setting: Setting) -> Tensor:
-    with torch.inference_mode():
-        return blur_by_coc(
-            subject.image,
-            subject.coc_px,
-            tolerance=setting.tolerance,
-            occlusion=setting.occlusion,
-            method=setting.method,
-            attention=setting.attention,
-        )
-
-
-def _times(work: Callable[[], object], repeat: int) -> list[float]:
-    work()  # warms up
-    times = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return times
-
-
 def _csv(rows: Iterable[Row]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = [field.name for field in dataclasses.fields(Row) if field.name != "setting"]
-    writer.writerow(["setting", "method", "occlusion", "tolerance", "crop", *names])
+    writer.writerow(["setting", "method", "runtime", "occlusion", "tolerance", "crop", *names])
     for row in rows:
         how = row.setting
-        values = [how.name, how.method, how.occlusion, how.tolerance, how.side is not None]
+        values = [how.name, how.method, how.runtime, how.occlusion, how.tolerance, how.side is not None]
         values += [getattr(row, name) for name in names]
         writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
     return text.getvalue()
@@ -381,7 +435,9 @@ def _title(subject: Subject) -> str:
     return f"{subject.name}, {width} x {height}, blur radius {low:.1f} to {high:.1f} px"
 
 
-def _markdown(rows: Sequence[Row], subject: Subject, unit: float, repeat: int) -> str:
+def _markdown(
+    rows: Sequence[Row], subject: Subject, unit: float, repeat: int, growth: Sequence[Sequence[str]] = ()
+) -> str:
     broken = [row.setting for row in rows if not row.keeps]
     names = "; ".join(f"{how.name}{'' if how.occlusion else ' without occlusion'}" for how in broken)
     machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {torch.get_num_threads()} threads"
@@ -402,6 +458,14 @@ def _markdown(rows: Sequence[Row], subject: Subject, unit: float, repeat: int) -
         lines += [cells for row, cells in _lines(rows) if row.setting.occlusion == seen]
         title = f"## {'With' if seen else 'Without'} occlusion\n"
         parts += [title, *("| " + " | ".join(line).replace("*", "\\*") + " |" for line in lines), ""]
+    if growth:
+        head, *body = growth
+        parts += [
+            "## How cost grows\n",
+            "The same scene at 1/255 with other largest radii, and in smaller frames, as blurred for their width.\n",
+            *("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)),
+            "",
+        ]
     return "\n".join(parts)
 
 

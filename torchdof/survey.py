@@ -17,6 +17,7 @@ __all__ = ["LayerUse", "Survey", "survey"]
 # Costs in nanoseconds, measured on one core; only their ratios matter here.
 _PASSES_NS = 25.0  # elementwise work, a pixel of a window
 _TAP_NS = 0.1  # a tap of the kernel, a pixel at the layer's resolution
+_MEAN_NS = 40.0  # a pixel of the frame that is averaged for a coarser layer
 _HIDDEN_NS = 120.0  # mixed and hidden surfaces, a pixel of the frame
 _COPY_NS = 4.0  # a frame in focus, a pixel
 _ERROR = 0.3  # RMS error over the tolerance, on scenes that are blurred all over; measured: 0 to 0.6
@@ -109,8 +110,8 @@ def survey(plan: Plan, coc_px: Tensor, table: BlurTable, layered: bool, occlusio
     for k, (node, blur) in enumerate(zip(plan.coc_px, blurs, strict=True)):
         here = torch.stack([t[k] for t in tiles])
         share = float(here.float().mean())
-        costs.append(_cost(share, blur, (height, width)))
         pixels = at_or_behind[k] - at_or_behind[k + 1]
+        costs.append(_cost(share, pixels, blur, (height, width)))
         found.append(
             LayerUse(node, pixels, share, _box(here.any(0), (height, width)), blur.scale, 2 * blur.half + 1, 0.0)
         )
@@ -133,14 +134,23 @@ def _tiles(x: Tensor, plan: Plan, blurs: list[Blur]) -> list[Tensor]:
     return Frame([Sample(x, x)], margin, align, tiled=True, extend=False).occupancy(plan, blurs)
 
 
-def _cost(share: float, blur: Blur, size: tuple[int, int]) -> float:
-    """Nanoseconds that a layer takes, in windows of tiles or, where these overlap too much, of the frame."""
-    height, width = size
+def _cost(share: float, own: float, blur: Blur, size: tuple[int, int]) -> float:
+    """Nanoseconds that a layer takes, in windows of tiles or, where these overlap too much, of the frame.
+
+    Args:
+        share: Of the frame's tiles that its light reaches.
+        own: Of the frame's pixels that it carries.
+        blur: How it is spread.
+        size: Of the frame.
+    """
+    area = size[0] * size[1]
     if blur.half == 0:
-        return _COPY_NS * share * height * width
-    windows = share * height * width * ((TILE + 2 * blur.halo) / TILE) ** 2
-    pixels = min(windows, float((height + 2 * blur.halo) * (width + 2 * blur.halo))) if share else 0.0
-    return pixels * (_PASSES_NS + _TAP_NS * (2 * blur.half + 1) ** 2 / blur.scale**2)
+        return _COPY_NS * share * area
+    height, width = (n / blur.scale for n in size)
+    windows = share * height * width * ((TILE + 2 * blur.half) / TILE) ** 2
+    pixels = min(windows, (height + 2 * blur.half) * (width + 2 * blur.half)) if share else 0.0
+    means = 2.0 * own * area * _MEAN_NS if blur.scale > 1 else 0.0  # a pixel lies between two layers
+    return pixels * (_PASSES_NS + _TAP_NS * (2 * blur.half + 1) ** 2) + means
 
 
 def _box(tiles: Tensor, size: tuple[int, int]) -> tuple[int, int, int, int] | None:
