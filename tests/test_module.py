@@ -501,6 +501,21 @@ def test_modules_with_other_options_compile_one_after_the_other() -> None:
         assert_close(fast, dof(image, depth, plan=Plan.all(reach, tolerance)), rtol=1e-5, atol=1e-6)
 
 
+def test_modules_with_other_cameras_compile_one_after_the_other() -> None:
+    torch.compiler.reset()
+    camera, image, depth = compiled_case()
+    for i in range(3):
+        other = camera.replace(
+            focal_length_mm=(1 + 0.1 * i) * camera.focal_length_mm,
+            sensor_width_mm=(1 + 0.2 * i) * camera.sensor_width_mm,
+            f_number=(1 + 0.3 * i) * camera.f_number,
+        )
+        dof = DepthOfField(other, occlusion=False, **COMPILED)
+        fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth, focus_m=torch.tensor([2.0]))
+        plan = Plan.all(COMPILED["max_coc_px"], COMPILED["tolerance"])
+        assert_close(fast, dof(image, depth, focus_m=torch.tensor([2.0]), plan=plan), rtol=1e-5, atol=1e-6)
+
+
 # Refused
 
 

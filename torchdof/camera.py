@@ -268,7 +268,8 @@ def _check_number(name: str, value: Number) -> None:
         raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {type(value).__name__}")
     if not good and not isinstance(value, Tensor):
         raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {show(value)}")
-    if not good or (name != "focus_m" and math.isinf(_largest(value))):
+    # compared, not asked for: in compiled code a number that differs between two cameras is a variable
+    if not good or (name != "focus_m" and (_largest(value) if isinstance(value, Tensor) else value) == math.inf):
         raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {_show(value)}")
 
 
