@@ -191,10 +191,9 @@ def fill_hidden(
     padded = functional.pad(coc_px, extra, mode="replicate")
     may_hide = _may_hide(padded, [depth for _, depth, _ in pyramid])[..., :height, :width]
     at = _positions(may_hide & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT))
-    levels_ = [
-        (torch.cat(level, 1).transpose(0, 1).flatten(1), (level[1].shape[-2], level[1].shape[-1])) for level in pyramid
-    ]
-    found = [_hidden(levels_, light, coc_px, some) for some in _in_parts(at)]
+    sizes = [(depth.shape[-2], depth.shape[-1]) for _, depth, _ in pyramid]
+    flat = [torch.cat(level, 1).transpose(0, 1).flatten(1) for level in pyramid]
+    found = [_hidden(list(zip(flat, sizes, strict=True)), light, coc_px, some) for some in _in_parts(at)]
     at, seen = torch.cat([some for some, _ in found]), torch.cat([seen for _, seen in found], 1)
     hidden = torch.full_like(seen[0], HIDDEN_WEIGHT)
     return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden)

@@ -10,10 +10,10 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .frame import TILE, TILES_AT_ONCE, Frame
+from .frame import TILE, TILES_AT_ONCE, Frame, cut_tiles, from_tiles
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
-from .pool import mean_of_four
+from .pool import mean_of_blocks
 
 __all__ = ["Coarse"]
 
@@ -53,9 +53,7 @@ class Coarse:
 
     def image(self, canvas: Tensor) -> Tensor:
         """A canvas in one piece: ``[1, C, rows, columns]`` with one pixel beyond the frame on each side."""
-        rows, columns = self.area[0] // TILE, self.area[1] // TILE
-        canvas = canvas.unflatten(0, (rows, columns)).permute(2, 0, 3, 1, 4).reshape(1, -1, *self.area)
-        return canvas[..., : self.size[0], : self.size[1]]
+        return from_tiles(canvas, self.area)[..., : self.size[0], : self.size[1]]
 
     def terms(
         self, plan: Plan, blurs: Sequence[Blur], group: Sequence[int], with_room: bool
@@ -66,23 +64,20 @@ class Coarse:
         half, colours = blurs[k].half, self.frame.colours
         spare = self.half - half
         height, width = self.plane.shape[-2:]
-        plane = self.plane[:, spare : height - spare, spare : width - spare]
+        plane = self.plane[None, :, spare : height - spare, spare : width - spare]
         side = TILE + 2 * half
-        tiles = functional.max_pool2d(plane[None, colours : colours + 1], side, TILE)[0, 0]
+        tiles = functional.max_pool2d(plane[:, colours : colours + 1], side, TILE)
         places = tiles.flatten().nonzero()[:, 0]
         columns = self.area[1] // TILE
         row, column = places // columns * TILE - half - 1, places % columns * TILE - half - 1
         inside = (row >= 0) & (row + side <= self.frame.size[0] // self.scale)
         inside &= (column >= 0) & (column + side <= self.frame.size[1] // self.scale)
         for border in (False, True):
-            lengths = [colours, 1, 1, 1] if border and len(plane) > colours + 2 else [colours, 1, 1]
-            lengths = lengths if with_room else [colours, 1]
+            more = [1] * (plane.shape[1] - colours)  # what was seen need not be told apart where all was
+            lengths = [colours, *(more if border or not with_room else more[:2])]
             for some in places[inside != border].split(TILES_AT_ONCE):
-                corners = [(place // columns * TILE, place % columns * TILE) for place in some.tolist()]
-                if corners:
-                    part = plane[: sum(lengths)]
-                    cut = torch.stack([part[:, y : y + side, x : x + side] for y, x in corners])
-                    yield some, [list(cut.split(lengths, 1))]
+                if len(some):
+                    yield some, [list(cut_tiles(plane[:, : sum(lengths)], half, some).split(lengths, 1))]
 
     def _fill(self, nodes: Sequence[float], k: int) -> None:
         """Means of what layer k scatters, over blocks."""
@@ -90,9 +85,7 @@ class Coarse:
         if not self.samples:
             halo = self.scale * (1 + self.half)
             terms = torch.cat(self.frame.whole(halo).terms(nodes, k, self.with_room), 1)
-            while terms.shape[-1] > columns:
-                terms = mean_of_four(terms)
-            self.plane[:, :rows, :columns] = terms[0]
+            self.plane[:, :rows, :columns] = mean_of_blocks(terms, self.scale)[0]
             return
         self.plane.zero_()
         below = nodes[k - 1] if k > 0 else -torch.inf
@@ -110,12 +103,12 @@ class _Blocks:
         self.weight = None if sample.weight is None else coarse.blocks(sample.weight)[0]
         self.known = None if frame.known is None else coarse.blocks(frame.known)[0]
         self.area, self.with_room = coarse.scale**2, coarse.with_room
-        self.row = self.column = None
+        self.places: tuple[Tensor, ...] | None = None  # everywhere
         low, high = self.x.amin((0, 1)), self.x.amax((0, 1))
         mean = torch.ones_like(low) if self.weight is None else self.weight.mean((0, 1))
         if which > 0 and self.weight is not None:  # only in few places
-            self.row, self.column = mean.nonzero(as_tuple=True)
-            low, high, mean = (t[self.row, self.column] for t in (low, high, mean))
+            self.places = mean.nonzero(as_tuple=True)
+            low, high, mean = (t[self.places] for t in (low, high, mean))
         self.low, self.high, self.mean = low, high, mean
 
     def add(self, plane: Tensor, nodes: Sequence[float], k: int, below: float, above: float) -> None:
@@ -123,14 +116,11 @@ class _Blocks:
         colours = self.light.shape[0]
         partly = (self.high > below) & (self.low < above)
         if self.with_room:
-            room = self.mean * (self.low >= above)
-            if self.row is None or self.column is None:
-                plane[colours + 1] += room
-            else:
-                plane[colours + 1, self.row, self.column] += room
+            room: tuple[int | Tensor, ...] = (colours + 1, *(self.places or ()))
+            plane[room] += self.mean * (self.low >= above)
         places = partly.nonzero(as_tuple=True)
-        if self.row is not None and self.column is not None:
-            places = (self.row[places], self.column[places])
+        if self.places is not None:
+            places = tuple(axis[places] for axis in self.places)
         for row, column in zip(*(p.split(_PIXELS_AT_ONCE // self.area) for p in places), strict=True):
             at = (..., row, column)
             x = self.x[at]

@@ -7,7 +7,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .coarse import Coarse
-from .frame import TILE, Frame, alike
+from .frame import TILE, Frame, alike, in_tiles
 from .plan import Blur, Plan
 from .spread import Spread, fold
 
@@ -207,9 +207,8 @@ def _join_finer(front: Tensor, scale: int, canvas: Tensor, frame: Frame, join: J
     for row in range(frame.area[0] // TILE):
         strip = front[..., row * step : (row + 1) * step + 2, :]
         if bool(strip.any()):
-            fine = _finer(strip, scale)[0].unflatten(2, (-1, TILE)).permute(2, 0, 1, 3)
             tiles = slice(row * columns, (row + 1) * columns)
-            canvas[tiles] = join(fine, canvas[tiles])
+            canvas[tiles] = join(in_tiles(_finer(strip, scale)), canvas[tiles])
 
 
 def _scattered(

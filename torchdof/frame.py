@@ -14,9 +14,20 @@ from torch import Tensor
 
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
-from .pool import mean_of_four
+from .pool import mean_of_blocks
 
-__all__ = ["TILE", "TILES_AT_ONCE", "Frame", "Sample", "Window", "alike"]
+__all__ = [
+    "TILE",
+    "TILES_AT_ONCE",
+    "Frame",
+    "Sample",
+    "Window",
+    "alike",
+    "cut_tiles",
+    "from_tiles",
+    "in_tiles",
+    "margin_and_align",
+]
 
 TILE = 64
 """Pixels of a tile along each axis."""
@@ -159,16 +170,14 @@ class Frame:
     def image(self, canvas: Tensor) -> Tensor:
         """What a canvas, or a part of its channels, shows: ``[B, C, H, W]``."""
         if self.tiled:
-            rows, columns = self.area[0] // TILE, self.area[1] // TILE
-            canvas = canvas.unflatten(0, (rows, columns)).permute(2, 0, 3, 1, 4).reshape(1, -1, *self.area)
+            canvas = from_tiles(canvas, self.area)
         return canvas[..., : self.size[0], : self.size[1]]
 
     def at(self, scattered: Tensor, places: Tensor | None) -> Tensor:
         """What was scattered in a window, as tiles where the canvas is made of tiles."""
         if places is None or scattered.shape[-2:] == (TILE, TILE):
             return scattered
-        tiles = scattered[0].unfold(1, TILE, TILE).unfold(2, TILE, TILE).permute(1, 2, 0, 3, 4)
-        return tiles.flatten(0, 1)[places]
+        return in_tiles(scattered)[places]
 
     def groups(self, plan: Plan, blurs: Sequence[Blur]) -> list[list[int]]:
         """Layers that are spread together, far to near: in a whole frame as many as fill the channels."""
@@ -202,9 +211,7 @@ class Frame:
             layers = [window.terms(plan.nodes, k, with_room) for k in group]
             each, lengths = len(layers[0]), [part.shape[1] for parts in layers for part in parts]
             if scale > 1:
-                means = torch.cat([part for parts in layers for part in parts], 1)
-                for _ in range(scale.bit_length() - 1):
-                    means = mean_of_four(means)
+                means = mean_of_blocks(torch.cat([part for parts in layers for part in parts], 1), scale)
                 parts = means.split(lengths, 1)
                 layers = [list(parts[i : i + each]) for i in range(0, len(parts), each)]
             yield tiles, layers
@@ -263,10 +270,7 @@ class Frame:
         values = values[..., start : start + self.area[0] + 2 * halo, start : start + self.area[1] + 2 * halo]
         if places is None:
             return values
-        columns = self.area[1] // TILE
-        side = TILE + 2 * halo
-        corners = [(place // columns * TILE, place % columns * TILE) for place in places.tolist()]
-        return torch.stack([values[0, :, y : y + side, x : x + side] for y, x in corners])
+        return cut_tiles(values, halo, places)
 
     def any_share(self, plan: Plan, group: Sequence[int], halo: int) -> Tensor:
         """Whether a pixel of the frame, or up to ``halo`` outside it, lies in these layers, which are neighbours."""
@@ -309,6 +313,30 @@ class Frame:
             wide = functional.max_pool2d(layer[None, None], 2 * reach + 1, 1, reach)
             occupied.append(functional.max_pool2d(wide, TILE // _CELL)[0, 0] > 0)
         return occupied
+
+
+def in_tiles(values: Tensor) -> Tensor:
+    """``[1, C, H, W]`` -> ``[tiles, C, TILE, TILE]``, row by row."""
+    return values[0].unfold(1, TILE, TILE).unfold(2, TILE, TILE).permute(1, 2, 0, 3, 4).flatten(0, 1)
+
+
+def from_tiles(tiles: Tensor, area: Sequence[int]) -> Tensor:
+    """``[tiles, C, TILE, TILE]`` of an area -> ``[1, C, H, W]``."""
+    rows, columns = area[0] // TILE, area[1] // TILE
+    return tiles.unflatten(0, (rows, columns)).permute(2, 0, 3, 1, 4).reshape(1, -1, *area)
+
+
+def cut_tiles(values: Tensor, halo: int, places: Tensor) -> Tensor:
+    """Some tiles with their halo, ``[n, C, TILE + 2 halo, TILE + 2 halo]``, of ``[1, C, H + 2 halo, W + 2 halo]``."""
+    side, columns = TILE + 2 * halo, (values.shape[-1] - 2 * halo) // TILE
+    corners = [(place // columns * TILE, place % columns * TILE) for place in places.tolist()]
+    return torch.stack([values[0, :, y : y + side, x : x + side] for y, x in corners])
+
+
+def margin_and_align(blurs: Sequence[Blur]) -> tuple[int, int]:
+    """What :class:`Frame` needs for these layers: pixels on each side, and what they and the frame are multiples of."""
+    align = max(blur.scale for blur in blurs)
+    return -(-max(blur.halo for blur in blurs) // align) * align, align
 
 
 def alike(plan: Plan, blurs: Sequence[Blur], j: int, k: int) -> bool:

@@ -1,18 +1,17 @@
 """How the cost of a scene grows with its blur and with the size of its frame."""
 
 import dataclasses
+import functools
 import math
-import statistics
 from collections.abc import Sequence
 
-import torch
 import torch.nn.functional as functional
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from .speed import Setting, Subject, render, times
+from .speed import Setting, Subject, median_and_spread, render, times
 
 __all__ = ["Growth", "lines", "measure_growth", "scenes", "show_growth"]
 
@@ -79,11 +78,7 @@ def measure_growth(subject: Subject, repeat: int, unit: float, console: Console 
         both = []
         for occlusion in (True, False):
             setting = Setting("layered", occlusion, _TOLERANCE)
-            taken = times(lambda: render(scene, setting), repeat)  # noqa: B023
-            low, high = torch.tensor(taken, dtype=torch.float64).quantile(
-                torch.tensor([0.25, 0.75], dtype=torch.float64)
-            )
-            both.append((statistics.median(taken), float(high - low)))
+            both.append(median_and_spread(times(functools.partial(render, scene, setting), repeat)))
         (median, spread), (plain, plain_spread) = both
         radius, pixels = float(scene.coc_px.abs().max()), width * height
         own = (median, spread, median / unit, 1e9 * median / pixels)

@@ -40,6 +40,7 @@ from .arguments import whole
 from .files import whole_file
 from .module import blur_by_coc
 from .scenes import Scene, read_scenes
+from .speed import median_and_spread
 
 __all__ = ["Peer", "Row", "check", "compare", "measure", "ours", "read_peers", "ratios"]
 
@@ -171,8 +172,7 @@ def measure(scene: Scene, compared: Sequence[Peer], repeat: int) -> list[Row]:
             times[peer.name].append(_timed(peer, scene.image, scene.coc_px)[1])
     rows = []
     for name, seconds in times.items():
-        low, high = torch.tensor(seconds, dtype=torch.float64).quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
-        rows.append(Row(scene.name, name, statistics.median(seconds), float(high - low), errors[name]))
+        rows.append(Row(scene.name, name, *median_and_spread(seconds), errors[name]))
     return rows
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from . import background, composite, highlights, layers
 from .attention import Attention, box_around, weight_map
 from .check import Options
-from .frame import Frame, Sample
+from .frame import Frame, Sample, margin_and_align
 from .loop import side, tile_by_tile
 from .plan import Blur, Plan
 from .spread import layers_by_conv, layers_by_fold
@@ -180,8 +180,7 @@ def _composite(surfaces: Sequence[Surface], plan: Plan, options: Options, indepe
     samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
     moves = torch.is_grad_enabled() and any(t.requires_grad for s in surfaces for t in s[:2])
     exporting = torch.compiler.is_exporting()
-    align = max(blur.scale for blur in blurs)
-    margin = -(-max(blur.halo for blur in blurs) // align) * align
+    margin, align = margin_and_align(blurs)
     frame = Frame(
         samples,
         margin=margin,

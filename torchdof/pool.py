@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-__all__ = ["max_around", "max_of_four", "mean_of_four"]
+__all__ = ["max_around", "max_of_four", "mean_of_blocks", "mean_of_four"]
 
 
 def max_around(values: Tensor) -> Tensor:
@@ -42,3 +42,15 @@ def mean_of_four(values: Tensor) -> Tensor:
     """
     rows = torch.lerp(values[..., 0::2, :], values[..., 1::2, :], 0.5)  # a sum could overflow
     return torch.lerp(rows[..., 0::2], rows[..., 1::2], 0.5)
+
+
+def mean_of_blocks(values: Tensor, scale: int) -> Tensor:
+    """Mean of each ``scale`` x ``scale`` values, a power of two: ``[..., H, W] -> [..., H / scale, W / scale]``.
+
+    Example:
+        >>> mean_of_blocks(torch.arange(16.0).reshape(4, 4), 4).tolist()
+        [[7.5]]
+    """
+    for _ in range(scale.bit_length() - 1):
+        values = mean_of_four(values)
+    return values

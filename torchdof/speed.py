@@ -42,6 +42,7 @@ __all__ = [
     "from_files",
     "measure",
     "measure_all",
+    "median_and_spread",
     "pareto",
     "render",
     "renderer",
@@ -246,6 +247,17 @@ def times(work: Callable[[], object], repeat: int) -> list[float]:
     return found
 
 
+def median_and_spread(seconds: Sequence[float]) -> tuple[float, float]:
+    """Median and interquartile range.
+
+    Example:
+        >>> median_and_spread([4.0, 1.0, 2.0, 3.0, 20.0])
+        (3.0, 2.0)
+    """
+    low, high = torch.tensor(seconds, dtype=torch.float64).quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
+    return statistics.median(seconds), float(high - low)
+
+
 def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
     """What renders a subject: a function without arguments, once all is prepared.
 
@@ -288,11 +300,9 @@ def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, uni
     rms = math.sqrt(float(squares.mean()))
     looked_at = squares if setting.attention is None else squares[..., weight_map(setting.attention, out)[0, 0] == 1]
     keeps = bool(torch.isfinite(out).all()) and math.sqrt(float(looked_at.mean())) <= setting.tolerance + _ROUNDING
-    taken = times(work, repeat)
-    median = statistics.median(taken)
-    low, high = torch.tensor(taken, dtype=torch.float64).quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
+    median, spread = median_and_spread(times(work, repeat))
     height, width = out.shape[-2:]
-    speed = (median, float(high - low), median / unit, width * height / 1e6 / median, peak_mb)
+    speed = (median, spread, median / unit, width * height / 1e6 / median, peak_mb)
     error = (255 * rms, metrics.psnr(shown, truth), metrics.ssim(shown, truth))
     return Row(setting, width, height, *speed, *error, keeps)
 

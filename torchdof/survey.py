@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from .frame import TILE, Frame, Sample
+from .frame import TILE, Frame, Sample, margin_and_align
 from .layers import blur_axis, share_at_or_behind
 from .plan import Blur, Plan
 from .table import BlurTable
@@ -129,9 +129,7 @@ def survey(plan: Plan, coc_px: Tensor, table: BlurTable, layered: bool, occlusio
 
 
 def _tiles(x: Tensor, plan: Plan, blurs: list[Blur]) -> list[Tensor]:
-    align = max(blur.scale for blur in blurs)
-    margin = -(-max(blur.halo for blur in blurs) // align) * align
-    return Frame([Sample(x, x)], margin, align, tiled=True, extend=False).occupancy(plan, blurs)
+    return Frame([Sample(x, x)], *margin_and_align(blurs), tiled=True, extend=False).occupancy(plan, blurs)
 
 
 def _cost(share: float, own: float, blur: Blur, size: tuple[int, int]) -> float:
