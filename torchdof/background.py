@@ -13,7 +13,7 @@ depends on the data, which compiled graphs do not allow for, so these call :func
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -21,7 +21,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from . import highlights
-from .pool import max_around, max_of_four, mean_of_four
+from .pool import bands, max_around, max_of_four, mean_of_four, places
 
 __all__ = ["fill_hidden", "split_mixed", "surfaces"]
 
@@ -36,7 +36,12 @@ _FALL = 0.7  # weight of a level of the pyramid against the finer one before
 _UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
 _TRUST = 4.0  # how much local contrast discredits a split
 _DOUBT = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
+_CELL_LEVEL = 3  # of the pyramid, whose pixels are told apart when looking for those that may hide something
+_FINE_LEVELS = (
+    2  # of the pyramid, which each pixel looks at; the coarser ones are looked at from cells as large as these
+)
 _AT_ONCE = 2**16  # positions looked at together
+_SPLIT_AT_ONCE = 2**13
 _LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
 
 
@@ -79,32 +84,34 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
         ``(own, other, other_coc_px, share)``: light of the pixel's own surface and of the other ``[B, C, H, W]``, the
         other's coc and the share of the pixel that it covers, in [0, 1/2], ``[B, 1, H, W]``; 0 away from edges.
     """
-    if valid is None:
-        low, high = -max_around(-coc_px), max_around(coc_px)
-        edge = ((high - low) / _EDGE_PX - 1.0).clamp(0.0, 1.0)
-    else:
-        low = -max_around(torch.where(valid > 0, -coc_px, -_NEVER_PX))
-        high = max_around(torch.where(valid > 0, coc_px, -_NEVER_PX))
-        edge = ((high - low) / _EDGE_PX - 1.0).clamp(0.0, 1.0) * valid
+    edge = torch.cat([_edge(coc_px, valid, rows) for rows in bands(coc_px)], -2)
     at = _positions(edge > 0)
-    near, far, here = (_pick(t, at)[0] for t in (low, high, coc_px))
-    colour = _pick(light, at)
+    parts = [_split(light, coc_px, valid, edge, some) for some in _in_parts(at, _SPLIT_AT_ONCE)]
+    own_light, other_light, other_coc, share = (torch.cat(part, -1) for part in zip(*parts, strict=True))
+    return (
+        _put(light, at, own_light),
+        _place(other_light, at, light),
+        _put(coc_px, at, other_coc),
+        _place(share, at, coc_px),
+    )
+
+
+def _split(light: Tensor, coc_px: Tensor, valid: Tensor | None, edge: Tensor, at: Tensor) -> tuple[Tensor, ...]:
+    """Own light and other light ``[C, P]``, coc of the other and its share ``[P]`` of pixels at edges."""
+    here, colour = _pick(coc_px, at)[0], _pick(light, at)
+    near, far = _ends(coc_px, valid, at)
     gap = (far - near).clamp_min(1e-6)
-    clean = (1.0 - edge + _UNCLEAN) if valid is None else (1.0 - edge + _UNCLEAN) * valid
+    seen, place, between = (_around(t, at, _REACH) for t in (light, coc_px, edge))  # [C, n, P]
+    weight = (1.0 - between[0] + _UNCLEAN) * _falloff(light)[:, None]
+    if valid is not None:
+        weight = weight * _around(valid, at, _REACH)[0]
+    nearness = (far - place[0]) / gap
+    nearer, farther = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
 
-    surroundings = torch.cat([light, coc_px, clean], 1)
-
-    def weights() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        for its, squared in zip(_around(surroundings, at), _distances(), strict=True):
-            weight = its[-1] * math.exp(-squared / 4.5)
-            nearness = (far - its[-2]) / gap
-            yield its[:-2], weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
-
-    behind, behind_spread = _mean((seen, w) for seen, _, w in weights())
+    behind, behind_spread = _mean(seen, farther)
     # a thin foreground has no clean pixel: trust the one that differs most from what is behind
-    differs = [(seen, w, w * ((seen - behind) ** 2).sum(0) + 1e-12) for seen, w, _ in weights()]
-    pure = torch.stack([w for _, w, _ in differs]).sum(0)
-    front, front_spread = _mean((seen, torch.where(pure > 20 * _UNCLEAN, w, v)) for seen, w, v in differs)
+    differs = nearer * ((seen - behind[:, None]) ** 2).sum(0) + 1e-12
+    front, front_spread = _mean(seen, torch.where(nearer.sum(0) > 20 * _UNCLEAN, nearer, differs))
 
     contrast = front - behind
     strength = (contrast**2).sum(0)
@@ -133,12 +140,7 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     other_light = (other_pure + rest * other / norm).clamp_min(0.0)
     # the own part takes what the other leaves, so that no light is lost
     own_light = (colour - other * other_light) / (1.0 - other)
-    return (
-        _put(light, at, own_light),
-        _place(other_light, at, light),
-        _put(coc_px, at, torch.where(is_near, far, near)),
-        _place(other, at, coc_px),
-    )
+    return own_light, other_light, torch.where(is_near, far, near), other
 
 
 def fill_hidden(
@@ -169,52 +171,82 @@ def fill_hidden(
         The second sample, mixed or hidden: light, coc and weight (0 where there is none).
     """
     height, width = coc_px.shape[-2:]
-    mixed = (share > 0.05) & (other_coc_px > coc_px)
-    depth = torch.where(mixed, other_coc_px, coc_px)
-    colour = torch.where(mixed, other_light, light)
     # a highlight is in one place: what is hidden beside it is no highlight
-    most, brightest = highlights.ordinary(colour, valid), colour.amax(1, keepdim=True)
-    bright = brightest > most
-    colour = colour * torch.where(bright, most / torch.where(bright, brightest, 1.0), 1.0)
-    weight = torch.where(mixed, share, 1.0 - share)
-    if valid is not None:
-        depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid
+    most = highlights.ordinary(light, valid)
     step = 2**levels
     # in this form exported code knows that the sizes are multiples, and with one more that none of them is 1
     more = 2 * step - 1
-    extra = (0, (width + more) // step * step - width, 0, (height + more) // step * step - height)
-    depth, colour, weight = (functional.pad(t, extra, mode="replicate") for t in (depth, colour, weight))
-    pyramid = []
-    for _ in range(levels):
-        colour, depth, weight = _farthest(colour, depth, weight)
-        pyramid.append((colour, depth, weight))
-    padded = functional.pad(coc_px, extra, mode="replicate")
-    may_hide = _may_hide(padded, [depth for _, depth, _ in pyramid])[..., :height, :width]
-    at = _positions(may_hide & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT))
-    sizes = [(depth.shape[-2], depth.shape[-1]) for _, depth, _ in pyramid]
-    flat = [torch.cat(level, 1).transpose(0, 1).flatten(1) for level in pyramid]
-    found = [_hidden(list(zip(flat, sizes, strict=True)), light, coc_px, some) for some in _in_parts(at)]
+    right, below = (width + more) // step * step - width, (height + more) // step * step - height
+    maps = [light, coc_px, other_light, other_coc_px, share, most, *([] if valid is None else [valid])]
+    parts = []
+    for rows in bands(coc_px, step):
+        extra = (0, right, 0, below if rows.stop == height else 0)
+        parts.append(_finest(*(t[..., rows, :] for t in maps), extra=extra, cell=min(step, 2**_CELL_LEVEL)))
+    *finest, near, blur = (torch.cat(part, -2) for part in zip(*parts, strict=True))
+    pyramid = [tuple(finest)]
+    for _ in range(levels - 1):
+        pyramid.append(_farthest(*pyramid[-1]))
+    may_hide, near_by = (t[..., :height, :width] for t in _may_hide(near, blur, [depth for _, depth, _ in pyramid]))
+    wanted = may_hide & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT)
+    looks = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
+    if levels > _FINE_LEVELS:
+        looks[_FINE_LEVELS:] = [_together(looks[_FINE_LEVELS:], wanted, coc_px)]
+    found = [_hidden(looks, light, coc_px, some) for some in _in_parts(_positions(wanted & near_by), _AT_ONCE)]
+    if levels > _FINE_LEVELS:
+        far = _positions(wanted & ~near_by)
+        found += [_hidden(looks[_FINE_LEVELS:], light, coc_px, some) for some in _in_parts(far, _AT_ONCE)]
     at, seen = torch.cat([some for some, _ in found]), torch.cat([seen for _, seen in found], 1)
     hidden = torch.full_like(seen[0], HIDDEN_WEIGHT)
     return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden)
 
 
-def _hidden(
-    levels: Sequence[tuple[Tensor, tuple[int, int]]], light: Tensor, coc_px: Tensor, at: Tensor
-) -> tuple[Tensor, Tensor]:
-    """What is behind pixels, by the levels of a pyramid ``[C + 2, P]`` and their sizes.
+class _Level:
+    """Farthest surfaces, at every ``step``-th pixel.
 
-    Returns:
-        The pixels for which there is something, and its light and coc ``[C + 1, P]``.
+    Args:
+        values: Light, coc and weight ``[B, C + 2, H, W]``.
+        step: A power of two.
+        vote: Weight against other levels; None if it is in the weights.
+        least_px: Blur from which on a pixel looks so far.
     """
-    here = _pick(coc_px, at)[0]
-    item, row, column = _places(at, coc_px.shape[-2], coc_px.shape[-1])
-    total, seen = torch.zeros_like(here), torch.cat([_pick(light, at), here[None]])
-    for level, (values, size) in enumerate(levels, 1):
-        behind, any_behind = _behind(values, size, item, row, column, here, 2**level)
-        vote = torch.where((any_behind > 0) & (_least_px(level) <= here.abs()), _FALL**level, 0.0)
+
+    def __init__(self, values: Tensor, step: int, vote: float | None, least_px: float) -> None:
+        self.size = (values.shape[-2], values.shape[-1])
+        self.flat = values.transpose(0, 1).flatten(1)
+        self.step, self.vote, self.least_px = step, vote, least_px
+
+
+def _together(levels: Sequence[_Level], wanted: Tensor, coc_px: Tensor) -> _Level:
+    """What coarse levels show behind the nearest surface of each cell of pixels, as one level of such cells."""
+    step = 2**_FINE_LEVELS
+    extra = (0, -coc_px.shape[-1] % step, 0, -coc_px.shape[-2] % step)
+    near = -functional.max_pool2d(functional.pad(-coc_px, extra, value=-_NEVER_PX), step)
+    cells = functional.max_pool2d(functional.pad(wanted.to(coc_px.dtype), extra), step)
+    at = _positions(cells > 0)
+    here = _pick(near, at)[0]
+    item, row, column = places(at, near.shape[-2], near.shape[-1])
+    centre = (step - 1) / 2
+    total, seen = _look(levels, item, row * step + centre, column * step + centre, here)
+    values = near.new_zeros(near.shape[0], len(seen) + 1, near.shape[-2], near.shape[-1])
+    return _Level(_put(values, at, torch.cat([seen, total[None]])), step, None, levels[0].least_px)
+
+
+def _look(levels: Sequence[_Level], item: Tensor, row: Tensor, column: Tensor, here: Tensor) -> tuple[Tensor, Tensor]:
+    """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[C + 1, P]``."""
+    total = torch.zeros_like(here)
+    seen = here.new_zeros(())
+    for level in levels:
+        behind, any_behind = _behind(level, item, row, column, here)
+        vote = any_behind if level.vote is None else torch.where(any_behind > 0, level.vote, 0.0)
+        vote = torch.where(level.least_px <= here.abs(), vote, 0.0)
         total = total + vote
         seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
+    return total, seen
+
+
+def _hidden(levels: Sequence[_Level], light: Tensor, coc_px: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """The pixels behind which there is something, and its light and coc ``[C + 1, P]``."""
+    total, seen = _look(levels, *places(at, coc_px.shape[-2], coc_px.shape[-1]), _pick(coc_px, at)[0])
     some = _positions(total > 0)
     return at[some], seen.index_select(1, some)
 
@@ -267,11 +299,10 @@ def _least_px(level: int) -> float:
     return 2.0 ** (level - 2)
 
 
-def _may_hide(coc: Tensor, depths: Sequence[Tensor]) -> Tensor:
-    """Pixels, in cells, for which a level of the pyramid that they look at shows something farther."""
-    coarsest = min(len(depths), 3)
-    near, blur = -functional.max_pool2d(-coc, 2**coarsest), functional.max_pool2d(coc.abs(), 2**coarsest)
-    found = torch.zeros_like(near, dtype=torch.bool)
+def _may_hide(near: Tensor, blur: Tensor, depths: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Pixels, in cells, for which a level of the pyramid that they look at shows something farther; and a fine one."""
+    coarsest = min(len(depths), _CELL_LEVEL)
+    found = fine = torch.zeros_like(near, dtype=torch.bool)
     for level, depth in enumerate(depths, 1):
         around = max_around(depth)
         if level < coarsest:
@@ -279,7 +310,39 @@ def _may_hide(coc: Tensor, depths: Sequence[Tensor]) -> Tensor:
         elif level > coarsest:
             around = functional.interpolate(around, scale_factor=float(2 ** (level - coarsest)), mode="nearest")
         found = found | ((around > near + _BEHIND_PX) & (blur >= _least_px(level)))
-    return functional.interpolate(found.to(coc.dtype), scale_factor=float(2**coarsest), mode="nearest") > 0
+        fine = found if level <= _FINE_LEVELS else fine
+    both = torch.cat([found, fine], 1).to(near.dtype)
+    both = functional.interpolate(both, scale_factor=float(2**coarsest), mode="nearest") > 0
+    return both[:, :1], both[:, 1:]
+
+
+def _finest(
+    light: Tensor,
+    coc_px: Tensor,
+    other_light: Tensor,
+    other_coc_px: Tensor,
+    share: Tensor,
+    most: Tensor,
+    valid: Tensor | None = None,
+    *,
+    extra: tuple[int, int, int, int],
+    cell: int,
+) -> tuple[Tensor, ...]:
+    """First level of the pyramid; and in cells the nearest coc and the largest blur; of maps continued by so much."""
+    mixed = (share > 0.05) & (other_coc_px > coc_px)
+    depth = torch.where(mixed, other_coc_px, coc_px)
+    colour = torch.where(mixed, other_light, light)
+    brightest = colour.amax(1, keepdim=True)
+    bright = brightest > most
+    colour = colour * torch.where(bright, most / torch.where(bright, brightest, 1.0), 1.0)
+    weight = torch.where(mixed, share, 1.0 - share)
+    if valid is not None:
+        depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid
+    colour, depth, weight, coc_px = (
+        functional.pad(t, extra, mode="replicate") for t in (colour, depth, weight, coc_px)
+    )
+    near, blur = -functional.max_pool2d(-coc_px, cell), functional.max_pool2d(coc_px.abs(), cell)
+    return *_farthest(colour, depth, weight), near, blur
 
 
 def _farthest(colour: Tensor, depth: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -293,15 +356,13 @@ def _farthest(colour: Tensor, depth: Tensor, weight: Tensor) -> tuple[Tensor, Te
     return colour, depth, total
 
 
-def _behind(
-    level: Tensor, size: tuple[int, int], item: Tensor, row: Tensor, column: Tensor, here: Tensor, step: int
-) -> tuple[Tensor, Tensor]:
-    """Bilinear sample of a level ``[C + 2, P]`` at fine positions, of the samples behind each position only.
+def _behind(level: _Level, item: Tensor, row: Tensor, column: Tensor, here: Tensor) -> tuple[Tensor, Tensor]:
+    """Bilinear sample of a level at fine positions, of the samples behind each position only.
 
     Light and coc ``[C + 1, P]`` and their weight, 0 where nothing is behind.
     """
-    height, width = size
-    y, x = (row + 0.5) / step - 0.5, (column + 0.5) / step - 0.5
+    height, width = level.size
+    y, x = (row + 0.5) / level.step - 0.5, (column + 0.5) / level.step - 0.5
     top, left = y.floor(), x.floor()
     down, right = y - top, x - left
     first = item * height
@@ -310,21 +371,19 @@ def _behind(
     seen = total = torch.zeros_like(here)
     for line, vertical in zip(rows, (1 - down, down), strict=True):
         for place, horizontal in zip(columns, (1 - right, right), strict=True):
-            its = level.index_select(1, line + place)
+            its = level.flat.index_select(1, line + place)
             share = vertical * horizontal * its[-1] * (its[-2] > here + _BEHIND_PX)
             seen, total = seen + its[:-1] * share, total + share
     total = torch.where(total > 1e-4, total, 0.0)
     return seen / total.clamp_min(1e-4), total
 
 
-def _mean(weighted: Iterator[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Weighted mean of colours ``[C, P]`` and their variance, summed over colours, ``[P]``."""
-    first = second = total = torch.zeros(())
-    for colour, weight in weighted:
-        first, second, total = first + colour * weight, second + colour**2 * weight, total + weight
-    total = torch.as_tensor(total).clamp_min(1e-12)
-    mean = first / total
-    return mean, (second / total - mean**2).clamp_min(0.0).sum(0)
+def _mean(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted mean over n of colours ``[C, n, P]`` and their variance, summed over colours, ``[P]``."""
+    total = weight.sum(0).clamp_min(1e-12)
+    mean = (colour * weight).sum(1) / total
+    second = (colour**2 * weight).sum(1) / total
+    return mean, (second - mean**2).clamp_min(0.0).sum(0)
 
 
 def _positions(wanted: Tensor) -> Tensor:
@@ -332,16 +391,9 @@ def _positions(wanted: Tensor) -> Tensor:
     return wanted.flatten().nonzero()[:, 0]
 
 
-def _in_parts(at: Tensor) -> Sequence[Tensor]:
+def _in_parts(at: Tensor, count: int) -> Sequence[Tensor]:
     """Positions, as many at once as fit the cache. A graph does not know how many there are."""
-    return [at] if torch.compiler.is_exporting() else at.split(_AT_ONCE)
-
-
-def _places(at: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Item, row and column of flat indices."""
-    line = at // width
-    item = line // height
-    return item, line - item * height, at - line * width
+    return [at] if torch.compiler.is_exporting() else at.split(count)
 
 
 def _pick(values: Tensor, at: Tensor) -> Tensor:
@@ -365,18 +417,38 @@ def _put(values: Tensor, at: Tensor, new: Tensor) -> Tensor:
     return flat.reshape(channels, batch, height, width).transpose(0, 1)
 
 
-def _distances() -> list[int]:
+def _falloff(like: Tensor) -> Tensor:
+    """Weights of the pixels around one by their distance, in the order of :func:`_around`."""
     reach = range(-_REACH, _REACH + 1)
-    return [dy * dy + dx * dx for dy in reach for dx in reach]
+    return like.new_tensor([math.exp(-(dy * dy + dx * dx) / 4.5) for dy in reach for dx in reach])
 
 
-def _around(values: Tensor, at: Tensor) -> Iterator[Tensor]:
-    """The pixels around each position, one offset after the other, in the order of :func:`_distances`."""
+def _around(values: Tensor, at: Tensor, reach: int) -> Tensor:
+    """The pixels around each position, row by row: ``[B, C, H, W] -> [C, n, P]``."""
     height, width = values.shape[-2:]
-    item, row, column = _places(at, height, width)
-    flat, reach = values.transpose(0, 1).flatten(1), range(-_REACH, _REACH + 1)
-    columns = [(column + dx).clamp(0, width - 1) for dx in reach]
-    for dy in reach:
-        line = ((row + dy).clamp(0, height - 1) + item * height) * width
-        for across in columns:
-            yield flat.index_select(1, line + across)
+    item, row, column = places(at, height, width)
+    offsets = torch.arange(-reach, reach + 1, device=at.device)[:, None]
+    lines = ((row + offsets).clamp(0, height - 1) + item * height) * width
+    columns = (column + offsets).clamp(0, width - 1)
+    around = (lines[:, None] + columns).flatten()
+    found = values.transpose(0, 1).flatten(1).index_select(1, around)
+    return found.unflatten(1, ((2 * reach + 1) ** 2, -1))
+
+
+def _edge(coc_px: Tensor, valid: Tensor | None, rows: slice) -> Tensor:
+    """How surely pixels of some rows lie beside another surface, from 0 to 1."""
+    around = slice(max(0, rows.start - 1), rows.stop + 1)
+    coc, there = coc_px[..., around, :], None if valid is None else valid[..., around, :]
+    low, high = (max_around(c if there is None else torch.where(there > 0, c, -_NEVER_PX)) for c in (-coc, coc))
+    inner = slice(rows.start - around.start, rows.stop - around.start)
+    edge = ((high + low)[..., inner, :] / _EDGE_PX - 1.0).clamp(0.0, 1.0)
+    return edge if there is None else edge * there[..., inner, :]
+
+
+def _ends(coc_px: Tensor, valid: Tensor | None, at: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest coc around positions."""
+    low = high = _around(coc_px, at, 1)[0]
+    if valid is not None:
+        there = _around(valid, at, 1)[0] > 0
+        low, high = torch.where(there, low, _NEVER_PX), torch.where(there, high, -_NEVER_PX)
+    return low.amin(0), high.amax(0)

@@ -122,7 +122,7 @@ def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool
 def _mean(canvas: Tensor, colours: int) -> Tensor:
     """Light over its coverage; 0 where nothing is known."""
     light, covered = canvas.tensor_split((colours,), 1)
-    return torch.where(covered > _LEAST, light / covered.clamp_min(_LEAST), 0.0)
+    return light / torch.where(covered > _LEAST, covered, torch.inf)
 
 
 def _each(share: Tensor, colours: int) -> Tensor:

@@ -329,8 +329,11 @@ def from_tiles(tiles: Tensor, area: Sequence[int]) -> Tensor:
 def cut_tiles(values: Tensor, halo: int, places: Tensor) -> Tensor:
     """Some tiles with their halo, ``[n, C, TILE + 2 halo, TILE + 2 halo]``, of ``[1, C, H + 2 halo, W + 2 halo]``."""
     side, columns = TILE + 2 * halo, (values.shape[-1] - 2 * halo) // TILE
+    _, *steps = values.stride()
+    shape, first = (values.shape[1], side, side), values.storage_offset()
     corners = [(place // columns * TILE, place % columns * TILE) for place in places.tolist()]
-    return torch.stack([values[0, :, y : y + side, x : x + side] for y, x in corners])
+    # one view a tile: slicing would make three
+    return torch.stack([values.as_strided(shape, steps, first + y * steps[1] + x * steps[2]) for y, x in corners])
 
 
 def margin_and_align(blurs: Sequence[Blur]) -> tuple[int, int]:

@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .pool import places
 from .table import BlurTable
 
 __all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
@@ -60,14 +61,14 @@ def ordinary(light: Tensor, valid: Tensor | None = None) -> Tensor:
         ``[B, 1, H, W]``.
     """
     height, width = light.shape[-2:]
-    brightest = light.detach().amax(1, keepdim=True)
+    brightest = light.detach()[..., ::2, ::2].amax(1, keepdim=True)
     if valid is not None:
-        brightest = torch.where(valid > 0, brightest, torch.inf)
+        brightest = torch.where(valid[..., ::2, ::2] > 0, brightest, torch.inf)
     # as in `background`: in this form exported code knows that the sizes are multiples
-    more = 2 * _CELL - 1
-    extra = (0, (width + more) // _CELL * _CELL - width, 0, (height + more) // _CELL * _CELL - height)
-    padded = functional.pad(brightest, extra, mode="replicate")[..., ::2, ::2]
-    cells = functional.pixel_unshuffle(padded, _CELL // 2)
+    cell, (rows, columns) = _CELL // 2, brightest.shape[-2:]
+    more = 2 * cell - 1
+    extra = (0, (columns + more) // cell * cell - columns, 0, (rows + more) // cell * cell - rows)
+    cells = functional.pixel_unshuffle(functional.pad(brightest, extra, mode="replicate"), cell)
     level = torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
     level = FACTOR * level.clamp(0.0, torch.finfo(light.dtype).max / FACTOR)
     level = functional.interpolate(level, scale_factor=float(_CELL), mode="bilinear", align_corners=False)
@@ -91,15 +92,16 @@ def take(
         The light that is left, and the rays; None where there are none.
     """
     brightest = light.amax(1, keepdim=True)
-    place, nearest_px = coc_px.detach(), nearest_px.detach()
-    bright = (brightest > limit) & (place.abs() > 1.0)
+    bright = brightest > limit
     if weight is not None:
         bright &= weight > 0
-    if not bool(bright.any()):
-        return light, None
-    blur = place.abs()
-    bright &= (blur >= crisp_px) | (2.0 * blur > _to_border(place)) | _something_nearer(place, nearest_px)
     at = bright.flatten().nonzero()[:, 0]
+    if len(at) == 0:
+        return light, None
+    place = coc_px.detach().flatten()[at]
+    blur = place.abs()
+    traced = (blur >= crisp_px) | (2.0 * blur > _to_border(at, coc_px)) | _something_nearer(at, place, nearest_px)
+    at = at[traced & (blur > 1.0)]
     if len(at) == 0:
         return light, None
     peak, coc, most = brightest.flatten()[at], coc_px.flatten()[at], limit.flatten()[at]
@@ -115,8 +117,8 @@ def take(
     # from nothing at a radius of 1 px to all of it at 2
     share = (1.0 - most / peak) * (coc.abs() - 1.0).clamp(max=1.0)
     excess = light.transpose(0, 1).flatten(1)[:, at] * share
-    taken = torch.zeros_like(light.transpose(0, 1)).flatten(1).index_copy(1, at, excess)
-    left = light - taken.unflatten(1, (light.shape[0], *light.shape[-2:])).transpose(0, 1)
+    left = light.transpose(0, 1).flatten(1).index_add(1, at, -excess)
+    left = left.unflatten(1, (light.shape[0], *light.shape[-2:])).transpose(0, 1)
     return left, Rays(at, excess if weight is None else excess * weight.flatten()[at], coc)
 
 
@@ -143,7 +145,7 @@ def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int)
             chosen = sorted_[chunk]
             at, coc = some.at[chosen], some.coc_px[chosen]
             light = some.light[:, chosen]
-            item, row, column = at // (height * width), at // width % height, at % width
+            item, row, column = places(at, height, width)
             kernels = _kernels(table, coc, width, max(height, width)).to(light.dtype)  # [n, 1 or C, k, k]
             half = kernels.shape[-1] // 2
             step = torch.arange(-half, half + 1, device=at.device)
@@ -188,23 +190,25 @@ def _kernels(table: BlurTable, coc: Tensor, width: int, largest: int) -> Tensor:
     return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
 
 
-def _to_border(coc_px: Tensor) -> Tensor:
-    """Pixels between each pixel's centre and the nearest border, ``[H, W]``; layers would scale its light up there."""
-    rows, columns = (torch.arange(n, device=coc_px.device) for n in coc_px.shape[-2:])
-    rows, columns = (torch.minimum(i, i.flip(0)) + 0.5 for i in (rows, columns))
-    return torch.minimum(rows[:, None], columns)
+def _to_border(at: Tensor, coc_px: Tensor) -> Tensor:
+    """Pixels between pixels' centres and the nearest border; layers would scale their light up there."""
+    height, width = coc_px.shape[-2:]
+    _, row, column = places(at, height, width)
+    rows, columns = torch.minimum(row, height - 1 - row), torch.minimum(column, width - 1 - column)
+    return torch.minimum(rows, columns) + 0.5
 
 
-def _something_nearer(coc: Tensor, nearest_px: Tensor) -> Tensor:
+def _something_nearer(at: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     """Whether a ray of a pixel could meet a nearer surface, or land where layers would scale it; none too few."""
-    height, width = coc.shape[-2:]
-    cells = functional.max_pool2d(-nearest_px, _COARSE_CELL, ceil_mode=True)
+    item, row, column = places(at, int(nearest_px.shape[-2]), int(nearest_px.shape[-1]))
+    cells = functional.max_pool2d(-nearest_px.detach(), _COARSE_CELL, ceil_mode=True)
+    rows, columns = row // _COARSE_CELL, column // _COARSE_CELL
     found = torch.zeros_like(coc, dtype=torch.bool)
     inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells
-    farthest = float(torch.maximum(coc.max() - nearest_px.min(), 2.0 * coc.abs().max()))
+    farthest = float(torch.maximum(coc.max() + cells.max(), 2.0 * coc.abs().max()))
     while inner < farthest:
         around = functional.max_pool2d(functional.pad(cells, (radius,) * 4, value=-math.inf), 2 * radius + 1, 1)
-        near = -functional.interpolate(around, scale_factor=_COARSE_CELL, mode="nearest")[..., :height, :width]
+        near = -around[item, 0, rows, columns]
         found |= (near < coc - inner) | ((near < coc - _NEARER_PX) & (2.0 * coc.abs() > inner))
         inner, radius = max(_NEARER_PX, float(radius * _COARSE_CELL)), 2 * radius
     return found

@@ -1,9 +1,31 @@
-"""Maxima and means of neighbours, from shifted views: on a CPU several times faster than PyTorch's pooling."""
+"""Bands of rows, places of pixels, and maxima and means of neighbours.
+
+These come from shifted views: on a CPU several times faster than PyTorch's pooling.
+"""
 
 import torch
 from torch import Tensor
 
-__all__ = ["max_around", "max_of_four", "mean_of_blocks", "mean_of_four"]
+__all__ = ["bands", "max_around", "max_of_four", "mean_of_blocks", "mean_of_four", "places"]
+
+
+_PIXELS = 2**17  # of a band: what fits the cache
+
+
+def bands(values: Tensor, multiple: int = 1) -> list[slice]:
+    """Rows of ``[..., H, W]`` in bands that fit the cache, a multiple of so many but for the last.
+
+    Traced code, which knows no sizes, takes all rows at once.
+
+    Example:
+        >>> bands(torch.zeros(300, 1024), 64)
+        [slice(0, 128, None), slice(128, 256, None), slice(256, 300, None)]
+    """
+    height, width = values.shape[-2:]
+    if torch.compiler.is_compiling() or torch.compiler.is_exporting():
+        return [slice(0, height)]
+    rows = max(1, _PIXELS // (width * multiple)) * multiple
+    return [slice(start, min(start + rows, height)) for start in range(0, height, rows)]
 
 
 def max_around(values: Tensor) -> Tensor:
@@ -54,3 +76,15 @@ def mean_of_blocks(values: Tensor, scale: int) -> Tensor:
     for _ in range(scale.bit_length() - 1):
         values = mean_of_four(values)
     return values
+
+
+def places(at: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Item, row and column of flat indices in ``[B, 1, H, W]``.
+
+    Example:
+        >>> [part.tolist() for part in places(torch.tensor([5, 7]), 2, 3)]
+        [[0, 1], [1, 0], [2, 1]]
+    """
+    line = at // width
+    item = line // height
+    return item, line - item * height, at - line * width
