@@ -13,7 +13,7 @@ from torch import Tensor
 from .frame import TILE, TILES_AT_ONCE, Frame, cut_tiles, from_tiles
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
-from .pool import mean_of_blocks
+from .pool import max_of_blocks, mean_of_blocks
 
 __all__ = ["Coarse"]
 
@@ -39,11 +39,15 @@ class Coarse:
         self.plane = frame.samples[0].light.new_zeros(channels, height, width)
         self.samples = [] if frame.independent else [_Blocks(self, i) for i in range(len(frame.samples))]
 
-    def blocks(self, values: Tensor) -> Tensor:
-        """``[1, C, ...]`` of the frame with its margin -> ``[C, scale, scale, rows, columns]``."""
+    def pixels(self, values: Tensor) -> Tensor:
+        """What of a frame with its margin lies in blocks: ``[1, C, ...] -> [C, scale * rows, scale * columns]``."""
         start, count = self.frame.margin - self.scale * (1 + self.half), [n + 2 * self.half for n in self.size]
         rows, columns = (slice(start, start + self.scale * n) for n in count)
-        parts = values[0, :, rows, columns].unflatten(1, (-1, self.scale)).unflatten(3, (-1, self.scale))
+        return values[0, :, rows, columns]
+
+    def blocks(self, values: Tensor) -> Tensor:
+        """The same, as ``[C, scale, scale, rows, columns]``."""
+        parts = self.pixels(values).unflatten(1, (-1, self.scale)).unflatten(3, (-1, self.scale))
         return parts.permute(0, 2, 4, 1, 3)
 
     def canvas(self, kernels: int) -> Tensor:
@@ -104,11 +108,16 @@ class _Blocks:
         self.known = None if frame.known is None else coarse.blocks(frame.known)[0]
         self.area, self.with_room = coarse.scale**2, coarse.with_room
         self.places: tuple[Tensor, ...] | None = None  # everywhere
-        low, high = self.x.amin((0, 1)), self.x.amax((0, 1))
-        mean = torch.ones_like(low) if self.weight is None else self.weight.mean((0, 1))
-        if which > 0 and self.weight is not None:  # only in few places
+        if which > 0 and sample.weight is not None:  # only in few places
+            mean = mean_of_blocks(coarse.pixels(sample.weight), coarse.scale)[0]
             self.places = mean.nonzero(as_tuple=True)
-            low, high, mean = (t[self.places] for t in (low, high, mean))
+            there = self.x[(..., *self.places)]
+            low, high, mean = there.amin((0, 1)), there.amax((0, 1)), mean[self.places]
+        else:
+            x = coarse.pixels(sample.x)
+            low, high = -max_of_blocks(-x, coarse.scale)[0], max_of_blocks(x, coarse.scale)[0]
+            weight = torch.ones_like(x) if sample.weight is None else coarse.pixels(sample.weight)
+            mean = mean_of_blocks(weight, coarse.scale)[0]
         self.low, self.high, self.mean = low, high, mean
 
     def add(self, plane: Tensor, nodes: Sequence[float], k: int, below: float, above: float) -> None:

@@ -3,10 +3,12 @@
 These come from shifted views: on a CPU several times faster than PyTorch's pooling.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
-__all__ = ["bands", "max_around", "max_of_four", "mean_of_blocks", "mean_of_four", "places"]
+__all__ = ["bands", "max_around", "max_of_blocks", "max_of_four", "mean_of_blocks", "mean_of_four", "places"]
 
 
 _PIXELS = 2**17  # of a band: what fits the cache
@@ -73,8 +75,22 @@ def mean_of_blocks(values: Tensor, scale: int) -> Tensor:
         >>> mean_of_blocks(torch.arange(16.0).reshape(4, 4), 4).tolist()
         [[7.5]]
     """
+    return _of_blocks(mean_of_four, values, scale)
+
+
+def max_of_blocks(values: Tensor, scale: int) -> Tensor:
+    """Largest of each ``scale`` x ``scale`` values, a power of two: ``[..., H, W] -> [..., H / scale, W / scale]``.
+
+    Example:
+        >>> max_of_blocks(torch.arange(16.0).reshape(4, 4), 4).tolist()
+        [[15.0]]
+    """
+    return _of_blocks(max_of_four, values, scale)
+
+
+def _of_blocks(of_four: Callable[[Tensor], Tensor], values: Tensor, scale: int) -> Tensor:
     for _ in range(scale.bit_length() - 1):
-        values = mean_of_four(values)
+        values = of_four(values)
     return values
 
 
