@@ -99,3 +99,22 @@ def test_coarse_layers_leave_out_what_the_coarser_pixel_blurs() -> None:
     variance = (coc / blur.scale) ** 2 / 4
     radius = coc / blur.scale * math.sqrt(1 - (1 / 3 - 1 / (12 * blur.scale**2)) / variance)
     torch.testing.assert_close(blur.kernel[0], disc(radius), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("tolerance", [1 / 255, 4 / 255])
+def test_highlights_are_traced_wherever_a_coarse_layer_has_a_share_of_them(tolerance: float) -> None:
+    plan = Plan.of_scene(coc_map(-40.0, 0.0, 30.0).expand(1, 1, 100, 3), tolerance)
+    blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
+    for k, (blur, coc) in enumerate(zip(blurs, plan.coc_px, strict=True)):
+        beside = [b.scale for b in blurs[max(0, k - 1) : k + 2]]
+        assert max(beside) == 1 or abs(coc) >= plan.crisp_px or plan.nodes[k] == 0.0
+    assert any(abs(c) < plan.crisp_px for c in plan.coc_px if c) and any(blur.scale > 1 for blur in blurs)
+
+
+def test_one_layer_just_large_enough_gets_no_resolution_of_its_own() -> None:
+    def scales(largest: float) -> set[int]:
+        plan = Plan.of_scene(coc_map(0.0, largest).expand(1, 1, 100, 2), 1 / 255)
+        blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
+        return {blur.scale for blur in blurs}
+
+    assert scales(7.5) == {1} and scales(12.0) == {1, 2} and scales(19.0) == {1, 2} and scales(30.0) == {1, 2, 4}

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .layers import blur_axis, from_blur_axis
+from .resolution import shrink
 from .table import BlurTable
 
 if TYPE_CHECKING:
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
 __all__ = ["Blur", "Plan"]
 
 _FINEST_SPACING = 0.5
-_SPACING = 4.0  # measured, as the next: keeps the RMS error below the tolerance on every ray-traced scene
-_COARSE_RADIUS = 4.5  # at a tolerance of 1/255 half resolution starts at twice this radius, a quarter at four times
-_COARSEST = 4
-_MOMENT_REACH = 64.0  # px; second moments of kernels that large are those of the continuous profile
+_SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next two: errors stay below the tolerance
+_SPACING_POWER = 0.8  # of the tolerance
+_COARSE_FROM_PX = (7.2, 18.0)  # blurs from which half and quarter resolution will do at a tolerance of 1/255
+_COARSE_PAYS = 1.2  # a resolution of its own takes time that layers little larger than its first do not save
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,13 +108,17 @@ class Plan:
 
     @property
     def crisp_px(self) -> float:
-        """Radius from which on layers are blurred at a coarser resolution, which softens the edges of highlights."""
-        return 2 * _COARSE_RADIUS / math.sqrt(self.tolerance * 255.0) if self.tolerance else math.inf
+        """Radius from which on light is blurred at a coarser resolution, all or in part; that softens highlights."""
+        coarse = [abs(coc) for coc in self.coc_px if self._scale(coc) > 1]
+        finer = [abs(coc) for coc in self.coc_px if abs(coc) < min(coarse, default=0.0)]
+        return math.inf if not coarse else max(finer, default=0.0)
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is blurred at: every ``scale``-th pixel, a power of two."""
-        steps = abs(coc_px) / _COARSE_RADIUS * math.sqrt(self.tolerance * 255.0)
-        return 2 ** min(_COARSEST, math.floor(math.log2(steps))) if steps >= 2 else 1
+        times = math.sqrt(self.tolerance * 255.0)
+        largest = max(abs(self.coc_px[0]), abs(self.coc_px[-1]))
+        starts = [start for start in _COARSE_FROM_PX if largest * times >= _COARSE_PAYS * start]
+        return 2 ** sum(abs(coc_px) * times >= start for start in starts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +147,7 @@ class Blur:
 def spacing(x: float, tolerance: float) -> float:
     """Distance on the blur axis from a node at ``x`` to the next one outwards."""
     finest = max(_FINEST_SPACING, abs(x) / 40.0)
-    return max(finest, _SPACING * math.sqrt(tolerance) * max(abs(x) + 0.5, 1.0) ** 0.75)
+    return max(finest, _SPACING * (tolerance * 255.0) ** _SPACING_POWER * max(abs(x) + 0.5, 1.0) ** 0.75)
 
 
 def _law(low: float, high: float, tolerance: float) -> tuple[float, ...]:
@@ -168,19 +173,10 @@ def _span(coc_px: Tensor) -> tuple[float, float]:
 @functools.lru_cache(maxsize=512)
 @torch.inference_mode(False)  # what is kept must serve autograd as well
 def _kernel(table: BlurTable, coc_px: float, width: int, scale: int, window: int | None) -> Tensor:
-    coc = torch.tensor([coc_px / scale], dtype=torch.float64)
-    if scale > 1:
-        # averaging, interpolation and the coarser pixel blur as well: leave that much out, by second moments
-        coc = coc * math.sqrt(max(0.25, 1 - (1 / 3 - 1 / (12 * scale**2)) / _variance(table, coc, width / scale)))
-    return table.kernels(coc, width / scale, window=window)[0]
-
-
-def _variance(table: BlurTable, coc_px: Tensor, width: float) -> float:
-    """Second moment of a kernel along an axis; that of a large one from a smaller one of the same shape."""
-    smaller = max(1.0, min(table.reach_px(float(coc_px), width) / _MOMENT_REACH, float(coc_px.abs())))
-    kernel = table.kernels(coc_px / smaller, width / smaller)[0]
-    axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
-    return smaller**2 * (float((kernel.mean(0).sum(0) * axis**2).sum()) - 1 / 12)
+    coc = coc_px / scale
+    if scale > 1:  # averaging and interpolation blur as well
+        coc *= shrink(table, coc, width / scale, scale)
+    return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0]
 
 
 # one constant each: a compiled graph cannot hold several results of one such function

@@ -1,0 +1,62 @@
+"""Kernels at a coarser resolution: averaged, spread and interpolated they come nearest to the kernel they stand for."""
+
+import pytest
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from torchdof import BlurTable
+from torchdof.resolution import shrink
+
+TABLES = {"disc": BlurTable.disc(), "gaussian": BlurTable.gaussian()}
+
+
+def photograph(size: int = 256) -> Tensor:
+    """Noise with the spectrum of photographs, amplitude 1/f: ``[1, 1, size, size]``."""
+    frequency = torch.fft.fftfreq(size, dtype=torch.float64)
+    distance = (frequency[:, None] ** 2 + frequency**2).sqrt()
+    white = torch.randn(size, size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return torch.fft.ifft2(torch.fft.fft2(white) / distance.clamp_min(0.5 / size)).real[None, None]
+
+
+def spread(image: Tensor, table: BlurTable, coc_px: float) -> Tensor:
+    """Spread with the kernel of a coc, around the ends."""
+    kernel = table.kernels(torch.tensor([coc_px], dtype=torch.float64), 256)[0, 0]
+    half, size = kernel.shape[-1] // 2, image.shape[-1]
+    area = functional.pad(kernel, (0, size - 2 * half - 1) * 2).roll((-half, -half), (0, 1))
+    return torch.fft.irfft2(torch.fft.rfft2(image) * torch.fft.rfft2(area), s=(size, size))
+
+
+def error(table: BlurTable, coc_px: float, scale: int, factor: float) -> float:
+    """RMS difference of the coarse chain from the kernel itself."""
+    image = photograph()
+    means = spread(functional.avg_pool2d(image, scale), table, coc_px / scale * factor)
+    fine = functional.interpolate(means, scale_factor=float(scale), mode="bilinear", align_corners=False)
+    inner = (..., slice(64, -64), slice(64, -64))  # interpolation does not wrap around
+    return float((fine - spread(image, table, coc_px))[inner].square().mean().sqrt())
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("coc_px", [1.8, 2.3, 3.6, 4.6, 7.1])
+@pytest.mark.parametrize("name", TABLES)
+def test_no_other_size_is_much_nearer_to_the_kernel(name: str, coc_px: float, scale: int) -> None:
+    table, meant = TABLES[name], coc_px * scale
+    best = min(error(table, meant, scale, 0.5 + 0.02 * step) for step in range(27))
+    assert error(table, meant, scale, shrink(table, coc_px, 256 / scale, scale)) < 1.1 * best
+    assert error(table, meant, scale, 1.0) > 1.05 * best or coc_px > 3.0, "as it is would do"
+
+
+def test_a_wide_gaussian_keeps_its_second_moment() -> None:
+    # what averaging 2 x 2 pixels, linear interpolation and the coarser pixel add to the variance, in coarse pixels
+    others = 1 / 3 - 1 / 48
+    table = TABLES["gaussian"]
+    kernel = table.kernels(torch.tensor([6.0], dtype=torch.float64), 128)[0, 0]
+    axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
+    variance = float((kernel.sum(0) * axis**2).sum()) - 1 / 12
+    assert shrink(table, 6.0, 128, 2) == pytest.approx((1 - others / variance) ** 0.5, abs=2e-3)
+
+
+@pytest.mark.parametrize("coc_px", [-3.0, 0.3, 11.0, 400.0])
+def test_a_size_is_a_share(coc_px: float) -> None:
+    assert 0.5 <= shrink(TABLES["disc"], coc_px, 500.0, 2) <= 1.0
+    assert shrink(TABLES["disc"], coc_px, 500.0, 2) == shrink(TABLES["disc"], -coc_px, 500.0, 2)
