@@ -105,7 +105,7 @@ def test_coarse_layers_leave_out_what_the_coarser_pixel_blurs() -> None:
 def test_highlights_are_traced_wherever_a_coarse_layer_has_a_share_of_them(tolerance: float) -> None:
     plan = Plan.of_scene(coc_map(-40.0, 0.0, 30.0).expand(1, 1, 100, 3), tolerance)
     blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
-    for k, (blur, coc) in enumerate(zip(blurs, plan.coc_px, strict=True)):
+    for k, (_, coc) in enumerate(zip(blurs, plan.coc_px, strict=True)):
         beside = [b.scale for b in blurs[max(0, k - 1) : k + 2]]
         assert max(beside) == 1 or abs(coc) >= plan.crisp_px or plan.nodes[k] == 0.0
     assert any(abs(c) < plan.crisp_px for c in plan.coc_px if c) and any(blur.scale > 1 for blur in blurs)
