@@ -115,7 +115,7 @@ def test_one_run_more_warms_up() -> None:
 def test_median_and_spread_are_those_of_the_timed_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     subject = speed.shipped(36, 64)
     wanted = speed.exact(subject, True)
-    ticks = iter([0.0, 1.0, 10.0, 12.0, 20.0, 23.0, 30.0, 34.0, 40.0, 60.0])
+    ticks = iter([-9.0, 0.0, 1.0, 10.0, 12.0, 20.0, 23.0, 30.0, 34.0, 40.0, 60.0])
     monkeypatch.setattr(speed.time, "perf_counter", lambda: next(ticks))
     found = speed.measure(subject, EXACT, wanted, 5, 2.0)
     assert (found.median_s, found.spread_s, found.units) == (3.0, 2.0, 1.5)
@@ -228,7 +228,8 @@ def test_alpha_is_left_out(tmp_path: Path) -> None:
         (["TINY", "TINY", "--depth-kind", "z"], "from 16 pixels a side on"),
         (["--focus-m", "2"], "the built-in scene has its own camera"),
         (["--truth", "."], "give a folder with --out"),
-        (["--truth", ".", "--scan"], "leave IMAGE and DEPTH out, and --onnx and --scan"),
+        (["--truth", ".", "--scan"], "leave IMAGE and DEPTH out, and --onnx, --compile and --scan"),
+        (["--peers", ".", "--compile"], "of the other options it takes --out, --repeat"),
         (["--peers", ".", "--onnx"], "of the other options it takes --out, --repeat"),
     ],
 )
@@ -246,12 +247,29 @@ def test_bad_arguments_are_refused_in_a_sentence(
 
 def test_an_exported_file_has_its_row() -> None:
     subject = speed.shipped(64, 160)
-    found = [s for s in speed.settings(subject, onnx=True) if s.runtime == "onnxruntime"]
+    found = [s for s in speed.settings(subject, ["onnxruntime"]) if s.runtime == "onnxruntime"]
     assert [(s.name, s.occlusion) for s in found] == [("onnx 1/255", True), ("onnx 1/255", False)]
     wanted = speed.exact(subject, occlusion=False)
     here = speed.measure(subject, found[1], wanted, 1, 1.0)
     assert here.keeps and 0 < here.rms_255 < 1
     assert not speed.measure(subject, found[1], wanted + 0.1, 1, 1.0).keeps
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
+def test_a_compiled_module_has_its_row_and_tells_what_compiling_took() -> None:
+    subject = speed.shipped(64, 96)
+    found = [s for s in speed.settings(subject, ["compiled"]) if s.runtime == "compiled"]
+    assert [(s.name, s.occlusion) for s in found] == [("compiled 1/255", True), ("compiled 1/255", False)]
+    here = speed.measure(subject, found[1], speed.exact(subject, occlusion=False), 1, 1.0)
+    assert here.keeps and here.ready_s > here.median_s > 0
+    assert f"compiled 1/255 without occlusion: ready after {here.ready_s:.0f} s" in speed._remarks([here])
+
+
+def test_bench_needs_a_compiler_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    result = run("--compile")
+    assert result.exit_code == 2 and "install g++ or leave --compile out" in result.output
 
 
 def test_scans_change_the_radius_or_the_frame_alone() -> None:

@@ -6,6 +6,8 @@ import dataclasses
 import importlib.util
 import io
 import math
+import os
+import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -188,6 +190,10 @@ def bench(
             "--onnx", help="Also export and time the file in onnxruntime; takes minutes.", rich_help_panel=_SPEED
         ),
     ] = False,
+    compiled: Annotated[
+        bool,
+        typer.Option("--compile", help="Also time torch.compile; takes minutes.", rich_help_panel=_SPEED),
+    ] = False,
     scan: Annotated[
         bool,
         typer.Option("--scan", help="Also show how cost grows with radius and frame size.", rich_help_panel=_SPEED),
@@ -233,7 +239,7 @@ def bench(
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
     Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU; with --onnx also an
-    exported file, with --scan also how cost grows with blur and frame:
+    exported file, with --compile also torch.compile, with --scan also how cost grows with blur and frame:
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
@@ -251,14 +257,14 @@ def bench(
     if out is not None and not out.is_dir():
         raise FileNotFoundError(f"{out}: there is no such folder; make it first")
     if compared is not None:
-        if image is not None or truth is not None or views or inner or onnx or scan:
+        if image is not None or truth is not None or views or inner or onnx or compiled or scan:
             raise ValueError("--peers measures the scenes of its folder; of the other options it takes --out, --repeat")
         peers.compare(compared, peers_folder, out, repeat)
         return
     if truth is not None:
-        if image is not None or onnx or scan:
+        if image is not None or onnx or compiled or scan:
             raise ValueError(
-                "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx and --scan"
+                "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
             )
         if out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
@@ -282,9 +288,18 @@ def bench(
         raise ModuleNotFoundError("no matplotlib", name="matplotlib")
     if onnx and importlib.util.find_spec("onnxruntime") is None:
         raise ModuleNotFoundError("no onnxruntime", name="onnxruntime")
+    if compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
+        raise FileNotFoundError(
+            "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
+        )
     subject = speed.shipped() if image is None else speed.from_files(image, depth, how)
     console = Console(stderr=True)
-    rows, unit = speed.measure_all(subject, repeat, console, onnx)
+    runtimes: list[speed.Runtime] = []
+    if onnx:
+        runtimes.append("onnxruntime")
+    if compiled:
+        runtimes.append("compiled")
+    rows, unit = speed.measure_all(subject, repeat, console, runtimes)
     speed.show(rows, subject, unit)
     grown = measure_growth(subject, repeat, unit, console) if scan else []
     if grown:

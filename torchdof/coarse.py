@@ -111,7 +111,7 @@ class _Blocks:
         if which > 0 and sample.weight is not None:  # only in few places
             mean = mean_of_blocks(coarse.pixels(sample.weight), coarse.scale)[0]
             self.places = mean.nonzero(as_tuple=True)
-            there = self.x[(..., *self.places)]
+            there = self.x.flatten(2)[..., (mean > 0).flatten()]
             low, high, mean = there.amin((0, 1)), there.amax((0, 1)), mean[self.places]
         else:
             x = coarse.pixels(sample.x)

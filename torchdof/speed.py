@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import dataclasses
+import functools
 import importlib.metadata
 import io
 import math
@@ -57,6 +58,8 @@ __all__ = [
 _LEVELS = (8.0, 4.0, 2.0, 1.0, 0.5)  # of 255
 _LEAST_PX = 16
 _LOOKED_AT = 8  # of the height: radius of what is looked at
+Runtime = Literal["torch", "compiled", "onnxruntime"]
+_SHORT = {"compiled": "compiled", "onnxruntime": "onnx"}
 _FOLD_PX = 128  # largest side of the crop that the literal scatter gets
 _FOLD_BYTES = 256 * 2**20  # and the memory of its columns
 _ROUNDING = 1e-6
@@ -104,7 +107,7 @@ class Setting:
         tolerance: As there.
         side: Largest side of a crop; None is the frame.
         attention: Where the viewer looks, as in :meth:`torchdof.DepthOfField.forward`.
-        runtime: ``onnxruntime`` renders with an exported file.
+        runtime: ``compiled`` renders with ``torch.compile``, ``onnxruntime`` with an exported file.
     """
 
     method: Method
@@ -112,14 +115,14 @@ class Setting:
     tolerance: float
     side: int | None = None
     attention: tuple[float, float, float] | None = None
-    runtime: Literal["torch", "onnxruntime"] = "torch"
+    runtime: Runtime = "torch"
 
     @property
     def name(self) -> str:
         """For the report, such as ``1/255`` or ``fold 1/255``."""
         level = f"{self.tolerance * 255:g}/255" if self.tolerance else "exact"
         level += " looked at" if self.attention else ""
-        level = f"onnx {level}" if self.runtime == "onnxruntime" else level
+        level = level if self.runtime == "torch" else f"{_SHORT[self.runtime]} {level}"
         return level if self.method == "layered" else f"{self.method} {level}"
 
 
@@ -129,7 +132,7 @@ class Row:
 
     Times are in seconds, for a picture from its circle of confusion; ``units`` is the median over unit Y (see
     :func:`unit_s`); ``peak_mb`` the growth of the process's resident memory in MiB; errors are display-encoded, against
-    the exact rendering with the same occlusion.
+    the exact rendering with the same occlusion. ``ready_s`` is what compiling or exporting took beforehand.
     """
 
     setting: Setting
@@ -144,13 +147,14 @@ class Row:
     psnr_db: float
     ssim: float
     keeps: bool
+    ready_s: float = 0.0
 
 
-def settings(subject: Subject, onnx: bool = False) -> list[Setting]:
+def settings(subject: Subject, runtimes: Sequence[Runtime] = ()) -> list[Setting]:
     """What is compared on a subject: from coarse to exact with and without occlusion, and the literal scatter.
 
-    That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB. With
-    ``onnx`` also exported files.
+    That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB. Further
+    runtimes render at 1/255.
     """
     taps = (2 * math.ceil(float(subject.coc_px.abs().max())) + 3) ** 2
     bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
@@ -158,7 +162,7 @@ def settings(subject: Subject, onnx: bool = False) -> list[Setting]:
     found = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
     height, width = subject.image.shape[-2:]
     found.append(Setting("layered", True, 1 / 255, attention=(width / 2, height / 2, height / _LOOKED_AT)))
-    found += [Setting("layered", seen, 1 / 255, runtime="onnxruntime") for seen in (True, False)] if onnx else []
+    found += [Setting("layered", seen, 1 / 255, runtime=runtime) for runtime in runtimes for seen in (True, False)]
     return [*found, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
 
 
@@ -267,11 +271,16 @@ def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
     """
     if setting.runtime == "torch":
         return lambda: render(subject, setting)
+    reach = max(1.0, float(math.ceil(float(subject.coc_px.abs().max()))))
+    options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
+    if setting.runtime == "compiled":
+        compiled = torch.compile(functools.partial(blur_by_coc, max_coc_px=reach, check=False, **options))
+        with torch.no_grad():
+            compiled(subject.image, subject.coc_px)
+        return torch.no_grad()(lambda: compiled(subject.image, subject.coc_px))
     from torchdof.export import to_onnx
     from torchdof.export.timing import session
 
-    reach = max(1.0, float(math.ceil(float(subject.coc_px.abs().max()))))
-    options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
     dof = DepthOfField(Camera(), max_coc_px=reach, check=False, **options)
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/dof.onnx"
@@ -291,7 +300,9 @@ def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, uni
         repeat: How often, at least 1.
         unit: Unit Y in seconds.
     """
+    before = time.perf_counter()
     work = renderer(subject, setting)
+    ready = 0.0 if setting.runtime == "torch" else time.perf_counter() - before
     start = memory.reset_peak()
     out = work()
     peak_mb = memory.peak_mb() - start
@@ -304,11 +315,11 @@ def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, uni
     height, width = out.shape[-2:]
     speed = (median, spread, median / unit, width * height / 1e6 / median, peak_mb)
     error = (255 * rms, metrics.psnr(shown, truth), metrics.ssim(shown, truth))
-    return Row(setting, width, height, *speed, *error, keeps)
+    return Row(setting, width, height, *speed, *error, keeps, ready)
 
 
 def measure_all(
-    subject: Subject, repeat: int = 5, console: Console | None = None, onnx: bool = False
+    subject: Subject, repeat: int = 5, console: Console | None = None, runtimes: Sequence[Runtime] = ()
 ) -> tuple[list[Row], float]:
     """Every setting on a subject.
 
@@ -316,7 +327,8 @@ def measure_all(
         subject: What is rendered.
         repeat: How often each.
         console: Where to show progress; None shows none.
-        onnx: Also export, and render with onnxruntime; needs the extra ``export`` and minutes.
+        runtimes: Others to render with: ``compiled`` needs a C++ compiler, ``onnxruntime`` the extra ``export``;
+            both take minutes.
 
     Returns:
         A row for each setting, and unit Y in seconds.
@@ -328,7 +340,7 @@ def measure_all(
     unit, rows = unit_s(repeat), []
     references: dict[tuple[int | None, bool], Tensor] = {}
     silent = console is None or not console.is_terminal
-    for setting in track(settings(subject, onnx), "settings", console=console, transient=True, disable=silent):
+    for setting in track(settings(subject, runtimes), "settings", console=console, transient=True, disable=silent):
         part = subject if setting.side is None else subject.crop(setting.side)
         key = (setting.side, setting.occlusion)
         if key not in references:
@@ -433,9 +445,14 @@ def _lines(rows: Sequence[Row]) -> list[tuple[Row, list[str]]]:
 def _remarks(rows: Sequence[Row]) -> str:
     sizes = {f"{row.width} x {row.height}" for row in rows if row.setting.side is not None}
     crop = f" fold holds k * k columns a pixel: on the {' and '.join(sizes)} pixels in the middle." if sizes else ""
+    ready = [
+        f" {row.setting.name}{'' if row.setting.occlusion else ' without occlusion'}: ready after {row.ready_s:.0f} s."
+        for row in rows
+        if row.setting.runtime != "torch"
+    ]
     return (
         f"looked at: the tolerance holds in a circle in the middle, of 1/{_LOOKED_AT} of the height in radius, and a "
-        f"draft's outside; kept is about the circle.{crop}"
+        f"draft's outside; kept is about the circle.{crop}{''.join(ready)}"
     )
 
 
