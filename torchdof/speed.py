@@ -516,7 +516,9 @@ def _plot(path: Path, rows: Sequence[Row], subject: Subject) -> None:
         for row in seen:
             at = (1e3 * row.median_s, row.rms_255)
             axes.plot(*at, "o", ms=6, color=colour, mfc=colour if row in front else "none")
-            axes.annotate(row.setting.name, at, xytext=(5, 4), textcoords="offset points", fontsize=7, color=colour)
+            other = row.setting.runtime != "torch"  # these lie side by side
+            place: dict[str, Any] = {"xytext": (0, -11), "ha": "center"} if other else {"xytext": (5, 4)}
+            axes.annotate(row.setting.name, at, textcoords="offset points", fontsize=7, color=colour, **place)
         for row in (row for row in chosen if row.rms_255 == 0):
             axes.axvline(1e3 * row.median_s, color=colour, ls=":", lw=1)
         axes.plot([], [], "o-", color=colour, label="with occlusion" if occlusion else "without")
