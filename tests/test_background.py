@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from torchdof import background, pool
+from torchdof.frame import Frame, Sample
 
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
@@ -44,12 +45,13 @@ def test_no_light_is_lost_in_a_split() -> None:
 
 def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> None:
     image, coc = edge(1.0, near_px=-12.0)
-    own, _, other, other_coc, share = background.surfaces(image, coc, None, levels=5)
+    own, _, other, other_coc, share, behind = background.surfaces(image, coc, None, levels=5)
     reached = (share[0, 0, 24] > 0).nonzero()[:, 0]
     assert 12 <= 32 - int(reached.min()) <= 32 and int(reached.max()) == 31  # nothing is behind the wall
     assert torch.equal(own, image)
     assert torch.allclose(other[0, :, 24, 20:31], BLUE[:, None].expand(3, 11), atol=1e-5)
     assert float(other_coc[0, 0, 24, 20:31].abs().max()) < 1e-5
+    assert torch.allclose(behind[0, :, 24, 20:28], BLUE[:, None].expand(3, 8), atol=1e-5)
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -63,3 +65,24 @@ def test_bands_and_parts_change_nothing(known: bool, levels: int, monkeypatch: p
     monkeypatch.setattr(background, "_SPLIT_AT_ONCE", 77)
     for got, expected in zip(background.surfaces(image, coc, valid, levels), whole, strict=True):
         assert torch.allclose(got, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_behind_two_blurred_surfaces_lies_the_farthest_around() -> None:
+    green = torch.tensor([0.1, 0.6, 0.1])
+    image, coc = edge(1.0, near_px=-18.0)
+    image, coc = image.clone(), coc.clone()
+    image[..., 24:40], coc[..., 24:40] = green[:, None, None], -12.0  # red in front of green, and a blue wall
+    image[..., 40:], coc[..., 40:] = BLUE[:, None, None], 0.0
+    *_, share, behind = background.surfaces(image, coc, None, levels=6)
+    assert float(share[0, 0, 24, 20]) > 0
+    assert torch.allclose(behind[0, :, 24, 20], BLUE, atol=0.02), "the wall, not the surface in between"
+
+
+def test_a_hole_between_all_layers_shows_what_is_behind_them() -> None:
+    light = torch.rand(1, 3, 20, 30, generator=torch.Generator().manual_seed(2))
+    x = torch.full((1, 1, 20, 30), 3.0)
+    for tiled in (False, True):
+        frame = Frame([Sample(torch.zeros_like(light), x)], 4, 1, tiled, extend=False, behind=light)
+        canvas = frame.start(1)
+        assert torch.equal(frame.image(canvas[:, :3]), light)
+        assert bool((canvas[:, 3:] == 1.0).all())

@@ -45,9 +45,7 @@ _SPLIT_AT_ONCE = 2**13
 _LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
 
 
-def surfaces(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -> tuple[Tensor, ...]:
     """What each pixel shows and hides.
 
     Args:
@@ -58,11 +56,11 @@ def surfaces(
 
     Returns:
         Light ``[B, C, H, W]`` and weight ``[B, 1, H, W]`` of each pixel's own surface; light, coc and weight of its
-        second one, which is mixed into the pixel or hidden behind it.
+        second one, which is mixed into the pixel or hidden behind it; and light of what lies behind both.
     """
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-        own, seen, other, other_coc, share = _surfaces_operator(light, coc_px, valid, levels)
-        return own, seen, other, other_coc, share
+        own, seen, other, other_coc, share, behind = _surfaces_operator(light, coc_px, valid, levels)
+        return own, seen, other, other_coc, share, behind
     return _surfaces(light, coc_px, valid, levels)
 
 
@@ -151,12 +149,15 @@ def fill_hidden(
     share: Tensor,
     valid: Tensor | None,
     levels: int,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Light and coc of what lies behind blurred surfaces, from the farthest surfaces around them.
 
     A pyramid averages at each step only the farthest of four children. A pixel takes the mean of the levels that show
     something behind it, finer ones first, and of the four samples around it there only those that do; it looks no
     farther than its own blur reaches, for deeper inside nothing of what is hidden can show.
+
+    Where that surface is blurred itself, and nothing else reaches a pixel, something lies behind it again: of all that
+    the levels show, the farthest.
 
     Args:
         light: Own light of each pixel ``[B, C, H, W]``.
@@ -168,7 +169,7 @@ def fill_hidden(
         levels: Levels of the pyramid; the widest look is ``2 ** levels`` pixels.
 
     Returns:
-        The second sample, mixed or hidden: light, coc and weight (0 where there is none).
+        The second sample, mixed or hidden: light, coc and weight (0 where there is none); and light behind it.
     """
     height, width = coc_px.shape[-2:]
     # a highlight is in one place: what is hidden beside it is no highlight
@@ -189,15 +190,17 @@ def fill_hidden(
     may_hide, near_by = (t[..., :height, :width] for t in _may_hide(near, blur, [depth for _, depth, _ in pyramid]))
     wanted = may_hide & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT)
     looks = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
+    cells = _cells(wanted, coc_px, (right, below), 2 ** min(levels, _FINE_LEVELS))
+    behind = _behind_all(looks, cells)[..., :height, :width]
     if levels > _FINE_LEVELS:
-        looks[_FINE_LEVELS:] = [_together(looks[_FINE_LEVELS:], wanted, coc_px)]
+        looks[_FINE_LEVELS:] = [_together(looks[_FINE_LEVELS:], cells)]
     found = [_hidden(looks, light, coc_px, some) for some in _in_parts(_positions(wanted & near_by), _AT_ONCE)]
     if levels > _FINE_LEVELS:
         far = _positions(wanted & ~near_by)
         found += [_hidden(looks[_FINE_LEVELS:], light, coc_px, some) for some in _in_parts(far, _AT_ONCE)]
     at, seen = torch.cat([some for some, _ in found]), torch.cat([seen for _, seen in found], 1)
     hidden = torch.full_like(seen[0], HIDDEN_WEIGHT)
-    return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden)
+    return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden), behind
 
 
 class _Level:
@@ -212,33 +215,67 @@ class _Level:
 
     def __init__(self, values: Tensor, step: int, vote: float | None, least_px: float) -> None:
         self.size = (values.shape[-2], values.shape[-1])
-        self.flat = values.transpose(0, 1).flatten(1)
+        self.flat, self.light = values.transpose(0, 1).flatten(1), values[:, :-2]
         self.step, self.vote, self.least_px = step, vote, least_px
 
 
-def _together(levels: Sequence[_Level], wanted: Tensor, coc_px: Tensor) -> _Level:
-    """What coarse levels show behind the nearest surface of each cell of pixels, as one level of such cells."""
-    step = 2**_FINE_LEVELS
-    extra = (0, -coc_px.shape[-1] % step, 0, -coc_px.shape[-2] % step)
-    near = -functional.max_pool2d(functional.pad(-coc_px, extra, value=-_NEVER_PX), step)
-    cells = functional.max_pool2d(functional.pad(wanted.to(coc_px.dtype), extra), step)
-    at = _positions(cells > 0)
-    here = _pick(near, at)[0]
-    item, row, column = places(at, near.shape[-2], near.shape[-1])
-    centre = (step - 1) / 2
-    total, seen = _look(levels, item, row * step + centre, column * step + centre, here)
-    values = near.new_zeros(near.shape[0], len(seen) + 1, near.shape[-2], near.shape[-1])
-    return _Level(_put(values, at, torch.cat([seen, total[None]])), step, None, levels[0].least_px)
+class _Cells:
+    """Cells of pixels that may hide something, each with its nearest surface."""
+
+    def __init__(self, near: Tensor, at: Tensor, step: int) -> None:
+        self.near, self.at, self.step = near, at, step
+
+    def look(self, levels: Sequence[_Level], farthest: bool = False) -> tuple[Tensor, Tensor]:
+        """What levels show behind them; see :func:`_look`."""
+        item, row, column = places(self.at, self.near.shape[-2], self.near.shape[-1])
+        centre = (self.step - 1) / 2
+        here = _pick(self.near, self.at)[0]
+        return _look(levels, item, row * self.step + centre, column * self.step + centre, here, farthest)
 
 
-def _look(levels: Sequence[_Level], item: Tensor, row: Tensor, column: Tensor, here: Tensor) -> tuple[Tensor, Tensor]:
-    """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[C + 1, P]``."""
+def _cells(wanted: Tensor, coc_px: Tensor, extra: tuple[int, int], step: int) -> _Cells:
+    """Cells of ``step`` pixels a side, of maps that are continued by so many to the right and below."""
+    right, below = extra
+    ends = (0, right, 0, below)
+    near = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-_NEVER_PX), step)
+    any_wanted = functional.max_pool2d(functional.pad(wanted.to(coc_px.dtype), ends), step)
+    return _Cells(near, _positions(any_wanted > 0), step)
+
+
+def _together(levels: Sequence[_Level], cells: _Cells) -> _Level:
+    """What coarse levels show behind cells, as one level of such cells."""
+    total, seen = cells.look(levels)
+    batch, _, height, width = cells.near.shape
+    values = seen.new_zeros(batch, len(seen) + 1, height, width)
+    return _Level(_put(values, cells.at, torch.cat([seen, total[None]])), cells.step, None, levels[0].least_px)
+
+
+def _behind_all(levels: Sequence[_Level], cells: _Cells) -> Tensor:
+    """Light of the farthest surfaces in reach of each pixel, of cells that reach none the farthest of their own."""
+    total, seen = cells.look(levels, farthest=True)
+    some = _positions(total > 0)
+    own = next(level for level in levels if level.step == cells.step)
+    light = _put(own.light, cells.at[some], seen[:-1].index_select(1, some))
+    return functional.interpolate(light, scale_factor=float(cells.step), mode="bilinear", align_corners=False)
+
+
+def _look(
+    levels: Sequence[_Level], item: Tensor, row: Tensor, column: Tensor, here: Tensor, farthest: bool = False
+) -> tuple[Tensor, Tensor]:
+    """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[C + 1, P]``.
+
+    With ``farthest``, of two surfaces only the farther one counts.
+    """
     total = torch.zeros_like(here)
-    seen = here.new_zeros(())
+    seen = here.new_zeros(levels[0].flat.shape[0] - 1, 1)
     for level in levels:
         behind, any_behind = _behind(level, item, row, column, here)
         vote = any_behind if level.vote is None else torch.where(any_behind > 0, level.vote, 0.0)
         vote = torch.where(level.least_px <= here.abs(), vote, 0.0)
+        if farthest:
+            apart = behind[-1] - seen[-1]
+            vote = torch.where((total > 0) & (apart < -_BEHIND_PX), 0.0, vote)
+            total = torch.where((vote > 0) & (apart > _BEHIND_PX), 0.0, total)
         total = total + vote
         seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
     return total, seen
@@ -251,29 +288,27 @@ def _hidden(levels: Sequence[_Level], light: Tensor, coc_px: Tensor, at: Tensor)
     return at[some], seen.index_select(1, some)
 
 
-def _surfaces(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -> tuple[Tensor, ...]:
     own, other, other_coc, share = split_mixed(light, coc_px, valid)
     seen = 1.0 - share
-    other, other_coc, share = fill_hidden(own, coc_px, other, other_coc, share, valid, levels)
+    other, other_coc, share, behind = fill_hidden(own, coc_px, other, other_coc, share, valid, levels)
     if valid is not None:
         seen, share = seen * valid, share * valid
-    return own, seen, other, other_coc, share
+    return own, seen, other, other_coc, share, behind
 
 
 @torch.library.custom_op("torchdof::surfaces", mutates_args=())
 def _surfaces_operator(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    own, seen, other, other_coc, share = _surfaces(light, coc_px, valid, levels)
-    return own.contiguous(), seen.contiguous(), other.contiguous(), other_coc.contiguous(), share.contiguous()
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    own, seen, other, other_coc, share, behind = (t.contiguous() for t in _surfaces(light, coc_px, valid, levels))
+    return own, seen, other, other_coc, share, behind
 
 
 @_surfaces_operator.register_fake
 def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -> tuple[Tensor, ...]:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
-    return colour, single, torch.empty_like(colour), torch.empty_like(single), torch.empty_like(single)
+    return colour, single, *(torch.empty_like(t) for t in (colour, single, single, colour))
 
 
 def _remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:

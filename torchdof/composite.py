@@ -34,7 +34,8 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
     ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
     Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
     blurred edge of what is in front. Outside the frame surfaces go on as they are at the border, but their light is
-    unknown and weighs nothing: colours are means over what was seen.
+    unknown and weighs nothing: colours are means over what was seen. Where all layers leave a pixel uncovered, what is
+    behind them shows.
 
     Args:
         frame: The surfaces seen in each pixel.
@@ -133,12 +134,12 @@ def _each(share: Tensor, colours: int) -> Tensor:
 def _lay_all(
     frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, settle: Settle, join: Join
 ) -> Tensor:
-    """Lay all layers, far to near, on an empty canvas.
+    """Lay all layers, far to near, on what is behind them.
 
     Neighbouring layers of one coarser resolution are laid on a canvas of that resolution first.
     """
     exporting, kernels = torch.compiler.is_exporting(), blurs[0].kernel.shape[0]
-    canvas = frame.canvas(kernels)
+    canvas = frame.start(kernels)
     for groups in _runs(frame.groups(plan, blurs), plan, blurs):
         scale = blurs[groups[0][0]].scale
         part: Frame | Coarse = frame

@@ -109,6 +109,7 @@ class Frame:
         extend: Continue light over the border as well, as if it were known.
         independent: The samples of a pixel, near to far, each cover it by their weight, whatever the others do. False:
             their weights are shares of the pixel.
+        behind: Light behind all of them, ``[B, C, H, W]``; None: nothing is.
     """
 
     def __init__(
@@ -119,6 +120,7 @@ class Frame:
         tiled: bool,
         extend: bool,
         independent: bool = False,
+        behind: Tensor | None = None,
     ) -> None:
         self.independent = independent
         self.size: tuple[int, ...] = tuple(samples[0].light.shape[-2:])
@@ -135,16 +137,19 @@ class Frame:
             for s in samples
         ]
         self.known = None if extend else functional.pad(torch.ones_like(samples[0].x[:1]), ends)
+        self.behind = None if behind is None else functional.pad(behind, ends, mode="replicate")
         self._occupied: list[Tensor] = []
         self._plain_tiles: dict[int, Tensor] = {}
 
     @classmethod
-    def piece(cls, samples: Sequence[Sample], known: Tensor | None, margin: int, side: int) -> "Frame":
+    def piece(
+        cls, samples: Sequence[Sample], known: Tensor | None, behind: Tensor | None, margin: int, side: int
+    ) -> "Frame":
         """A square part of a frame that has its margin already, as a frame of its own."""
         frame = cls.__new__(cls)
         frame.size = frame.area = (side, side)
         frame.samples, frame.known, frame.margin, frame.tiled = list(samples), known, margin, False
-        frame.independent = False
+        frame.independent, frame.behind = False, behind
         return frame
 
     @property
@@ -166,6 +171,17 @@ class Frame:
             return light.new_zeros(count, self.colours + kernels, TILE, TILE)
         size = [n // scale + 2 * ring for n in self.area]
         return light.new_zeros(light.shape[0], self.colours + kernels, *size)
+
+    def start(self, kernels: int) -> Tensor:
+        """The canvas before any layer: what is behind all of them, or nothing."""
+        if self.behind is None:
+            return self.canvas(kernels)
+        light = self._cut(self.behind, 0, None)
+        if not self.tiled:
+            return torch.cat([light, torch.ones_like(light[:, :1]).expand(-1, kernels, -1, -1)], 1)
+        canvas = torch.ones_like(self.canvas(kernels))
+        canvas[:, : self.colours] = in_tiles(light)
+        return canvas
 
     def image(self, canvas: Tensor) -> Tensor:
         """What a canvas, or a part of its channels, shows: ``[B, C, H, W]``."""

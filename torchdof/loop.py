@@ -42,8 +42,10 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, l
     batch, colours = parts[0].shape[0], int(parts[0].shape[1])
     if frame.known is not None:
         parts.append(frame.known.expand(batch, -1, -1, -1))
+    if frame.behind is not None:
+        parts.append(frame.behind)
     channels = [int(t.shape[1]) for t in parts]
-    weighted, known = frame.samples[0].weight is not None, frame.known is not None
+    weighted, known, backed = frame.samples[0].weight is not None, frame.known is not None, frame.behind is not None
     across = torch.arange(window)
     tiles = torch.cat(parts, 1)
     tiles = tiles[:, :, (torch.arange(rows) * length)[:, None] + across]  # [B, P, rows, window, W]
@@ -56,10 +58,11 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, l
 
     def step(count: Tensor, tile: Tensor) -> tuple[Tensor, Tensor]:
         fields = [t.clone() for t in tile.reshape(1, sum(channels), window, window).split(channels, 1)]
+        behind = fields.pop() if backed else None
         seen = fields.pop() if known else None
         each = 3 if weighted else 2
         samples = [Sample(*fields[i : i + each]) for i in range(0, len(fields), each)]
-        piece = Frame.piece(samples, seen, frame_margin, length)
+        piece = Frame.piece(samples, seen, behind, frame_margin, length)
         tile = render(piece, [Blur(kernel.reshape(shape), scale) for kernel, shape, scale in bank])
         return count + 1, tile.reshape(colours, length, length)
 

@@ -134,11 +134,12 @@ def _render(
     coc = _within(coc, plan)
     weight = None if valid is None else valid.to(light.dtype)
     surfaces: list[Surface] = [(light, coc, weight)]
+    farthest = None
     levels = min(math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1, 7)
     if behind_light is not None and behind_coc is not None:
         surfaces = _before(light, coc, weight, behind_light, _within(behind_coc, plan), options)
     elif options.occlusion and len(plan.nodes) > 1:
-        own, seen, other, other_coc, share = background.surfaces(light, coc, weight, levels)
+        own, seen, other, other_coc, share, farthest = background.surfaces(light, coc, weight, levels)
         surfaces = [(own, coc, seen), (other, other_coc, share)]
     rays = []
     if options.occlusion and plan.rays and len(plan.nodes) > 1:
@@ -148,7 +149,7 @@ def _render(
             left, some = highlights.take(colour, c, w, limit, coc, crisp_px)
             surfaces[i] = (left, c, w)
             rays += [] if some is None else [some]
-    out = _composite(surfaces, plan, options, independent=behind_light is not None)
+    out = _composite(surfaces, plan, options, behind_light is not None, farthest)
     if rays:
         out = out + highlights.trace(rays, coc, options.table, light.shape[1])
     return out if valid is None else torch.where(valid, out, image)
@@ -172,7 +173,9 @@ def _before(
     return [(other, other_coc, share), (own, coc, seen), (behind, behind_coc, behind_weight)]
 
 
-def _composite(surfaces: Sequence[Surface], plan: Plan, options: Options, independent: bool) -> Tensor:
+def _composite(
+    surfaces: Sequence[Surface], plan: Plan, options: Options, independent: bool, behind: Tensor | None = None
+) -> Tensor:
     light, coc, _ = surfaces[0]
     layered = options.method == "layered"
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
@@ -188,6 +191,7 @@ def _composite(surfaces: Sequence[Surface], plan: Plan, options: Options, indepe
         tiled=layered and not _traced() and not moves and light.shape[0] == 1,
         extend=options.border == "extend",
         independent=independent,
+        behind=behind,
     )
 
     def rendered(frame: Frame, blurs: list[Blur]) -> Tensor:
