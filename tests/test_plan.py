@@ -111,10 +111,12 @@ def test_highlights_are_traced_wherever_a_coarse_layer_has_a_share_of_them(toler
     assert any(abs(c) < plan.crisp_px for c in plan.coc_px if c) and any(blur.scale > 1 for blur in blurs)
 
 
-def test_one_layer_just_large_enough_gets_no_resolution_of_its_own() -> None:
-    def scales(largest: float) -> set[int]:
-        plan = Plan.of_scene(coc_map(0.0, largest).expand(1, 1, 100, 2), 1 / 255)
-        blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
-        return {blur.scale for blur in blurs}
-
-    assert scales(7.5) == {1} and scales(12.0) == {1, 2} and scales(19.0) == {1, 2} and scales(30.0) == {1, 2, 4}
+def test_the_larger_a_blur_the_coarser_its_layer() -> None:
+    plan = Plan.of_scene(coc_map(0.0, 100.0).expand(1, 1, 100, 2), 1 / 255)
+    blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
+    starts = {
+        scale: min(c for b, c in zip(blurs, plan.coc_px, strict=True) if b.scale == scale) for scale in (2, 4, 8, 16)
+    }
+    assert (
+        7.2 <= starts[2] < 9.0 and 18.0 <= starts[4] < 22.0 and 36.0 <= starts[8] < 44.0 and 72.0 <= starts[16] < 85.0
+    )

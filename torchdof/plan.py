@@ -20,8 +20,8 @@ __all__ = ["Blur", "Plan"]
 _FINEST_SPACING = 0.5
 _SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next two: errors stay below the tolerance
 _SPACING_POWER = 0.8  # of the tolerance
-_COARSE_FROM_PX = (7.2, 18.0)  # blurs from which half and quarter resolution will do at a tolerance of 1/255
-_COARSE_PAYS = 1.2  # a resolution of its own takes time that layers little larger than its first do not save
+_LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consists of two layers
+_COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,10 +115,8 @@ class Plan:
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is blurred at: every ``scale``-th pixel, a power of two."""
-        times = math.sqrt(self.tolerance * 255.0)
-        largest = max(abs(self.coc_px[0]), abs(self.coc_px[-1]))
-        starts = [start for start in _COARSE_FROM_PX if largest * times >= _COARSE_PAYS * start]
-        return 2 ** sum(abs(coc_px) * times >= start for start in starts)
+        reached = abs(coc_px) * math.sqrt(self.tolerance * 255.0)
+        return 2 ** sum(reached >= start for start in _COARSE_FROM_PX)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,8 +144,9 @@ class Blur:
 
 def spacing(x: float, tolerance: float) -> float:
     """Distance on the blur axis from a node at ``x`` to the next one outwards."""
-    finest = max(_FINEST_SPACING, abs(x) / 40.0)
-    return max(finest, _SPACING * (tolerance * 255.0) ** _SPACING_POWER * max(abs(x) + 0.5, 1.0) ** 0.75)
+    finest, times = max(_FINEST_SPACING, abs(x) / 40.0), tolerance * 255.0
+    loose = times**_SPACING_POWER if times <= _LOOSE else max(_LOOSE**_SPACING_POWER, math.sqrt(times))
+    return max(finest, _SPACING * loose * max(abs(x) + 0.5, 1.0) ** 0.75)
 
 
 def _law(low: float, high: float, tolerance: float) -> tuple[float, ...]:
