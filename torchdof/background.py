@@ -37,9 +37,7 @@ _UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
 _TRUST = 4.0  # how much local contrast discredits a split
 _DOUBT = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
 _CELL_LEVEL = 3  # of the pyramid, whose pixels are told apart when looking for those that may hide something
-_FINE_LEVELS = (
-    2  # of the pyramid, which each pixel looks at; the coarser ones are looked at from cells as large as these
-)
+_FINE_LEVELS = 2  # that each pixel looks at; the coarser ones are looked at from cells as large as these
 _AT_ONCE = 2**16  # positions looked at together
 _SPLIT_AT_ONCE = 2**13
 _LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
@@ -99,10 +97,11 @@ def _split(light: Tensor, coc_px: Tensor, valid: Tensor | None, edge: Tensor, at
     here, colour = _pick(coc_px, at)[0], _pick(light, at)
     near, far = _ends(coc_px, valid, at)
     gap = (far - near).clamp_min(1e-6)
-    seen, place, between = (_around(t, at, _REACH) for t in (light, coc_px, edge))  # [C, n, P]
+    around = _around(at, coc_px, _REACH)
+    seen, place, between = (_pick_all(t, around) for t in (light, coc_px, edge))
     weight = (1.0 - between[0] + _UNCLEAN) * _falloff(light)[:, None]
     if valid is not None:
-        weight = weight * _around(valid, at, _REACH)[0]
+        weight = weight * _pick_all(valid, around)[0]
     nearness = (far - place[0]) / gap
     nearer, farther = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
 
@@ -254,7 +253,7 @@ def _behind_all(levels: Sequence[_Level], cells: _Cells) -> Tensor:
     """Light of the farthest surfaces in reach of each pixel, of cells that reach none the farthest of their own."""
     total, seen = cells.look(levels, farthest=True)
     some = _positions(total > 0)
-    own = next(level for level in levels if level.step == cells.step)
+    own = levels[:_FINE_LEVELS][-1]
     light = _put(own.light, cells.at[some], seen[:-1].index_select(1, some))
     return functional.interpolate(light, scale_factor=float(cells.step), mode="bilinear", align_corners=False)
 
@@ -458,16 +457,19 @@ def _falloff(like: Tensor) -> Tensor:
     return like.new_tensor([math.exp(-(dy * dy + dx * dx) / 4.5) for dy in reach for dx in reach])
 
 
-def _around(values: Tensor, at: Tensor, reach: int) -> Tensor:
-    """The pixels around each position, row by row: ``[B, C, H, W] -> [C, n, P]``."""
-    height, width = values.shape[-2:]
+def _around(at: Tensor, like: Tensor, reach: int) -> Tensor:
+    """Flat indices of the pixels around each position, row by row: ``[n, P]``."""
+    height, width = like.shape[-2:]
     item, row, column = places(at, height, width)
     offsets = torch.arange(-reach, reach + 1, device=at.device)[:, None]
     lines = ((row + offsets).clamp(0, height - 1) + item * height) * width
     columns = (column + offsets).clamp(0, width - 1)
-    around = (lines[:, None] + columns).flatten()
-    found = values.transpose(0, 1).flatten(1).index_select(1, around)
-    return found.unflatten(1, ((2 * reach + 1) ** 2, -1))
+    return (lines[:, None] + columns).flatten(0, 1)
+
+
+def _pick_all(values: Tensor, around: Tensor) -> Tensor:
+    """``[B, C, H, W]`` -> ``[C, n, P]``."""
+    return _pick(values, around.flatten()).unflatten(1, (around.shape[0], -1))
 
 
 def _edge(coc_px: Tensor, valid: Tensor | None, rows: slice) -> Tensor:
@@ -482,8 +484,9 @@ def _edge(coc_px: Tensor, valid: Tensor | None, rows: slice) -> Tensor:
 
 def _ends(coc_px: Tensor, valid: Tensor | None, at: Tensor) -> tuple[Tensor, Tensor]:
     """Least and largest coc around positions."""
-    low = high = _around(coc_px, at, 1)[0]
+    around = _around(at, coc_px, 1)
+    low = high = _pick_all(coc_px, around)[0]
     if valid is not None:
-        there = _around(valid, at, 1)[0] > 0
+        there = _pick_all(valid, around)[0] > 0
         low, high = torch.where(there, low, _NEVER_PX), torch.where(there, high, -_NEVER_PX)
     return low.amin(0), high.amax(0)

@@ -275,9 +275,9 @@ def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
     options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
     if setting.runtime == "compiled":
         compiled = torch.compile(functools.partial(blur_by_coc, max_coc_px=reach, check=False, **options))
-        with torch.no_grad():
-            compiled(subject.image, subject.coc_px)
-        return torch.no_grad()(lambda: compiled(subject.image, subject.coc_px))
+        run = torch.no_grad()(lambda: compiled(subject.image, subject.coc_px))
+        run()  # compiles
+        return run
     from torchdof.export import to_onnx
     from torchdof.export.timing import session
 
