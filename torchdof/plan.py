@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .layers import blur_axis, from_blur_axis
+from . import placement
+from .layers import from_blur_axis
 from .resolution import shrink
 from .table import BlurTable
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Blur", "Plan"]
 
-_FINEST_SPACING = 0.5
 _SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next two: errors stay below the tolerance
 _SPACING_POWER = 0.8  # of the tolerance
 _LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consists of two layers
@@ -46,7 +46,7 @@ class Plan:
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
-        """Layers for this scene: they span the coc that occur, with one on each end.
+        """Layers for this scene: they span the coc that occur, with one on each end, and lie close at those of borders.
 
         A scene of one plane gets one layer, and its kernel is exact.
 
@@ -54,24 +54,34 @@ class Plan:
             coc_px: ``[B, 1, H, W]``; NaN is left out.
             tolerance: As in :class:`torchdof.DepthOfField`.
         """
-        low, high = _span(coc_px)
+        x = placement.on_axis(coc_px)
+        low, high = placement.ends(x)
         if high <= low:
             return cls((low,), tolerance)
-        inner: list[float] = []
-        for x in _law(low, high, tolerance):
-            gap = 0.3 * spacing(x, tolerance)
-            if low < x < high and (x == 0.0 or (x - (inner or [low])[-1] > gap and high - x > gap)):
-                inner.append(x)
-        # surfaces go on beyond the frame as they are at its border, often with the largest blur: by what is there alone
-        ends = [x for x in (low + _FINEST_SPACING, high - _FINEST_SPACING) if low < x < high]
-        ends = [x for x in ends if min((abs(x - y) for y in inner), default=math.inf) > 0.6 * _FINEST_SPACING]
-        return cls((low, *sorted({*inner, *ends}), high), tolerance)
+        nodes = [low, high]
+
+        def around(x: float) -> float:
+            return spacing(x, tolerance)
+
+        def lay(y: float, gap: float) -> None:
+            if low < y < high and min(abs(y - other) for other in nodes) > gap:
+                nodes.append(y)
+
+        for plane in placement.planes(x, around):
+            lay(plane, 0.2 * placement.finest(plane))
+        for border in placement.at_borders(x):
+            finest = placement.finest(border)
+            if around(border) > 2.5 * finest:
+                for y in (border, border - finest, border + finest):
+                    lay(y, 0.6 * finest)
+        for y in _law(low, high, tolerance):
+            lay(y, 0.0 if y == 0.0 else 0.3 * around(y))
+        return cls(tuple(sorted(nodes)), tolerance)
 
     @classmethod
     def still(cls, coc_px: Tensor, tolerance: float) -> "Plan":
         """Layers that reach as far as this scene does but do not move with it: for gradients."""
-        low, high = _span(coc_px)
-        return cls(_law(low, high, tolerance), tolerance)
+        return cls(_law(*placement.ends(placement.on_axis(coc_px)), tolerance), tolerance)
 
     @classmethod
     def all(cls, max_coc_px: float, tolerance: float) -> "Plan":
@@ -144,9 +154,9 @@ class Blur:
 
 def spacing(x: float, tolerance: float) -> float:
     """Distance on the blur axis from a node at ``x`` to the next one outwards."""
-    finest, times = max(_FINEST_SPACING, abs(x) / 40.0), tolerance * 255.0
+    times = tolerance * 255.0
     loose = times**_SPACING_POWER if times <= _LOOSE else max(_LOOSE**_SPACING_POWER, math.sqrt(times))
-    return max(finest, _SPACING * loose * max(abs(x) + 0.5, 1.0) ** 0.75)
+    return max(placement.finest(x), _SPACING * loose * max(abs(x) + 0.5, 1.0) ** 0.75)
 
 
 def _law(low: float, high: float, tolerance: float) -> tuple[float, ...]:
@@ -158,15 +168,6 @@ def _law(low: float, high: float, tolerance: float) -> tuple[float, ...]:
             x += spacing(x, tolerance)
             nodes.append(sign * x)
     return tuple(sorted(nodes))
-
-
-def _span(coc_px: Tensor) -> tuple[float, float]:
-    coc = coc_px.detach()
-    # a kernel far larger than the frame is the same everywhere in it
-    reach = 4.0 * max(coc.shape[-2:]) + 4.0
-    x = blur_axis(torch.where(torch.isnan(coc), 0.0, coc).clamp(-reach, reach))
-    low, high = torch.aminmax(x)
-    return float(low), float(high)
 
 
 @functools.lru_cache(maxsize=512)
