@@ -6,6 +6,7 @@ from torch import Tensor
 
 from torchdof import background, pool
 from torchdof.frame import Frame, Sample
+from torchdof.highlights import ordinary
 
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
@@ -45,7 +46,7 @@ def test_no_light_is_lost_in_a_split() -> None:
 
 def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> None:
     image, coc = edge(1.0, near_px=-12.0)
-    own, _, other, other_coc, share, behind = background.surfaces(image, coc, None, levels=5)
+    own, _, other, other_coc, share, behind = background.surfaces(image, coc, None, ordinary(image), levels=5)
     reached = (share[0, 0, 24] > 0).nonzero()[:, 0]
     assert 12 <= 32 - int(reached.min()) <= 32 and int(reached.max()) == 31  # nothing is behind the wall
     assert torch.equal(own, image)
@@ -59,11 +60,13 @@ def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> N
 def test_bands_and_parts_change_nothing(known: bool, levels: int, monkeypatch: pytest.MonkeyPatch) -> None:
     image, coc = random_scene()
     valid = None if known else (torch.rand(coc.shape, generator=torch.Generator().manual_seed(6)) > 0.1).float()
-    whole = background.surfaces(image, coc, valid, levels)
+    whole = background.surfaces(image, coc, valid, ordinary(image, valid), levels)
     monkeypatch.setattr(pool, "_PIXELS", 1)
     monkeypatch.setattr(background, "_AT_ONCE", 100)
     monkeypatch.setattr(background, "_SPLIT_AT_ONCE", 77)
-    for got, expected in zip(background.surfaces(image, coc, valid, levels), whole, strict=True):
+    for got, expected in zip(
+        background.surfaces(image, coc, valid, ordinary(image, valid), levels), whole, strict=True
+    ):
         assert torch.allclose(got, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -73,7 +76,7 @@ def test_behind_two_blurred_surfaces_lies_the_farthest_around() -> None:
     image, coc = image.clone(), coc.clone()
     image[..., 24:40], coc[..., 24:40] = green[:, None, None], -12.0  # red in front of green, and a blue wall
     image[..., 40:], coc[..., 40:] = BLUE[:, None, None], 0.0
-    *_, share, behind = background.surfaces(image, coc, None, levels=6)
+    *_, share, behind = background.surfaces(image, coc, None, ordinary(image), levels=6)
     assert float(share[0, 0, 24, 20]) > 0
     assert torch.allclose(behind[0, :, 24, 20], BLUE, atol=0.02), "the wall, not the surface in between"
 

@@ -20,7 +20,6 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from . import highlights
 from .pool import bands, max_around, max_of_four, mean_of_four, places
 
 __all__ = ["fill_hidden", "split_mixed", "surfaces"]
@@ -43,13 +42,14 @@ _SPLIT_AT_ONCE = 2**13
 _LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
 
 
-def surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -> tuple[Tensor, ...]:
+def surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, ordinary: Tensor, levels: int) -> tuple[Tensor, ...]:
     """What each pixel shows and hides.
 
     Args:
         light: ``[B, C, H, W]``.
         coc_px: ``[B, 1, H, W]``, signed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
+        ordinary: As in :func:`fill_hidden`.
         levels: As in :func:`fill_hidden`.
 
     Returns:
@@ -57,9 +57,9 @@ def surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -
         second one, which is mixed into the pixel or hidden behind it; and light of what lies behind both.
     """
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-        own, seen, other, other_coc, share, behind = _surfaces_operator(light, coc_px, valid, levels)
+        own, seen, other, other_coc, share, behind = _surfaces_operator(light, coc_px, valid, ordinary, levels)
         return own, seen, other, other_coc, share, behind
-    return _surfaces(light, coc_px, valid, levels)
+    return _surfaces(light, coc_px, valid, ordinary, levels)
 
 
 def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -147,6 +147,7 @@ def fill_hidden(
     other_coc_px: Tensor,
     share: Tensor,
     valid: Tensor | None,
+    ordinary: Tensor,
     levels: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Light and coc of what lies behind blurred surfaces, from the farthest surfaces around them.
@@ -165,19 +166,19 @@ def fill_hidden(
         other_coc_px: Its coc.
         share: Its share, 0 where a pixel is not mixed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
+        ordinary: Largest light that is no highlight's ``[B, 1, H, W]``: a highlight is in one place, so what is hidden
+            beside it is none.
         levels: Levels of the pyramid; the widest look is ``2 ** levels`` pixels.
 
     Returns:
         The second sample, mixed or hidden: light, coc and weight (0 where there is none); and light behind it.
     """
     height, width = coc_px.shape[-2:]
-    # a highlight is in one place: what is hidden beside it is no highlight
-    most = highlights.ordinary(light, valid)
     step = 2**levels
     # in this form exported code knows that the sizes are multiples, and with one more that none of them is 1
     more = 2 * step - 1
     right, below = (width + more) // step * step - width, (height + more) // step * step - height
-    maps = [light, coc_px, other_light, other_coc_px, share, most, *([] if valid is None else [valid])]
+    maps = [light, coc_px, other_light, other_coc_px, share, ordinary, *([] if valid is None else [valid])]
     parts = []
     for rows in bands(coc_px, step):
         extra = (0, right, 0, below if rows.stop == height else 0)
@@ -287,10 +288,10 @@ def _hidden(levels: Sequence[_Level], light: Tensor, coc_px: Tensor, at: Tensor)
     return at[some], seen.index_select(1, some)
 
 
-def _surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -> tuple[Tensor, ...]:
+def _surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, ordinary: Tensor, levels: int) -> tuple[Tensor, ...]:
     own, other, other_coc, share = split_mixed(light, coc_px, valid)
     seen = 1.0 - share
-    other, other_coc, share, behind = fill_hidden(own, coc_px, other, other_coc, share, valid, levels)
+    other, other_coc, share, behind = fill_hidden(own, coc_px, other, other_coc, share, valid, ordinary, levels)
     if valid is not None:
         seen, share = seen * valid, share * valid
     return own, seen, other, other_coc, share, behind
@@ -298,31 +299,32 @@ def _surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) 
 
 @torch.library.custom_op("torchdof::surfaces", mutates_args=())
 def _surfaces_operator(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, ordinary: Tensor, levels: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    own, seen, other, other_coc, share, behind = (t.contiguous() for t in _surfaces(light, coc_px, valid, levels))
+    maps = (t.contiguous() for t in _surfaces(light, coc_px, valid, ordinary, levels))
+    own, seen, other, other_coc, share, behind = maps
     return own, seen, other, other_coc, share, behind
 
 
 @_surfaces_operator.register_fake
-def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, levels: int) -> tuple[Tensor, ...]:
+def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, ordinary: Tensor, levels: int) -> tuple[Tensor, ...]:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
     return colour, single, *(torch.empty_like(t) for t in (colour, single, single, colour))
 
 
 def _remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:
-    light, coc_px, valid, context.levels = inputs
-    context.save_for_backward(light, coc_px, valid)
+    *maps, context.levels = inputs
+    context.save_for_backward(*maps)
 
 
 def _backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-    light, coc_px, valid = context.saved_tensors
+    light, coc_px, valid, ordinary = context.saved_tensors
     with torch.enable_grad():
         light, coc_px = light.detach().requires_grad_(), coc_px.detach().requires_grad_()
-        outputs = _surfaces(light, coc_px, valid, context.levels)
+        outputs = _surfaces(light, coc_px, valid, ordinary, context.levels)
         wanted = [(o, g) for o, g in zip(outputs, gradients, strict=True) if o.requires_grad]
         back = torch.autograd.grad([o for o, _ in wanted], [light, coc_px], [g for _, g in wanted], allow_unused=True)
-    return (*back, None, None)
+    return (*back, None, None, None)
 
 
 _surfaces_operator.register_autograd(_backward, setup_context=_remember)

@@ -137,6 +137,7 @@ class Frame:
             for s in samples
         ]
         self.known = None if extend else functional.pad(torch.ones_like(samples[0].x[:1]), ends)
+        ends = (0, self.area[1] - self.size[1], 0, self.area[0] - self.size[0])
         self.behind = None if behind is None else functional.pad(behind, ends, mode="replicate")
         self._occupied: list[Tensor] = []
         self._plain_tiles: dict[int, Tensor] = {}
@@ -145,7 +146,7 @@ class Frame:
     def piece(
         cls, samples: Sequence[Sample], known: Tensor | None, behind: Tensor | None, margin: int, side: int
     ) -> "Frame":
-        """A square part of a frame that has its margin already, as a frame of its own."""
+        """A square part of a frame that has its margin already, but for what is behind, as a frame of its own."""
         frame = cls.__new__(cls)
         frame.size = frame.area = (side, side)
         frame.samples, frame.known, frame.margin, frame.tiled = list(samples), known, margin, False
@@ -176,12 +177,8 @@ class Frame:
         """The canvas before any layer: what is behind all of them, or nothing."""
         if self.behind is None:
             return self.canvas(kernels)
-        light = self._cut(self.behind, 0, None)
-        if not self.tiled:
-            return torch.cat([light, torch.ones_like(light[:, :1]).expand(-1, kernels, -1, -1)], 1)
-        canvas = torch.ones_like(self.canvas(kernels))
-        canvas[:, : self.colours] = in_tiles(light)
-        return canvas
+        light = in_tiles(self.behind) if self.tiled else self.behind
+        return torch.cat([light, torch.ones_like(light[:, :1]).expand(-1, kernels, -1, -1)], 1)
 
     def image(self, canvas: Tensor) -> Tensor:
         """What a canvas, or a part of its channels, shows: ``[B, C, H, W]``."""

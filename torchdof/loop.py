@@ -7,6 +7,7 @@ inside skip every layer that the window does not hold.
 from collections.abc import Callable, Sequence
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from .frame import Frame, Sample
@@ -43,7 +44,7 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, l
     if frame.known is not None:
         parts.append(frame.known.expand(batch, -1, -1, -1))
     if frame.behind is not None:
-        parts.append(frame.behind)
+        parts.append(functional.pad(frame.behind, (frame.margin,) * 4))
     channels = [int(t.shape[1]) for t in parts]
     weighted, known, backed = frame.samples[0].weight is not None, frame.known is not None, frame.behind is not None
     across = torch.arange(window)
@@ -58,7 +59,8 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, l
 
     def step(count: Tensor, tile: Tensor) -> tuple[Tensor, Tensor]:
         fields = [t.clone() for t in tile.reshape(1, sum(channels), window, window).split(channels, 1)]
-        behind = fields.pop() if backed else None
+        inner = slice(frame_margin, frame_margin + length)
+        behind = fields.pop()[..., inner, inner] if backed else None
         seen = fields.pop() if known else None
         each = 3 if weighted else 2
         samples = [Sample(*fields[i : i + each]) for i in range(0, len(fields), each)]

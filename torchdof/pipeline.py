@@ -134,16 +134,16 @@ def _render(
     coc = _within(coc, plan)
     weight = None if valid is None else valid.to(light.dtype)
     surfaces: list[Surface] = [(light, coc, weight)]
+    limit = highlights.ordinary(light, valid) if options.occlusion and len(plan.nodes) > 1 else None
     farthest = None
     levels = min(math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1, 7)
     if behind_light is not None and behind_coc is not None:
         surfaces = _before(light, coc, weight, behind_light, _within(behind_coc, plan), options)
-    elif options.occlusion and len(plan.nodes) > 1:
-        own, seen, other, other_coc, share, farthest = background.surfaces(light, coc, weight, levels)
+    elif limit is not None:
+        own, seen, other, other_coc, share, farthest = background.surfaces(light, coc, weight, limit, levels)
         surfaces = [(own, coc, seen), (other, other_coc, share)]
     rays = []
-    if options.occlusion and plan.rays and len(plan.nodes) > 1:
-        limit = highlights.ordinary(light, valid)
+    if limit is not None and plan.rays:
         crisp_px = plan.crisp_px if options.method == "layered" else math.inf
         for i, (colour, c, w) in enumerate(surfaces):
             left, some = highlights.take(colour, c, w, limit, coc, crisp_px)
