@@ -37,6 +37,8 @@ _TRUST = 4.0  # how much local contrast discredits a split
 _DOUBT = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
 _CELL_LEVEL = 3  # of the pyramid, whose pixels are told apart when looking for those that may hide something
 _FINE_LEVELS = 2  # that each pixel looks at; the coarser ones are looked at from cells as large as these
+BEHIND_STEP = 2**_FINE_LEVELS
+"""Light behind both surfaces is known at every so many pixels."""
 _AT_ONCE = 2**16  # positions looked at together
 _SPLIT_AT_ONCE = 2**13
 _LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
@@ -54,7 +56,8 @@ def surfaces(light: Tensor, coc_px: Tensor, valid: Tensor | None, ordinary: Tens
 
     Returns:
         Light ``[B, C, H, W]`` and weight ``[B, 1, H, W]`` of each pixel's own surface; light, coc and weight of its
-        second one, which is mixed into the pixel or hidden behind it; and light of what lies behind both.
+        second one, which is mixed into the pixel or hidden behind it; and light of what lies behind both, at every
+        :data:`BEHIND_STEP`-th pixel ``[B, C, h, w]``, for somewhat more than the image.
     """
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
         own, seen, other, other_coc, share, behind = _surfaces_operator(light, coc_px, valid, ordinary, levels)
@@ -162,22 +165,20 @@ def fill_hidden(
     Args:
         light: Own light of each pixel ``[B, C, H, W]``.
         coc_px: Its signed coc ``[B, 1, H, W]``.
-        other_light: Light of the second surface of mixed pixels.
-        other_coc_px: Its coc.
-        share: Its share, 0 where a pixel is not mixed.
+        other_light: Light of the second surface of mixed pixels, as :func:`split_mixed` made it: it is overwritten.
+        other_coc_px: Its coc; overwritten.
+        share: Its share, 0 where a pixel is not mixed; overwritten.
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
         ordinary: Largest light that is no highlight's ``[B, 1, H, W]``: a highlight is in one place, so what is hidden
             beside it is none.
-        levels: Levels of the pyramid; the widest look is ``2 ** levels`` pixels.
+        levels: Levels of the pyramid, from 2; the widest look is ``2 ** levels`` pixels.
 
     Returns:
         The second sample, mixed or hidden: light, coc and weight (0 where there is none); and light behind it.
     """
     height, width = coc_px.shape[-2:]
     step = 2**levels
-    # in this form exported code knows that the sizes are multiples, and with one more that none of them is 1
-    more = 2 * step - 1
-    right, below = (width + more) // step * step - width, (height + more) // step * step - height
+    right, below = _continued(width, step) - width, _continued(height, step) - height
     maps = [light, coc_px, other_light, other_coc_px, share, ordinary, *([] if valid is None else [valid])]
     parts = []
     for rows in bands(coc_px, step):
@@ -190,8 +191,8 @@ def fill_hidden(
     may_hide, near_by = (t[..., :height, :width] for t in _may_hide(near, blur, [depth for _, depth, _ in pyramid]))
     wanted = may_hide & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT)
     looks = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
-    cells = _cells(wanted, coc_px, (right, below), 2 ** min(levels, _FINE_LEVELS))
-    behind = _behind_all(looks, cells)[..., :height, :width]
+    cells = _cells(wanted, coc_px, (right, below))
+    behind = _behind_all(looks, cells)
     if levels > _FINE_LEVELS:
         looks[_FINE_LEVELS:] = [_together(looks[_FINE_LEVELS:], cells)]
     found = [_hidden(looks, light, coc_px, some) for some in _in_parts(_positions(wanted & near_by), _AT_ONCE)]
@@ -200,7 +201,7 @@ def fill_hidden(
         found += [_hidden(looks[_FINE_LEVELS:], light, coc_px, some) for some in _in_parts(far, _AT_ONCE)]
     at, seen = torch.cat([some for some, _ in found]), torch.cat([seen for _, seen in found], 1)
     hidden = torch.full_like(seen[0], HIDDEN_WEIGHT)
-    return _put(other_light, at, seen[:-1]), _put(other_coc_px, at, seen[-1]), _put(share, at, hidden), behind
+    return _fill(other_light, at, seen[:-1]), _fill(other_coc_px, at, seen[-1]), _fill(share, at, hidden), behind
 
 
 class _Level:
@@ -222,8 +223,10 @@ class _Level:
 class _Cells:
     """Cells of pixels that may hide something, each with its nearest surface."""
 
-    def __init__(self, near: Tensor, at: Tensor, step: int) -> None:
-        self.near, self.at, self.step = near, at, step
+    step = BEHIND_STEP
+
+    def __init__(self, near: Tensor, at: Tensor) -> None:
+        self.near, self.at = near, at
 
     def look(self, levels: Sequence[_Level], farthest: bool = False) -> tuple[Tensor, Tensor]:
         """What levels show behind them; see :func:`_look`."""
@@ -233,13 +236,13 @@ class _Cells:
         return _look(levels, item, row * self.step + centre, column * self.step + centre, here, farthest)
 
 
-def _cells(wanted: Tensor, coc_px: Tensor, extra: tuple[int, int], step: int) -> _Cells:
-    """Cells of ``step`` pixels a side, of maps that are continued by so many to the right and below."""
-    right, below = extra
+def _cells(wanted: Tensor, coc_px: Tensor, extra: tuple[int, int]) -> _Cells:
+    """Cells of maps that are continued by so many pixels to the right and below."""
+    (right, below), step = extra, _Cells.step
     ends = (0, right, 0, below)
     near = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-_NEVER_PX), step)
     any_wanted = functional.max_pool2d(functional.pad(wanted.to(coc_px.dtype), ends), step)
-    return _Cells(near, _positions(any_wanted > 0), step)
+    return _Cells(near, _positions(any_wanted > 0))
 
 
 def _together(levels: Sequence[_Level], cells: _Cells) -> _Level:
@@ -251,12 +254,10 @@ def _together(levels: Sequence[_Level], cells: _Cells) -> _Level:
 
 
 def _behind_all(levels: Sequence[_Level], cells: _Cells) -> Tensor:
-    """Light of the farthest surfaces in reach of each pixel, of cells that reach none the farthest of their own."""
+    """Light of the farthest surfaces in reach of each cell, of those that reach none the farthest of their own."""
     total, seen = cells.look(levels, farthest=True)
     some = _positions(total > 0)
-    own = levels[:_FINE_LEVELS][-1]
-    light = _put(own.light, cells.at[some], seen[:-1].index_select(1, some))
-    return functional.interpolate(light, scale_factor=float(cells.step), mode="bilinear", align_corners=False)
+    return _put(levels[_FINE_LEVELS - 1].light, cells.at[some], seen[:-1].index_select(1, some))
 
 
 def _look(
@@ -309,7 +310,9 @@ def _surfaces_operator(
 @_surfaces_operator.register_fake
 def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, ordinary: Tensor, levels: int) -> tuple[Tensor, ...]:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
-    return colour, single, *(torch.empty_like(t) for t in (colour, single, single, colour))
+    cells = [_continued(n, 2**levels) // BEHIND_STEP for n in light.shape[-2:]]
+    behind = light.new_empty(*light.shape[:2], *cells)
+    return colour, single, *(torch.empty_like(t) for t in (colour, single, single)), behind
 
 
 def _remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -328,6 +331,12 @@ def _backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
 
 
 _surfaces_operator.register_autograd(_backward, setup_context=_remember)
+
+
+def _continued(size: int, step: int) -> int:
+    """Pixels of an image that is continued for a pyramid."""
+    # in this form exported code knows that the sizes are multiples, and with one more that none of them is 1
+    return (size + 2 * step - 1) // step * step
 
 
 def _least_px(level: int) -> float:
@@ -451,6 +460,12 @@ def _put(values: Tensor, at: Tensor, new: Tensor) -> Tensor:
     flat = values.transpose(0, 1).flatten(1)
     flat = flat.index_copy(1, at, new.reshape(channels, -1).to(values.dtype))
     return flat.reshape(channels, batch, height, width).transpose(0, 1)
+
+
+def _fill(values: Tensor, at: Tensor, new: Tensor) -> Tensor:
+    """As :func:`_put`, into the result of it or of :func:`_place` itself."""
+    values.transpose(0, 1).view(values.shape[1], -1).index_copy_(1, at, new.reshape(values.shape[1], -1))
+    return values
 
 
 def _falloff(like: Tensor) -> Tensor:

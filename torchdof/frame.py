@@ -6,12 +6,13 @@ recorded or code is traced, the whole frame is one window.
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .background import BEHIND_STEP
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
 from .pool import mean_of_blocks
@@ -109,12 +110,13 @@ class Frame:
         extend: Continue light over the border as well, as if it were known.
         independent: The samples of a pixel, near to far, each cover it by their weight, whatever the others do. False:
             their weights are shares of the pixel.
-        behind: Light behind all of them, ``[B, C, H, W]``; None: nothing is.
+        behind: Light behind all of them, at every :data:`torchdof.background.BEHIND_STEP`-th pixel of the frame or more
+            ``[B, C, h, w]``; None: nothing is.
     """
 
     def __init__(
         self,
-        samples: Sequence[Sample],
+        samples: Iterable[Sample],
         margin: int,
         align: int,
         tiled: bool,
@@ -122,23 +124,19 @@ class Frame:
         independent: bool = False,
         behind: Tensor | None = None,
     ) -> None:
-        self.independent = independent
-        self.size: tuple[int, ...] = tuple(samples[0].light.shape[-2:])
-        self.margin, self.tiled = margin, tiled
+        self.independent, self.margin, self.tiled = independent, margin, tiled
         align = max(align, TILE) if tiled else align
-        self.area = tuple((n + align - 1) // align * align for n in self.size)
-        ends = (margin, margin + self.area[1] - self.size[1], margin, margin + self.area[0] - self.size[0])
-        self.samples = [
-            Sample(
-                functional.pad(s.light, ends, mode="replicate") if extend else functional.pad(s.light, ends),
-                functional.pad(s.x, ends, mode="replicate"),
-                None if s.weight is None else functional.pad(s.weight, ends, mode="replicate"),
-            )
-            for s in samples
-        ]
-        self.known = None if extend else functional.pad(torch.ones_like(samples[0].x[:1]), ends)
-        ends = (0, self.area[1] - self.size[1], 0, self.area[0] - self.size[0])
-        self.behind = None if behind is None else functional.pad(behind, ends, mode="replicate")
+        self.samples: list[Sample] = []
+        for sample in samples:
+            self.size: tuple[int, ...] = tuple(sample.x.shape[-2:])
+            self.area = tuple((n + align - 1) // align * align for n in self.size)
+            self.samples.append(self._continued(sample, extend))
+        inside = torch.ones_like(self.samples[0].x[:1, :, : self.size[0], : self.size[1]])
+        self.known = None if extend else functional.pad(inside, self._ends(margin))
+        self.behind = behind
+        if behind is not None and not tiled:
+            light = _finer(behind)[..., : self.size[0], : self.size[1]]
+            self.behind = functional.pad(light, self._ends(0), mode="replicate")
         self._occupied: list[Tensor] = []
         self._plain_tiles: dict[int, Tensor] = {}
 
@@ -153,6 +151,17 @@ class Frame:
         frame.independent, frame.behind = False, behind
         return frame
 
+    def _ends(self, margin: int) -> tuple[int, int, int, int]:
+        """Pixels by which an image is continued to the left, the right, above and below."""
+        more = [area - size for area, size in zip(self.area, self.size, strict=True)]
+        return margin, margin + more[1], margin, margin + more[0]
+
+    def _continued(self, sample: Sample, extend: bool) -> Sample:
+        ends = self._ends(self.margin)
+        light = functional.pad(sample.light, ends, mode="replicate" if extend else "constant")
+        weight = None if sample.weight is None else functional.pad(sample.weight, ends, mode="replicate")
+        return Sample(light, functional.pad(sample.x, ends, mode="replicate"), weight)
+
     @property
     def colours(self) -> int:
         """C of the samples."""
@@ -166,19 +175,31 @@ class Frame:
             scale: Every so many pixels count; a canvas coarser than the frame has one pixel more on each side. Not for
                 frames in tiles.
         """
-        light, ring = self.samples[0].light, 0 if scale == 1 else 1
+        return self.samples[0].light.new_zeros(self._canvas_shape(kernels, scale))
+
+    def _canvas_shape(self, kernels: int, scale: int = 1) -> tuple[int, ...]:
         if self.tiled:
-            count = self.area[0] // TILE * (self.area[1] // TILE)
-            return light.new_zeros(count, self.colours + kernels, TILE, TILE)
-        size = [n // scale + 2 * ring for n in self.area]
-        return light.new_zeros(light.shape[0], self.colours + kernels, *size)
+            return self.area[0] // TILE * (self.area[1] // TILE), self.colours + kernels, TILE, TILE
+        ring = 0 if scale == 1 else 1
+        return self.samples[0].light.shape[0], self.colours + kernels, *(n // scale + 2 * ring for n in self.area)
 
     def start(self, kernels: int) -> Tensor:
         """The canvas before any layer: what is behind all of them, or nothing."""
         if self.behind is None:
             return self.canvas(kernels)
-        light = in_tiles(self.behind) if self.tiled else self.behind
-        return torch.cat([light, torch.ones_like(light[:, :1]).expand(-1, kernels, -1, -1)], 1)
+        if not self.tiled:
+            seen = torch.ones_like(self.behind[:, :1]).expand(-1, kernels, -1, -1)
+            return torch.cat([self.behind, seen], 1)
+        canvas = self.behind.new_ones(self._canvas_shape(kernels))
+        columns, step = self.area[1] // TILE, TILE // BEHIND_STEP
+        for row in range(self.area[0] // TILE):  # a row of tiles at a time
+            start, above = row * step, min(row, 1)
+            strip = _finer(self.behind[:, :, start - above : start + step + 1])
+            strip = strip[:, :, above * BEHIND_STEP :][:, :, :TILE, : self.area[1]]
+            strip = functional.pad(strip, (0, self.area[1] - strip.shape[3], 0, TILE - strip.shape[2]))
+            canvas[row * columns : (row + 1) * columns, : self.colours] = in_tiles(strip)
+        self.behind = None  # it is on the canvas
+        return canvas
 
     def image(self, canvas: Tensor) -> Tensor:
         """What a canvas, or a part of its channels, shows: ``[B, C, H, W]``."""
@@ -326,6 +347,11 @@ class Frame:
             wide = functional.max_pool2d(layer[None, None], 2 * reach + 1, 1, reach)
             occupied.append(functional.max_pool2d(wide, TILE // _CELL)[0, 0] > 0)
         return occupied
+
+
+def _finer(light: Tensor) -> Tensor:
+    """Light at every so many pixels, as it lies behind a frame, at each."""
+    return functional.interpolate(light, scale_factor=float(BEHIND_STEP), mode="bilinear", align_corners=False)
 
 
 def in_tiles(values: Tensor) -> Tensor:

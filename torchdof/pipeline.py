@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 
 import torch
 import torch.nn.functional as functional
@@ -24,6 +24,20 @@ _SAME_PX = 0.5  # a background whose coc differs by less is the surface that the
 
 Surface = tuple[Tensor, Tensor, Tensor | None]
 """Light ``[B, C, H, W]``, signed coc and weight ``[B, 1, H, W]``; None is 1."""
+
+
+@dataclasses.dataclass
+class _Shown:
+    """What an image shows: its surfaces, and light behind all of them as :class:`torchdof.frame.Frame` takes it."""
+
+    surfaces: list[Surface]
+    behind: Tensor | None = None
+
+    def samples(self, plan: Plan) -> Iterator[Sample]:
+        """The surfaces as a frame takes them, each given away: large frames have no room for two copies."""
+        while self.surfaces:
+            light, coc, weight = self.surfaces.pop(0)
+            yield Sample(light, layers.blur_axis(coc).clamp(plan.nodes[0], plan.nodes[-1]), weight)
 
 
 def blur(
@@ -113,7 +127,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     stack: list[Surface] = [(light[:, i], _within(coc[:, i], plan), cover[:, i]) for i in range(light.shape[1])]
     # what no layer covers is seen through all of them
     stack.append((torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], plan.coc_px[-1]), None))
-    return _composite(stack, plan, options, independent=True).to(rgba.dtype)
+    return _composite(_Shown(stack), plan, options, independent=True).to(rgba.dtype)
 
 
 def _render(
@@ -133,26 +147,44 @@ def _render(
         coc, light = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0)
     coc = _within(coc, plan)
     weight = None if valid is None else valid.to(light.dtype)
-    surfaces: list[Surface] = [(light, coc, weight)]
     limit = highlights.ordinary(light, valid) if options.occlusion and len(plan.nodes) > 1 else None
-    farthest = None
-    levels = min(math.ceil(math.log2(max(1.0, *(abs(c) for c in plan.coc_px)))) + 1, 7)
-    if behind_light is not None and behind_coc is not None:
-        surfaces = _before(light, coc, weight, behind_light, _within(behind_coc, plan), options)
-    elif limit is not None:
-        own, seen, other, other_coc, share, farthest = background.surfaces(light, coc, weight, limit, levels)
-        surfaces = [(own, coc, seen), (other, other_coc, share)]
-    rays = []
-    if limit is not None and plan.rays:
-        crisp_px = plan.crisp_px if options.method == "layered" else math.inf
-        for i, (colour, c, w) in enumerate(surfaces):
-            left, some = highlights.take(colour, c, w, limit, coc, crisp_px)
-            surfaces[i] = (left, c, w)
-            rays += [] if some is None else [some]
-    out = _composite(surfaces, plan, options, behind_light is not None, farthest)
+    shown = _shown(plan, options, light, coc, weight, limit, behind_light, behind_coc)
+    rays = [] if limit is None or not plan.rays else _take_highlights(shown, plan, options, limit, coc)
+    out = _composite(shown, plan, options, behind_light is not None)
     if rays:
         out = out + highlights.trace(rays, coc, options.table, light.shape[1])
     return out if valid is None else torch.where(valid, out, image)
+
+
+def _shown(
+    plan: Plan,
+    options: Options,
+    light: Tensor,
+    coc: Tensor,
+    weight: Tensor | None,
+    limit: Tensor | None,
+    behind_light: Tensor | None,
+    behind_coc: Tensor | None,
+) -> _Shown:
+    """Surfaces of an image; ``limit`` is None without occlusion."""
+    if behind_light is not None and behind_coc is not None:
+        return _Shown(_before(light, coc, weight, behind_light, _within(behind_coc, plan), options))
+    if limit is None:
+        return _Shown([(light, coc, weight)])
+    levels = min(math.ceil(math.log2(max(2.0, *(abs(c) for c in plan.coc_px)))) + 1, 7)
+    own, seen, other, other_coc, share, farthest = background.surfaces(light, coc, weight, limit, levels)
+    return _Shown([(own, coc, seen), (other, other_coc, share)], farthest)
+
+
+def _take_highlights(shown: _Shown, plan: Plan, options: Options, limit: Tensor, coc: Tensor) -> list[highlights.Rays]:
+    """Take the highlights that must be traced out of what is shown."""
+    rays = []
+    crisp_px = plan.crisp_px if options.method == "layered" else math.inf
+    for i, (light, place, weight) in enumerate(shown.surfaces):
+        left, some = highlights.take(light, place, weight, limit, coc, crisp_px)
+        shown.surfaces[i] = (left, place, weight)
+        rays += [] if some is None else [some]
+    return rays
 
 
 def _before(
@@ -173,25 +205,24 @@ def _before(
     return [(other, other_coc, share), (own, coc, seen), (behind, behind_coc, behind_weight)]
 
 
-def _composite(
-    surfaces: Sequence[Surface], plan: Plan, options: Options, independent: bool, behind: Tensor | None = None
-) -> Tensor:
-    light, coc, _ = surfaces[0]
+def _composite(shown: _Shown, plan: Plan, options: Options, independent: bool) -> Tensor:
+    """Render what is shown. Takes it over: the frame copies it to give it a margin."""
+    light, coc, _ = shown.surfaces[0]
     layered = options.method == "layered"
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
-    first, last = plan.nodes[0], plan.nodes[-1]
-    samples = [Sample(colour, layers.blur_axis(c).clamp(first, last), w) for colour, c, w in surfaces]
-    moves = torch.is_grad_enabled() and any(t.requires_grad for s in surfaces for t in s[:2])
+    moves = torch.is_grad_enabled() and any(t.requires_grad for s in shown.surfaces for t in s[:2])
     exporting = torch.compiler.is_exporting()
     margin, align = margin_and_align(blurs)
+    tiled = layered and not _traced() and not moves and light.shape[0] == 1
+    del light, coc
     frame = Frame(
-        samples,
+        shown.samples(plan),
         margin=margin,
         align=side(margin) if exporting else align,
-        tiled=layered and not _traced() and not moves and light.shape[0] == 1,
+        tiled=tiled,
         extend=options.border == "extend",
         independent=independent,
-        behind=behind,
+        behind=shown.behind,
     )
 
     def rendered(frame: Frame, blurs: list[Blur]) -> Tensor:
