@@ -27,28 +27,29 @@ class Coarse:
         frame: The frame, in tiles.
         scale: A power of two.
         half: Pixels of that resolution which the widest kernel reaches.
+        plan: Where the layers are.
+        layers: Those that are looked at.
         with_room: As in :meth:`torchdof.frame.Frame.terms`.
     """
 
-    def __init__(self, frame: Frame, scale: int, half: int, with_room: bool) -> None:
+    def __init__(self, frame: Frame, scale: int, half: int, plan: Plan, layers: range, with_room: bool) -> None:
         self.frame, self.scale, self.half, self.with_room = frame, scale, half, with_room
         self.size = tuple(n // scale + 2 for n in frame.area)
         self.area = tuple(-(-n // TILE) * TILE for n in self.size)
         channels = frame.colours + (1 if not with_room else 2 if frame.known is None else 3)
         height, width = (n + 2 * half for n in self.area)
         self.plane = frame.samples[0].light.new_zeros(channels, height, width)
-        self.samples = [] if frame.independent else [_Blocks(self, i) for i in range(len(frame.samples))]
+        self.start = frame.margin - scale * (
+            1 + half
+        )  # pixel of the frame with its margin where the first block begins
+        self.room = torch.zeros_like(self.plane[0])  # the share behind all of the layers
+        count = 0 if frame.independent else len(frame.samples)
+        self.samples = [_Blocks(self, i, plan.nodes, layers) for i in range(count)]
 
     def pixels(self, values: Tensor) -> Tensor:
         """What of a frame with its margin lies in blocks: ``[1, C, ...] -> [C, scale * rows, scale * columns]``."""
-        start, count = self.frame.margin - self.scale * (1 + self.half), [n + 2 * self.half for n in self.size]
-        rows, columns = (slice(start, start + self.scale * n) for n in count)
+        rows, columns = (slice(self.start, self.start + self.scale * (n + 2 * self.half)) for n in self.size)
         return values[0, :, rows, columns]
-
-    def blocks(self, values: Tensor) -> Tensor:
-        """The same, as ``[C, scale, scale, rows, columns]``."""
-        parts = self.pixels(values).unflatten(1, (-1, self.scale)).unflatten(3, (-1, self.scale))
-        return parts.permute(0, 2, 4, 1, 3)
 
     def canvas(self, kernels: int) -> Tensor:
         """As :meth:`torchdof.frame.Frame.canvas`, in tiles of this resolution."""
@@ -92,56 +93,113 @@ class Coarse:
             self.plane[:, :rows, :columns] = mean_of_blocks(terms, self.scale)[0]
             return
         self.plane.zero_()
-        below = nodes[k - 1] if k > 0 else -torch.inf
-        above = nodes[k + 1] if k + 1 < len(nodes) else torch.inf
+        if self.with_room:
+            self.plane[self.frame.colours + 1] = self.room
         for sample in self.samples:
-            sample.add(self.plane[:, :rows, :columns], nodes, k, below, above)
+            sample.add(self.plane.flatten(1), nodes, k)
 
 
 class _Blocks:
-    """One sample of a frame, in blocks."""
+    """One sample of a frame, in blocks, for some layers.
 
-    def __init__(self, coarse: Coarse, which: int) -> None:
-        sample, frame = coarse.frame.samples[which], coarse.frame
-        self.light, self.x = coarse.blocks(sample.light), coarse.blocks(sample.x)[0]
-        self.weight = None if sample.weight is None else coarse.blocks(sample.weight)[0]
-        self.known = None if frame.known is None else coarse.blocks(frame.known)[0]
-        self.area, self.with_room = coarse.scale**2, coarse.with_room
-        self.places: tuple[Tensor, ...] | None = None  # everywhere
-        if which > 0 and sample.weight is not None:  # only in few places
-            mean = mean_of_blocks(coarse.pixels(sample.weight), coarse.scale)[0]
-            self.places = mean.nonzero(as_tuple=True)
-            there = self.x.flatten(2)[..., (mean > 0).flatten()]
-            low, high, mean = there.amin((0, 1)), there.amax((0, 1)), mean[self.places]
-        else:
-            x = coarse.pixels(sample.x)
-            low, high = -max_of_blocks(-x, coarse.scale)[0], max_of_blocks(x, coarse.scale)[0]
-            weight = torch.ones_like(x) if sample.weight is None else coarse.pixels(sample.weight)
-            mean = mean_of_blocks(weight, coarse.scale)[0]
-        self.low, self.high, self.mean = low, high, mean
+    Between two nodes the share of a layer is linear in a pixel's place. So what a layer scatters of a block that lies
+    between two nodes follows from moments of the block; blocks in which a node lies are looked at pixel by pixel.
+    """
 
-    def add(self, plane: Tensor, nodes: Sequence[float], k: int, below: float, above: float) -> None:
-        """Adds the means of layer k to ``[C, rows, columns]``."""
-        colours = self.light.shape[0]
-        partly = (self.high > below) & (self.low < above)
+    def __init__(self, coarse: Coarse, which: int, nodes: Sequence[float], layers: range) -> None:
+        frame, scale = coarse.frame, coarse.scale
+        self.sample, self.known = frame.samples[which], frame.known
+        self.area, self.with_room = scale**2, coarse.with_room
+        x = coarse.pixels(self.sample.x)
+        low, high = -max_of_blocks(-x, scale), max_of_blocks(x, scale)
+        weight = torch.ones_like(low) if self.sample.weight is None else coarse.pixels(self.sample.weight)
+        mean = weight if self.sample.weight is None else mean_of_blocks(weight, scale)
+        near = nodes[layers.start - 1] if layers.start > 0 else -torch.inf
+        far = nodes[layers.stop] if layers.stop < len(nodes) else torch.inf
         if self.with_room:
-            room: tuple[int | Tensor, ...] = (colours + 1, *(self.places or ()))
-            plane[room] += self.mean * (self.low >= above)
-        places = partly.nonzero(as_tuple=True)
-        if self.places is not None:
-            places = tuple(axis[places] for axis in self.places)
-        for row, column in zip(*(p.split(_PIXELS_AT_ONCE // self.area) for p in places), strict=True):
-            at = (..., row, column)
-            x = self.x[at]
-            here = share_at_or_behind(x, nodes, k)
-            mine = here - share_at_or_behind(x, nodes, k + 1)
-            # divided first, lest a sum overflows
-            weight = 1.0 / self.area if self.weight is None else self.weight[at] / self.area
-            here, mine = here * weight, mine * weight
-            parts = [(self.light[at] * mine).sum((1, 2))]
-            seen = mine if self.known is None else mine * self.known[at]
-            if self.with_room:
-                parts += [mine.sum((0, 1))[None], here.sum((0, 1))[None]]
-            if not self.with_room or self.known is not None:
-                parts.append(seen.sum((0, 1))[None])
-            plane[at] += torch.cat(parts)
+            coarse.room[: low.shape[-2], : low.shape[-1]] += (mean * (low >= far))[0]
+        at = ((high > near) & (low < far) & (mean > 0)).flatten().nonzero()[:, 0]
+        self.low, self.high, self.mean = low.flatten()[at], high.flatten()[at], mean.flatten()[at]
+        row, column = at // low.shape[-1], at % low.shape[-1]
+        self.at = row * coarse.plane.shape[-1] + column
+        across = self.sample.x.shape[-1]
+        self.corner = (coarse.start + row * scale) * across + coarse.start + column * scale
+        step = torch.arange(scale, device=at.device)
+        self.pixels = (step[:, None] * across + step).flatten()[:, None]
+
+        axis = torch.tensor(nodes, device=low.device, dtype=low.dtype)
+        after = torch.bucketize(self.low, axis, right=True)  # the next node
+        plain = self.high <= functional.pad(axis, (0, 1), value=torch.inf)[after]
+        if self.known is not None:
+            seen = mean_of_blocks(coarse.pixels(self.known), scale).flatten()[at]
+            plain &= (seen == 0) | (seen == 1)
+        # by the next node, the mixed ones last; short numbers are sorted fast
+        order = torch.sort(torch.where(plain, after, len(nodes) + 1).to(torch.int16), stable=True)[1]
+        count = torch.bincount(after[plain], minlength=len(nodes) + 1).cumsum(0).tolist()
+        first = count[max(layers.start - 1, 0)]
+        self.plain, self.mixed = order[first : count[layers.stop]], order[count[-1] :]
+        self.before = [n - first for n in count]
+        moments = [self._moments(some) for some in self.plain.split(_PIXELS_AT_ONCE // self.area)]
+        self.moments = torch.cat(moments, 1)
+        self.seen = None if self.known is None else seen[self.plain]
+
+    def add(self, terms: Tensor, nodes: Sequence[float], k: int) -> None:
+        """Adds the means of layer k to ``[channels, places]``."""
+        below = nodes[k - 1] if k > 0 else -torch.inf
+        above = nodes[k + 1] if k + 1 < len(nodes) else torch.inf
+        if self.with_room:
+            colours = self.sample.light.shape[1]
+            terms[colours + 1].index_add_(0, self.at, self.mean * (self.low >= above))
+        some = slice(self.before[max(k - 1, 0)], self.before[k + 1])
+        self._add_plain(terms, self.plain[some], some, nodes[k], below, above)
+        mixed = self.mixed[(self.high[self.mixed] > below) & (self.low[self.mixed] < above)]
+        for part in mixed.split(_PIXELS_AT_ONCE // self.area):
+            self._add_mixed(terms, part, nodes, k)
+
+    def _add_plain(self, terms: Tensor, which: Tensor, some: slice, node: float, below: float, above: float) -> None:
+        """Blocks between the node of a layer and one beside it: the share at a pixel is ``first + more * its part``."""
+        low, behind = self.low[which], self.low[which] >= node
+        from_, gap = torch.where(behind, node, below), torch.where(behind, above - node, node - below)
+        first, more = (low - from_) / gap, (self.high[which] - low) / gap
+        first, more = torch.where(behind, 1.0 - first, first), torch.where(behind, -more, more)
+        whole, part = self.moments[:, some].chunk(2)
+        light = first * whole + more * part
+        light, share = light[:-1], light[-1]
+        here = torch.where(behind, whole[-1], share)
+        seen = share if self.seen is None else share * self.seen[some]
+        self._put(terms, self.at[which], light, share, here, seen)
+
+    def _add_mixed(self, terms: Tensor, which: Tensor, nodes: Sequence[float], k: int) -> None:
+        """Blocks in which a node lies, pixel by pixel."""
+        pixels = self.corner[which] + self.pixels  # [scale * scale, n]
+        x, weight = self._at(self.sample.x, pixels)[0], self._weight(pixels)
+        here = share_at_or_behind(x, nodes, k)
+        mine = (here - share_at_or_behind(x, nodes, k + 1)) * weight
+        light = (self._at(self.sample.light, pixels) * mine).sum(1)
+        seen = mine if self.known is None else mine * self._at(self.known, pixels)[0]
+        self._put(terms, self.at[which], light, mine.sum(0), (here * weight).sum(0), seen.sum(0))
+
+    def _put(self, terms: Tensor, at: Tensor, light: Tensor, share: Tensor, here: Tensor, seen: Tensor) -> None:
+        every = [*light, share, here, seen] if self.with_room else [*light, seen]
+        for channel, term in zip(terms, every, strict=False):
+            channel.index_add_(0, at, term)
+
+    def _moments(self, which: Tensor) -> Tensor:
+        """Of blocks the means of light and 1, and those times where a pixel lies between the block's ends, 0 to 1."""
+        pixels = self.corner[which] + self.pixels
+        low = self.low[which]
+        part = (self._at(self.sample.x, pixels)[0] - low) / (self.high[which] - low).clamp_min(1e-12)
+        weight = self._weight(pixels)
+        terms = torch.cat([self._at(self.sample.light, pixels) * weight, weight[None]])
+        return torch.cat([terms.sum(1), (terms * part).sum(1)])
+
+    def _weight(self, pixels: Tensor) -> Tensor:
+        # divided first, lest a sum overflows
+        if self.sample.weight is None:
+            return self.sample.x.new_full(pixels.shape, 1.0 / self.area)
+        return self._at(self.sample.weight, pixels)[0] / self.area
+
+    @staticmethod
+    def _at(values: Tensor, pixels: Tensor) -> Tensor:
+        """Values of some pixels, ``[C, *pixels.shape]``."""
+        return values[0].flatten(1).index_select(1, pixels.flatten()).unflatten(1, pixels.shape)

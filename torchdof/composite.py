@@ -144,7 +144,9 @@ def _lay_all(
         scale = blurs[groups[0][0]].scale
         part: Frame | Coarse = frame
         if frame.tiled and scale > 1:
-            part = Coarse(frame, scale, max(blurs[k].half for group in groups for k in group), with_room)
+            those = [k for group in groups for k in group]
+            half = max(blurs[k].half for k in those)
+            part = Coarse(frame, scale, half, plan, range(min(those), max(those) + 1), with_room)
             own = part.canvas(kernels)
         else:
             own = canvas if scale == 1 else frame.canvas(kernels, scale)
