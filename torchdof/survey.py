@@ -15,11 +15,11 @@ from .table import BlurTable
 __all__ = ["LayerUse", "Survey", "survey"]
 
 # Costs in nanoseconds, measured on one core; only their ratios matter here.
-_PASSES_NS = 25.0  # elementwise work, a pixel of a window
-_TAP_NS = 0.1  # a tap of the kernel, a pixel at the layer's resolution
-_MEAN_NS = 40.0  # a pixel of the frame that is averaged for a coarser layer
+_PASSES_NS = 40.0  # elementwise work, a pixel of a window
+_TAP_NS = 0.12  # a tap of the kernel, a pixel at the layer's resolution
+_MEAN_NS = 100.0  # a pixel of the frame that is averaged for a coarser layer
 _HIDDEN_NS = 120.0  # mixed and hidden surfaces, a pixel of the frame
-_COPY_NS = 4.0  # a frame in focus, a pixel
+_COPY_NS = 20.0  # a layer in focus, a pixel
 _ERROR = 0.3  # RMS error over the tolerance, on scenes that are blurred all over; measured: 0 to 0.6
 
 
