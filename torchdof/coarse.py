@@ -4,6 +4,7 @@ What a layer scatters is averaged to its resolution before anything else. Its ow
 pixels that it lies in are looked at; all else is known from the least and the largest coc of a block.
 """
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -39,12 +40,10 @@ class Coarse:
         channels = frame.colours + (1 if not with_room else 2 if frame.known is None else 3)
         height, width = (n + 2 * half for n in self.area)
         self.plane = frame.samples[0].light.new_zeros(channels, height, width)
-        self.start = frame.margin - scale * (
-            1 + half
-        )  # pixel of the frame with its margin where the first block begins
-        self.room = torch.zeros_like(self.plane[0])  # the share behind all of the layers
+        self.start = frame.margin - scale * (1 + half)  # the pixel of the frame with its margin at which blocks begin
+        self.room = torch.zeros_like(self.plane[0])  # what lies wholly behind the layer that is looked at
         count = 0 if frame.independent else len(frame.samples)
-        self.samples = [_Blocks(self, i, plan.nodes, layers) for i in range(count)]
+        self.pieces = [some for i in range(count) for some in _Blocks(self, i, plan.nodes, layers).pieces]
 
     def pixels(self, values: Tensor) -> Tensor:
         """What of a frame with its margin lies in blocks: ``[1, C, ...] -> [C, scale * rows, scale * columns]``."""
@@ -87,117 +86,163 @@ class Coarse:
     def _fill(self, nodes: Sequence[float], k: int) -> None:
         """Means of what layer k scatters, over blocks."""
         rows, columns = (n + 2 * self.half for n in self.size)
-        if not self.samples:
+        if not self.pieces:
             halo = self.scale * (1 + self.half)
             terms = torch.cat(self.frame.whole(halo).terms(nodes, k, self.with_room), 1)
             self.plane[:, :rows, :columns] = mean_of_blocks(terms, self.scale)[0]
             return
         self.plane.zero_()
         if self.with_room:
+            for pieces in self.pieces:
+                pieces.add_behind(self.room.flatten(), k)
             self.plane[self.frame.colours + 1] = self.room
-        for sample in self.samples:
-            sample.add(self.plane.flatten(1), nodes, k)
+        for pieces in self.pieces:
+            pieces.add(self.plane.flatten(1), nodes, k, self.with_room)
+
+
+@dataclasses.dataclass
+class _Pieces:
+    """Parts of blocks that lie between two nodes each, from the nearest to the farthest.
+
+    Args:
+        at: Flat index of each one's block, ``[n]``.
+        low: Least place in it, ``[n]``.
+        high: Greatest place in it, ``[n]``; None: it has but one.
+        whole: Its part of its block's means of light and 1, ``[C + 1, n]``.
+        partly: The same times where between least and greatest a pixel lies, 0 to 1; None: as ``high``.
+        known: 1 where its light is known, 0 where it is not, ``[n]``; None: all is.
+        before: Number of those that lie before each node, but for what is too near for all layers.
+        behind: Those from this node on are behind the layer that was looked at last.
+    """
+
+    at: Tensor
+    low: Tensor
+    high: Tensor | None
+    whole: Tensor
+    partly: Tensor | None
+    known: Tensor | None
+    before: list[int]
+    behind: int
+
+    def add_behind(self, room: Tensor, k: int) -> None:
+        """Adds the share of those that have come to lie wholly behind layer k to ``[places]``."""
+        some = slice(self.before[k + 1], self.before[self.behind])
+        room.index_add_(0, self.at[some], self.whole[-1, some])
+        self.behind = k + 1
+
+    def add(self, terms: Tensor, nodes: Sequence[float], k: int, with_room: bool) -> None:
+        """Adds what layer k scatters of them to ``[channels, places]``."""
+        some = slice(self.before[max(k - 1, 0)], self.before[k + 1])
+        whole, first = self.whole[:, some], _share(self.low[some], nodes, k)
+        light = first * whole  # the share at a pixel is ``first + more * its part``
+        if self.high is not None and self.partly is not None:
+            more = _share(self.high[some], nodes, k) - first
+            light = torch.addcmul(light, more, self.partly[:, some])
+        light, share = light[:-1], light[-1]
+        seen = share if self.known is None else share * self.known[some]
+        front = self.before[k] - some.start  # so many lie before the layer's node
+        here = torch.cat([share[:front], whole[-1, front:]])
+        at = self.at[some]
+        for channel, term in zip(terms, [*light, share, here, seen] if with_room else [*light, seen], strict=False):
+            channel.index_add_(0, at, term)
+
+
+def _share(x: Tensor, nodes: Sequence[float], k: int) -> Tensor:
+    """Share in layer k at places."""
+    return share_at_or_behind(x, nodes, k) - share_at_or_behind(x, nodes, k + 1)
 
 
 class _Blocks:
     """One sample of a frame, in blocks, for some layers.
 
     Between two nodes the share of a layer is linear in a pixel's place. So what a layer scatters of a block that lies
-    between two nodes follows from moments of the block; blocks in which a node lies are looked at pixel by pixel.
+    between two nodes follows from means over the block; blocks in which a node lies are taken apart into pixels.
     """
 
     def __init__(self, coarse: Coarse, which: int, nodes: Sequence[float], layers: range) -> None:
-        frame, scale = coarse.frame, coarse.scale
-        self.sample, self.known = frame.samples[which], frame.known
-        self.area, self.with_room = scale**2, coarse.with_room
+        self.sample, self.known, self.scale = coarse.frame.samples[which], coarse.frame.known, coarse.scale
+        self.layers, self.nodes = layers, torch.tensor(nodes, device=self.sample.x.device, dtype=self.sample.x.dtype)
         x = coarse.pixels(self.sample.x)
-        low, high = -max_of_blocks(-x, scale), max_of_blocks(x, scale)
+        low, high = -max_of_blocks(-x, self.scale), max_of_blocks(x, self.scale)
         weight = torch.ones_like(low) if self.sample.weight is None else coarse.pixels(self.sample.weight)
-        mean = weight if self.sample.weight is None else mean_of_blocks(weight, scale)
-        near = nodes[layers.start - 1] if layers.start > 0 else -torch.inf
-        far = nodes[layers.stop] if layers.stop < len(nodes) else torch.inf
-        if self.with_room:
-            coarse.room[: low.shape[-2], : low.shape[-1]] += (mean * (low >= far))[0]
-        at = ((high > near) & (low < far) & (mean > 0)).flatten().nonzero()[:, 0]
-        self.low, self.high, self.mean = low.flatten()[at], high.flatten()[at], mean.flatten()[at]
+        mean = weight if self.sample.weight is None else mean_of_blocks(weight, self.scale)
+        near, far = (self._end(end) for end in (layers.start - 1, layers.stop))
+        behind = low >= far
+        if coarse.with_room:
+            coarse.room[: low.shape[-2], : low.shape[-1]] += (mean * behind)[0]
+        at = ((high > near) & ~behind & (mean > 0)).flatten().nonzero()[:, 0]
         row, column = at // low.shape[-1], at % low.shape[-1]
-        self.at = row * coarse.plane.shape[-1] + column
-        across = self.sample.x.shape[-1]
-        self.corner = (coarse.start + row * scale) * across + coarse.start + column * scale
-        step = torch.arange(scale, device=at.device)
-        self.pixels = (step[:, None] * across + step).flatten()[:, None]
-
-        axis = torch.tensor(nodes, device=low.device, dtype=low.dtype)
-        after = torch.bucketize(self.low, axis, right=True)  # the next node
-        plain = self.high <= functional.pad(axis, (0, 1), value=torch.inf)[after]
+        low, high = low.flatten()[at], high.flatten()[at]
+        after = torch.bucketize(low, self.nodes, right=True)  # the next node
+        plain = high <= functional.pad(self.nodes, (0, 1), value=torch.inf)[after]
+        known = None
         if self.known is not None:
-            seen = mean_of_blocks(coarse.pixels(self.known), scale).flatten()[at]
-            plain &= (seen == 0) | (seen == 1)
-        # by the next node, the mixed ones last; short numbers are sorted fast
-        order = torch.sort(torch.where(plain, after, len(nodes) + 1).to(torch.int16), stable=True)[1]
-        count = torch.bincount(after[plain], minlength=len(nodes) + 1).cumsum(0).tolist()
-        first = count[max(layers.start - 1, 0)]
-        self.plain, self.mixed = order[first : count[layers.stop]], order[count[-1] :]
-        self.before = [n - first for n in count]
-        moments = [self._moments(some) for some in self.plain.split(_PIXELS_AT_ONCE // self.area)]
-        self.moments = torch.cat(moments, 1)
-        self.seen = None if self.known is None else seen[self.plain]
+            known = mean_of_blocks(coarse.pixels(self.known), self.scale).flatten()[at]
+            plain &= (known == 0) | (known == 1)
+        across = self.sample.x.shape[-1]
+        corner = (coarse.start + row * self.scale) * across + coarse.start + column * self.scale
+        step = torch.arange(self.scale, device=at.device)
+        self.pixels = (step[:, None] * across + step).flatten()[:, None]
+        at = row * coarse.plane.shape[-1] + column
 
-    def add(self, terms: Tensor, nodes: Sequence[float], k: int) -> None:
-        """Adds the means of layer k to ``[channels, places]``."""
-        below = nodes[k - 1] if k > 0 else -torch.inf
-        above = nodes[k + 1] if k + 1 < len(nodes) else torch.inf
-        if self.with_room:
-            colours = self.sample.light.shape[1]
-            terms[colours + 1].index_add_(0, self.at, self.mean * (self.low >= above))
-        some = slice(self.before[max(k - 1, 0)], self.before[k + 1])
-        self._add_plain(terms, self.plain[some], some, nodes[k], below, above)
-        mixed = self.mixed[(self.high[self.mixed] > below) & (self.low[self.mixed] < above)]
-        for part in mixed.split(_PIXELS_AT_ONCE // self.area):
-            self._add_mixed(terms, part, nodes, k)
+        order, before = self._in_order(after, plain)
+        parts = [
+            self._means(low[some], high[some], corner[some]) for some in order.split(_PIXELS_AT_ONCE // self.scale**2)
+        ]
+        whole, partly = torch.cat(parts, 1).chunk(2)
+        blocks = _Pieces(
+            at[order],
+            low[order],
+            high[order],
+            whole,
+            partly,
+            None if known is None else known[order],
+            before,
+            layers.stop,
+        )
+        self.pieces = [blocks, self._apart(coarse, at[~plain], corner[~plain], near, far)]
 
-    def _add_plain(self, terms: Tensor, which: Tensor, some: slice, node: float, below: float, above: float) -> None:
-        """Blocks between the node of a layer and one beside it: the share at a pixel is ``first + more * its part``."""
-        low, behind = self.low[which], self.low[which] >= node
-        from_, gap = torch.where(behind, node, below), torch.where(behind, above - node, node - below)
-        first, more = (low - from_) / gap, (self.high[which] - low) / gap
-        first, more = torch.where(behind, 1.0 - first, first), torch.where(behind, -more, more)
-        whole, part = self.moments[:, some].chunk(2)
-        light = first * whole + more * part
-        light, share = light[:-1], light[-1]
-        here = torch.where(behind, whole[-1], share)
-        seen = share if self.seen is None else share * self.seen[some]
-        self._put(terms, self.at[which], light, share, here, seen)
-
-    def _add_mixed(self, terms: Tensor, which: Tensor, nodes: Sequence[float], k: int) -> None:
-        """Blocks in which a node lies, pixel by pixel."""
-        pixels = self.corner[which] + self.pixels  # [scale * scale, n]
+    def _apart(self, coarse: Coarse, at: Tensor, corner: Tensor, near: float, far: float) -> _Pieces:
+        """The pixels of blocks in which a node lies."""
+        pixels = (corner + self.pixels).flatten()
+        at = at.expand(self.scale**2, -1).flatten()
         x, weight = self._at(self.sample.x, pixels)[0], self._weight(pixels)
-        here = share_at_or_behind(x, nodes, k)
-        mine = (here - share_at_or_behind(x, nodes, k + 1)) * weight
-        light = (self._at(self.sample.light, pixels) * mine).sum(1)
-        seen = mine if self.known is None else mine * self._at(self.known, pixels)[0]
-        self._put(terms, self.at[which], light, mine.sum(0), (here * weight).sum(0), seen.sum(0))
+        if coarse.with_room:
+            coarse.room.flatten().index_add_(0, at, weight * (x >= far))
+        order, before = self._in_order(
+            torch.bucketize(x, self.nodes, right=True), (x > near) & (x < far) & (weight > 0)
+        )
+        pixels, weight = pixels[order], weight[order]
+        whole = torch.cat([self._at(self.sample.light, pixels) * weight, weight[None]])
+        known = None if self.known is None else self._at(self.known, pixels)[0]
+        return _Pieces(at[order], x[order], None, whole, None, known, before, self.layers.stop)
 
-    def _put(self, terms: Tensor, at: Tensor, light: Tensor, share: Tensor, here: Tensor, seen: Tensor) -> None:
-        every = [*light, share, here, seen] if self.with_room else [*light, seen]
-        for channel, term in zip(terms, every, strict=False):
-            channel.index_add_(0, at, term)
+    def _in_order(self, after: Tensor, there: Tensor) -> tuple[Tensor, list[int]]:
+        """Indices of those that are there, by the next node, and how many of them lie before each node."""
+        count = len(self.nodes) + 1
+        # short numbers are sorted fast
+        order = torch.sort(torch.where(there, after, count).to(torch.int16), stable=True)[1]
+        before = torch.bincount(after[there], minlength=count).cumsum(0).tolist()
+        first = before[max(self.layers.start - 1, 0)]
+        return order[first : before[self.layers.stop]], [n - first for n in before]
 
-    def _moments(self, which: Tensor) -> Tensor:
+    def _end(self, node: int) -> float:
+        """Place of a node; beyond the last ones there is none."""
+        return -torch.inf if node < 0 else torch.inf if node >= len(self.nodes) else float(self.nodes[node])
+
+    def _means(self, low: Tensor, high: Tensor, corner: Tensor) -> Tensor:
         """Of blocks the means of light and 1, and those times where a pixel lies between the block's ends, 0 to 1."""
-        pixels = self.corner[which] + self.pixels
-        low = self.low[which]
-        part = (self._at(self.sample.x, pixels)[0] - low) / (self.high[which] - low).clamp_min(1e-12)
+        pixels = corner + self.pixels
+        part = (self._at(self.sample.x, pixels)[0] - low) / (high - low).clamp_min(1e-12)
         weight = self._weight(pixels)
         terms = torch.cat([self._at(self.sample.light, pixels) * weight, weight[None]])
         return torch.cat([terms.sum(1), (terms * part).sum(1)])
 
     def _weight(self, pixels: Tensor) -> Tensor:
-        # divided first, lest a sum overflows
+        """Of a block, that a pixel's surface covers; it comes first, lest a sum overflows."""
         if self.sample.weight is None:
-            return self.sample.x.new_full(pixels.shape, 1.0 / self.area)
-        return self._at(self.sample.weight, pixels)[0] / self.area
+            return self.sample.x.new_full(pixels.shape, 1.0 / self.scale**2)
+        return self._at(self.sample.weight, pixels)[0] / self.scale**2
 
     @staticmethod
     def _at(values: Tensor, pixels: Tensor) -> Tensor:
