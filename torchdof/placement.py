@@ -72,7 +72,7 @@ def _crowded(
         spacing: Distance around, in which half of all must lie at the place; None does not look around.
         least: Number of places.
     """
-    bins = torch.round(_in_finest(x.double()) * (3.0 / width)).long()
+    bins = torch.round(_in_finest(x) * (3.0 / width)).long()
     first = int(bins.min())
     count = torch.bincount(bins - first)
     sums = functional.pad(count.cumsum(0), (1, 0)).tolist()
