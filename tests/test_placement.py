@@ -60,3 +60,9 @@ def test_places_at_the_border_are_those_of_many_pixels() -> None:
     assert placement.at_borders(x) == pytest.approx([0.0, 6.0])
     x[..., -1, :] = torch.linspace(-40, 40, 100)
     assert placement.at_borders(x) == pytest.approx([0.0])
+
+
+@pytest.mark.parametrize("x", [-300.0, -20.5, -3.3, 0.0, 7.0, 20.0, 1e4])
+def test_finest_distances_count_there_and_back(x: float) -> None:
+    steps = float(placement._in_finest(torch.tensor(x).double()))
+    assert placement._from_finest(steps) == pytest.approx(x)

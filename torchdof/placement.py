@@ -13,6 +13,7 @@ __all__ = ["at_borders", "ends", "finest", "on_axis", "planes"]
 
 _FINEST = 0.5
 _FINEST_PARTS = 40.0
+_WIDE = _FINEST * _FINEST_PARTS  # from which on the finest distance grows
 _SAMPLES = 2**16  # pixels that tell where planes are
 
 
@@ -86,16 +87,23 @@ def _crowded(
     for i, held in sorted(near.items(), key=lambda item: -item[1]):
         if held < many:
             break
-        place = float(x[(bins - first - i).abs() <= 1].median())  # one that occurs: its pixels lie in no other layer
+        place = _from_finest((first + i) * width / 3.0)
         if spacing is not None and 2 * held < within(i, round(1.5 * spacing(place) / (finest(place) * width))):
             continue
         if all(abs(place - other) > 0.6 * finest(place) for other in found):
-            found.append(place)
+            # one that occurs: its pixels then lie in no other layer
+            found.append(float(x[(bins - first - i).abs() <= 1].median()))
     return found
 
 
 def _in_finest(x: Tensor) -> Tensor:
     """Places in finest distances from focus."""
-    wide = _FINEST * _FINEST_PARTS  # from which on the finest distance grows
-    steps = x.abs().clamp(max=wide) / _FINEST + _FINEST_PARTS * (x.abs() / wide).clamp_min(1.0).log()
+    steps = x.abs().clamp(max=_WIDE) / _FINEST + _FINEST_PARTS * (x.abs() / _WIDE).clamp_min(1.0).log()
     return steps * x.sign()
+
+
+def _from_finest(steps: float) -> float:
+    """The place so many finest distances from focus."""
+    if abs(steps) <= _FINEST_PARTS:
+        return steps * _FINEST
+    return math.copysign(_WIDE * math.exp(abs(steps) / _FINEST_PARTS - 1.0), steps)
