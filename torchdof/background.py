@@ -221,9 +221,7 @@ class _Level:
 
 
 class _Cells:
-    """Cells of pixels that may hide something, each with its nearest surface."""
-
-    step = BEHIND_STEP
+    """Cells of :data:`BEHIND_STEP` pixels a side that may hide something, each with its nearest surface."""
 
     def __init__(self, near: Tensor, at: Tensor) -> None:
         self.near, self.at = near, at
@@ -231,17 +229,17 @@ class _Cells:
     def look(self, levels: Sequence[_Level], farthest: bool = False) -> tuple[Tensor, Tensor]:
         """What levels show behind them; see :func:`_look`."""
         item, row, column = places(self.at, self.near.shape[-2], self.near.shape[-1])
-        centre = (self.step - 1) / 2
+        centre = (BEHIND_STEP - 1) / 2
         here = _pick(self.near, self.at)[0]
-        return _look(levels, item, row * self.step + centre, column * self.step + centre, here, farthest)
+        return _look(levels, item, row * BEHIND_STEP + centre, column * BEHIND_STEP + centre, here, farthest)
 
 
 def _cells(wanted: Tensor, coc_px: Tensor, extra: tuple[int, int]) -> _Cells:
     """Cells of maps that are continued by so many pixels to the right and below."""
-    (right, below), step = extra, _Cells.step
+    right, below = extra
     ends = (0, right, 0, below)
-    near = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-_NEVER_PX), step)
-    any_wanted = functional.max_pool2d(functional.pad(wanted.to(coc_px.dtype), ends), step)
+    near = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-_NEVER_PX), BEHIND_STEP)
+    any_wanted = functional.max_pool2d(functional.pad(wanted.to(coc_px.dtype), ends), BEHIND_STEP)
     return _Cells(near, _positions(any_wanted > 0))
 
 
@@ -250,7 +248,7 @@ def _together(levels: Sequence[_Level], cells: _Cells) -> _Level:
     total, seen = cells.look(levels)
     batch, _, height, width = cells.near.shape
     values = seen.new_zeros(batch, len(seen) + 1, height, width)
-    return _Level(_put(values, cells.at, torch.cat([seen, total[None]])), cells.step, None, levels[0].least_px)
+    return _Level(_put(values, cells.at, torch.cat([seen, total[None]])), BEHIND_STEP, None, levels[0].least_px)
 
 
 def _behind_all(levels: Sequence[_Level], cells: _Cells) -> Tensor:

@@ -94,7 +94,7 @@ class Coarse:
         self.plane.zero_()
         if self.with_room:
             for pieces in self.pieces:
-                pieces.add_behind(self.room.flatten(), k)
+                pieces.add_behind(self.room.view(-1), k)
             self.plane[self.frame.colours + 1] = self.room
         for pieces in self.pieces:
             pieces.add(self.plane.flatten(1), nodes, k, self.with_room)
@@ -208,7 +208,7 @@ class _Blocks:
         at = at.expand(self.scale**2, -1).flatten()
         x, weight = self._at(self.sample.x, pixels)[0], self._weight(pixels)
         if coarse.with_room:
-            coarse.room.flatten().index_add_(0, at, weight * (x >= far))
+            coarse.room.view(-1).index_add_(0, at, weight * (x >= far))
         order, before = self._in_order(
             torch.bucketize(x, self.nodes, right=True), (x > near) & (x < far) & (weight > 0)
         )

@@ -131,8 +131,10 @@ class Frame:
             self.size: tuple[int, ...] = tuple(sample.x.shape[-2:])
             self.area = tuple((n + align - 1) // align * align for n in self.size)
             self.samples.append(self._continued(sample, extend))
-        inside = torch.ones_like(self.samples[0].x[:1, :, : self.size[0], : self.size[1]])
-        self.known = None if extend else functional.pad(inside, self._ends(margin))
+        self.known: Tensor | None = None
+        if not extend:
+            inside = torch.ones_like(self.samples[0].x[:1, :, : self.size[0], : self.size[1]])
+            self.known = functional.pad(inside, self._ends(margin))
         self.behind = behind
         if behind is not None and not tiled:
             light = _finer(behind)[..., : self.size[0], : self.size[1]]
@@ -198,7 +200,6 @@ class Frame:
             strip = strip[:, :, above * BEHIND_STEP :][:, :, :TILE, : self.area[1]]
             strip = functional.pad(strip, (0, self.area[1] - strip.shape[3], 0, TILE - strip.shape[2]))
             canvas[row * columns : (row + 1) * columns, : self.colours] = in_tiles(strip)
-        self.behind = None  # it is on the canvas
         return canvas
 
     def image(self, canvas: Tensor) -> Tensor:

@@ -207,14 +207,14 @@ def _before(
 
 def _composite(shown: _Shown, plan: Plan, options: Options, independent: bool) -> Tensor:
     """Render what is shown. Takes it over: the frame copies it to give it a margin."""
-    light, coc, _ = shown.surfaces[0]
+    light = shown.surfaces[0][0]
     layered = options.method == "layered"
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
     moves = torch.is_grad_enabled() and any(t.requires_grad for s in shown.surfaces for t in s[:2])
     exporting = torch.compiler.is_exporting()
     margin, align = margin_and_align(blurs)
     tiled = layered and not _traced() and not moves and light.shape[0] == 1
-    del light, coc
+    del light
     frame = Frame(
         shown.samples(plan),
         margin=margin,
