@@ -11,6 +11,8 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
+from . import memory
+
 __all__ = ["app", "main"]
 
 # Each module defines a function of the command's name, with the options as Typer reads them off its signature.
@@ -87,4 +89,5 @@ def _advice(error: ModuleNotFoundError) -> str:
 
 def main() -> None:
     """Entry point of ``torchdof`` and of ``python -m torchdof``."""
+    memory.keep_freed()
     app(prog_name="torchdof")
