@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import bands, max_around, max_of_four, mean_of_four, places
+from .pool import bands, max_around, max_of_blocks, max_of_four, mean_of_four, places
 
 __all__ = ["fill_hidden", "split_mixed", "surfaces"]
 
@@ -238,8 +238,8 @@ def _cells(wanted: Tensor, coc_px: Tensor, extra: tuple[int, int]) -> _Cells:
     """Cells of maps that are continued by so many pixels to the right and below."""
     right, below = extra
     ends = (0, right, 0, below)
-    near = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-_NEVER_PX), BEHIND_STEP)
-    any_wanted = functional.max_pool2d(functional.pad(wanted.to(coc_px.dtype), ends), BEHIND_STEP)
+    near = -max_of_blocks(functional.pad(-coc_px, ends, value=-_NEVER_PX), BEHIND_STEP)
+    any_wanted = max_of_blocks(functional.pad(wanted.to(coc_px.dtype), ends), BEHIND_STEP)
     return _Cells(near, _positions(any_wanted > 0))
 
 
@@ -349,7 +349,7 @@ def _may_hide(near: Tensor, blur: Tensor, depths: Sequence[Tensor]) -> tuple[Ten
     for level, depth in enumerate(depths, 1):
         around = max_around(depth)
         if level < coarsest:
-            around = functional.max_pool2d(around, 2 ** (coarsest - level))
+            around = max_of_blocks(around, 2 ** (coarsest - level))
         elif level > coarsest:
             around = functional.interpolate(around, scale_factor=float(2 ** (level - coarsest)), mode="nearest")
         found = found | ((around > near + _BEHIND_PX) & (blur >= _least_px(level)))
@@ -384,7 +384,7 @@ def _finest(
     colour, depth, weight, coc_px = (
         functional.pad(t, extra, mode="replicate") for t in (colour, depth, weight, coc_px)
     )
-    near, blur = -functional.max_pool2d(-coc_px, cell), functional.max_pool2d(coc_px.abs(), cell)
+    near, blur = -max_of_blocks(-coc_px, cell), max_of_blocks(coc_px.abs(), cell)
     return *_farthest(colour, depth, weight), near, blur
 
 

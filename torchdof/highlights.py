@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import places
+from .pool import max_around, places
 from .table import BlurTable
 
 __all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
@@ -207,8 +207,7 @@ def _something_nearer(at: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells
     farthest = float(torch.maximum(coc.max() + cells.max(), 2.0 * coc.abs().max()))
     while inner < farthest:
-        around = functional.max_pool2d(functional.pad(cells, (radius,) * 4, value=-math.inf), 2 * radius + 1, 1)
-        near = -around[item, 0, rows, columns]
+        near = -max_around(cells, radius)[item, 0, rows, columns]
         found |= (near < coc - inner) | ((near < coc - _NEARER_PX) & (2.0 * coc.abs() > inner))
         inner, radius = max(_NEARER_PX, float(radius * _COARSE_CELL)), 2 * radius
     return found

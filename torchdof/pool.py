@@ -30,19 +30,26 @@ def bands(values: Tensor, multiple: int = 1) -> list[slice]:
     return [slice(start, min(start + rows, height)) for start in range(0, height, rows)]
 
 
-def max_around(values: Tensor) -> Tensor:
-    """Largest of the 3 x 3 values around each: ``[..., H, W]``; what is outside counts for nothing.
+def max_around(values: Tensor, reach: int = 1) -> Tensor:
+    """Largest of the values around each, so many to each side: ``[..., H, W]``; what is outside counts for nothing.
 
     Example:
         >>> max_around(torch.tensor([[3.0, 0, 0, 1]])).tolist()
         [[3.0, 3.0, 1.0, 1.0]]
+        >>> max_around(torch.tensor([[3.0, 0, 0, 1]]), 2).tolist()
+        [[3.0, 3.0, 3.0, 1.0]]
     """
+    side = 2 * reach + 1
     for dim in (-2, -1):
         size = values.shape[dim]
-        first, last = values.narrow(dim, 0, 1), values.narrow(dim, size - 1, 1)
-        padded = torch.cat([first, values, last], dim)
-        either = torch.maximum(padded.narrow(dim, 0, size), padded.narrow(dim, 2, size))
-        values = torch.maximum(values, either)
+        ends = [[values.narrow(dim, at, 1)] * reach for at in (0, size - 1)]
+        values = torch.cat([*ends[0], values, *ends[1]], dim)
+        length = 1  # of what each value is the largest of
+        while 2 * length <= side:
+            count = values.shape[dim] - length
+            values = torch.maximum(values.narrow(dim, 0, count), values.narrow(dim, length, count))
+            length *= 2
+        values = torch.maximum(values.narrow(dim, 0, size), values.narrow(dim, side - length, size))
     return values
 
 
