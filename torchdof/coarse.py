@@ -70,8 +70,7 @@ class Coarse:
         height, width = self.plane.shape[-2:]
         plane = self.plane[None, :, spare : height - spare, spare : width - spare]
         side = TILE + 2 * half
-        tiles = functional.max_pool2d(plane[:, colours : colours + 1], side, TILE)
-        places = tiles.flatten().nonzero()[:, 0]
+        places = plane[0, colours].unfold(0, side, TILE).unfold(1, side, TILE).amax((2, 3)).flatten().nonzero()[:, 0]
         columns = self.area[1] // TILE
         row, column = places // columns * TILE - half - 1, places % columns * TILE - half - 1
         inside = (row >= 0) & (row + side <= self.frame.size[0] // self.scale)

@@ -1,13 +1,14 @@
 """Layers, far to near, to one image: each layer is scattered with its kernel and laid over what is behind it."""
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from .coarse import Coarse
-from .frame import TILE, Frame, alike, in_tiles
+from .frame import TILE, TILES_AT_ONCE, Frame, alike, cut_tiles
 from .plan import Blur, Plan
 from .spread import Spread, fold
 
@@ -107,7 +108,7 @@ def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool
         accumulate.
     """
     halo = frame.margin
-    ((_, window),) = frame.windows([0], halo)
+    window = frame.whole(halo)
     terms = [window.terms(plan.nodes, k, with_room=True)[1] for k in range(len(plan.nodes))]
     kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
     light = window.samples[0].light
@@ -140,13 +141,20 @@ def _lay_all(
     """
     exporting, kernels = torch.compiler.is_exporting(), blurs[0].kernel.shape[0]
     canvas = frame.start(kernels)
+
+    def lay(layer: Tensor, canvas: Tensor) -> Tensor:
+        return join(settle(layer), canvas)
+
     for groups in _runs(frame.groups(plan, blurs), plan, blurs):
         scale = blurs[groups[0][0]].scale
+        layers = [k for group in groups for k in group]
         part: Frame | Coarse = frame
-        if frame.tiled and scale > 1:
-            those = [k for group in groups for k in group]
-            half = max(blurs[k].half for k in those)
-            part = Coarse(frame, scale, half, plan, range(min(those), max(those) + 1), with_room)
+        if frame.tiled and scale == 1:
+            _lay_patches(frame, plan, blurs, spread, with_room, layers, canvas, lay)
+            continue
+        if frame.tiled:
+            half = max(blurs[k].half for k in layers)
+            part = Coarse(frame, scale, half, plan, range(min(layers), max(layers) + 1), with_room)
             own = part.canvas(kernels)
         else:
             own = canvas if scale == 1 else frame.canvas(kernels, scale)
@@ -154,10 +162,7 @@ def _lay_all(
 
             def laid(canvas: Tensor, part: Frame | Coarse = part, group: list[int] = group) -> Tensor:
                 for tiles, layer in _scattered(part, plan, blurs, spread, with_room, group):
-                    if tiles is None:
-                        canvas = join(settle(layer), canvas)
-                    else:
-                        canvas.index_copy_(0, tiles, join(settle(layer), canvas.index_select(0, tiles)))
+                    canvas = _lay_at(canvas, tiles, layer, lay)
                 return canvas
 
             own = _where_needed(laid, frame, plan, blurs, group, own) if exporting else laid(own)
@@ -170,16 +175,49 @@ def _lay_all(
             def joined(canvas: Tensor, own: Tensor = own, scale: int = scale) -> Tensor:
                 return join(_finer(own, scale), canvas)
 
-            every = [k for group in groups for k in group]
-            canvas = _where_needed(joined, frame, plan, blurs, every, canvas) if exporting else joined(canvas)
+            canvas = _where_needed(joined, frame, plan, blurs, layers, canvas) if exporting else joined(canvas)
     return canvas
 
 
+def _lay_patches(
+    frame: Frame,
+    plan: Plan,
+    blurs: list[Blur],
+    spread: Spread,
+    with_room: bool,
+    layers: list[int],
+    canvas: Tensor,
+    lay: Callable[[Tensor, Tensor], Tensor],
+) -> None:
+    """Lay neighbouring layers of full resolution, patch by patch, but those that spread over the frame one by one."""
+    for wide, some in itertools.groupby(layers, lambda k: frame.is_wide(k, blurs[k].halo)):
+        if wide:
+            for k in some:
+                for tiles, layer in _scattered(frame, plan, blurs, spread, with_room, [k]):
+                    _lay_at(canvas, tiles, layer, lay)
+            continue
+        for patch in frame.patches(blurs, list(some)):
+            own = canvas[patch.tiles]
+            for k, tiles in patch.layers:
+                window = patch.window.part(tiles, patch.halo - blurs[k].halo)
+                (layer,) = _spread([window.terms(plan.nodes, k, with_room)], blurs, [k], spread)
+                own = _lay_at(own, tiles, layer, lay)
+            canvas.index_copy_(0, patch.tiles, own)
+
+
+def _lay_at(canvas: Tensor, tiles: Tensor | None, layer: Tensor, lay: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Lay a scattered layer on tiles of a canvas, which are changed, or on all of it."""
+    if tiles is None:
+        return lay(layer, canvas)
+    return canvas.index_copy_(0, tiles, lay(layer, canvas.index_select(0, tiles)))
+
+
 def _runs(groups: list[list[int]], plan: Plan, blurs: list[Blur]) -> list[list[list[int]]]:
-    """Neighbouring groups of one resolution together."""
+    """Neighbouring groups of one resolution together; at full resolution on both sides of the focus."""
     runs: list[list[list[int]]] = []
     for group in groups:
-        if runs and alike(plan, blurs, runs[-1][0][0], group[0]):
+        last = runs[-1][0][0] if runs else group[0]
+        if runs and (blurs[last].scale == blurs[group[0]].scale == 1 or alike(plan, blurs, last, group[0])):
             runs[-1].append(group)
         else:
             runs.append([group])
@@ -205,25 +243,28 @@ def _finer(canvas: Tensor, scale: int) -> Tensor:
 
 
 def _join_finer(front: Tensor, scale: int, canvas: Tensor, frame: Frame, join: Join) -> None:
-    """Join what is on a coarser canvas with one in tiles, a row of tiles at a time."""
-    columns, step = frame.area[1] // TILE, TILE // scale
-    for row in range(frame.area[0] // TILE):
-        strip = front[..., row * step : (row + 1) * step + 2, :]
-        if bool(strip.any()):
-            tiles = slice(row * columns, (row + 1) * columns)
-            canvas[tiles] = join(in_tiles(_finer(strip, scale)), canvas[tiles])
+    """Join what is on a coarser canvas with one in tiles, in the tiles that it reaches."""
+    step = TILE // scale
+    there = front[0, frame.colours :].amax(0).unfold(0, step + 2, step).unfold(1, step + 2, step).amax((2, 3)) > 0
+    for tiles in there.flatten().nonzero()[:, 0].split(TILES_AT_ONCE):
+        if len(tiles):
+            _lay_at(canvas, tiles, _finer(cut_tiles(front, 1, tiles, step), scale), join)
 
 
 def _scattered(
     part: Frame | Coarse, plan: Plan, blurs: list[Blur], spread: Spread, with_room: bool, group: list[int]
 ) -> Iterator[tuple[Tensor | None, Tensor]]:
     """Scattered layers, far to near, tiles by tiles."""
-    half, each = max(blurs[k].half for k in group), blurs[group[0]].kernel.shape[0]
     for tiles, layers in part.terms(plan, blurs, group, with_room):
-        if each > 1:
-            layers = [[term.expand(-1, each, -1, -1) for term in terms] for terms in layers]
-        lengths = [sum(term.shape[1] for term in terms) for terms in layers]
-        kernels = [(blurs[k], length) for k, length in zip(group, lengths, strict=True)]
-        scattered = spread(torch.cat([term for terms in layers for term in terms], 1), kernels, half)
-        for layer in scattered.split(lengths, 1):
+        for layer in _spread(layers, blurs, group, spread):
             yield tiles, part.at(layer, tiles) if isinstance(part, Frame) else layer
+
+
+def _spread(layers: list[list[Tensor]], blurs: list[Blur], group: list[int], spread: Spread) -> Sequence[Tensor]:
+    """What layers of a group scatter -> scattered."""
+    half, each = max(blurs[k].half for k in group), blurs[group[0]].kernel.shape[0]
+    if each > 1:
+        layers = [[term.expand(-1, each, -1, -1) for term in terms] for terms in layers]
+    lengths = [sum(term.shape[1] for term in terms) for terms in layers]
+    kernels = [(blurs[k], length) for k, length in zip(group, lengths, strict=True)]
+    return spread(torch.cat([term for terms in layers for term in terms], 1), kernels, half).split(lengths, 1)

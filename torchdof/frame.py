@@ -6,6 +6,7 @@ recorded or code is traced, the whole frame is one window.
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 
 import torch
@@ -15,12 +16,13 @@ from torch import Tensor
 from .background import BEHIND_STEP
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
-from .pool import mean_of_blocks
+from .pool import max_around, max_of_blocks, mean_of_blocks
 
 __all__ = [
     "TILE",
     "TILES_AT_ONCE",
     "Frame",
+    "Patch",
     "Sample",
     "Window",
     "alike",
@@ -32,9 +34,9 @@ __all__ = [
 
 TILE = 64
 """Pixels of a tile along each axis."""
-TILES_AT_ONCE = 24
+TILES_AT_ONCE = 48
 """Tiles computed together: what fits the cache."""
-_CELL = 16  # occupancy is known in cells of this many pixels
+_CELL = 8  # occupancy is known in cells of this many pixels
 _BLOCK = 4  # pixels a side that are looked at together to find occupied layers
 _CHANNELS = 16  # channels that are spread together
 
@@ -69,6 +71,14 @@ class Window:
             return [light, share if self.known is None else share * self.known]
         return [light, share, room] if self.known is None else [light, share, room, share * self.known]
 
+    def part(self, some: Tensor | None, less: int) -> "Window":
+        """Some of the windows, with so many pixels less of halo."""
+        samples = []
+        for s in self.samples:
+            weight = None if s.weight is None else _part(s.weight, some, less)
+            samples.append(Sample(_part(s.light, some, less), _part(s.x, some, less), weight))
+        return Window(samples, None if self.known is None else _part(self.known, some, less), self.independent)
+
     def _shared(self, nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
         light = share = room = None
         for sample in self.samples:
@@ -97,6 +107,24 @@ class Window:
             unknown = torch.where(here > 0, unknown * (1.0 - cover), unknown)
         light = torch.stack([s.light * (room * part) for s, part in zip(self.samples, stopped, strict=True)]).sum(0)
         return light, room * torch.stack(stopped).sum(0), room * (1.0 - unknown)
+
+
+@dataclasses.dataclass(frozen=True)
+class Patch:
+    """Some tiles of a frame, at full resolution.
+
+    Args:
+        tiles: Their places on the canvas, ``[n]``.
+        window: What they show, with a halo.
+        halo: Its pixels on each side.
+        layers: Layers whose light falls there, in the order they were asked for, each with the tiles that it falls in
+            (of the n); None: all.
+    """
+
+    tiles: Tensor
+    window: Window
+    halo: int
+    layers: list[tuple[int, Tensor | None]]
 
 
 class Frame:
@@ -140,7 +168,6 @@ class Frame:
             light = _finer(behind)[..., : self.size[0], : self.size[1]]
             self.behind = functional.pad(light, self._ends(0), mode="replicate")
         self._occupied: list[Tensor] = []
-        self._plain_tiles: dict[int, Tensor] = {}
 
     @classmethod
     def piece(
@@ -242,55 +269,59 @@ class Frame:
         Yields the tiles it belongs to, None if it is the frame, and for each layer what :meth:`Window.terms` returns.
         """
         scale = blurs[group[0]].scale
-        for tiles, window in self.windows(group, max(blurs[k].halo for k in group)):
-            layers = [window.terms(plan.nodes, k, with_room) for k in group]
+        window = self.whole(max(blurs[k].halo for k in group))
+        layers = [window.terms(plan.nodes, k, with_room) for k in group]
+        if scale > 1:
             each, lengths = len(layers[0]), [part.shape[1] for parts in layers for part in parts]
-            if scale > 1:
-                means = mean_of_blocks(torch.cat([part for parts in layers for part in parts], 1), scale)
-                parts = means.split(lengths, 1)
-                layers = [list(parts[i : i + each]) for i in range(0, len(parts), each)]
-            yield tiles, layers
+            parts = mean_of_blocks(torch.cat([part for parts in layers for part in parts], 1), scale).split(lengths, 1)
+            layers = [list(parts[i : i + each]) for i in range(0, len(parts), each)]
+        yield self._occupied[group[0]].flatten().nonzero()[:, 0] if self.tiled else None, layers
 
     def whole(self, halo: int) -> Window:
         """The frame as one window."""
         return self._window(halo, None, True)
 
-    def windows(self, group: Sequence[int], halo: int) -> Iterator[tuple[Tensor | None, Window]]:
-        """Windows in which a group's light falls, with a halo of so many pixels, and their places on the canvas."""
-        if not self.tiled:
-            yield None, self.whole(halo)
-            return
-        places = self._occupied[group[0]].flatten().nonzero()[:, 0]
-        columns = self.area[1] // TILE
-        row, column = places // columns, places % columns
-        inside = (row * TILE >= halo) & (column * TILE >= halo)
-        inside &= ((row + 1) * TILE + halo <= self.size[0]) & ((column + 1) * TILE + halo <= self.size[1])
-        spans_frame = len(places) * (TILE + 2 * halo) ** 2 > (self.area[0] + 2 * halo) * (self.area[1] + 2 * halo)
-        if spans_frame or halo > TILE:
-            yield places, self.whole(halo)
-            return
-        plain = self._plain(halo)[places]
-        for border, single in itertools.product((False, True), repeat=2):
-            chosen = places[(inside != border) & (plain == single)]
-            for some in chosen.split(TILES_AT_ONCE) if len(chosen) else ():
-                yield some, self._window(halo, some, border, single)
+    def is_wide(self, k: int, halo: int) -> bool:
+        """Whether a layer is better spread in the whole frame than in patches."""
+        count = int(self._occupied[k].sum())
+        return halo > TILE or count * (TILE + 2 * halo) ** 2 > math.prod(n + 2 * halo for n in self.area)
 
-    def _plain(self, halo: int) -> Tensor:
-        """Tiles that show the first sample alone, whole, as far as a halo reaches: ``[tiles]``."""
-        reach = -(-halo // _CELL)
-        if reach not in self._plain_tiles:
-            m, (height, width) = self.margin, self.area
-            other = torch.zeros(height // _CELL, width // _CELL, device=self.samples[0].x.device)
-            for i, s in enumerate(self.samples):
-                weight = torch.ones_like(s.x) if s.weight is None else s.weight
-                if i == 0 and s.weight is None:
-                    continue
-                there = weight[0, 0, m : m + height, m : m + width]
-                there = (1.0 - there if i == 0 else there).unflatten(0, (-1, _CELL)).amax(1)
-                other = torch.maximum(other, there.unflatten(1, (-1, _CELL)).amax(2))
-            wide = functional.max_pool2d(other[None, None], 2 * reach + 1, 1, reach)
-            self._plain_tiles[reach] = functional.max_pool2d(wide, TILE // _CELL).flatten() == 0
-        return self._plain_tiles[reach]
+    def patches(self, blurs: Sequence[Blur], layers: Sequence[int]) -> Iterator[Patch]:
+        """Tiles that light of some layers falls in, a few at once: all layers find what is there in the cache."""
+        occupied = torch.stack([self._occupied[k].flatten() for k in layers])
+        halos = torch.tensor([blurs[k].halo for k in layers], device=occupied.device)
+        halo = (occupied * halos[:, None]).amax(0)
+        places = torch.arange(len(halo), device=occupied.device)
+        row, column = places // (self.area[1] // TILE) * TILE, places % (self.area[1] // TILE) * TILE
+        inside = (row >= halo) & (row + TILE + halo <= self.size[0])
+        inside &= (column >= halo) & (column + TILE + halo <= self.size[1])
+        single = self._single(-(-halo // _CELL))
+        places = occupied.any(0).nonzero()[:, 0]
+        for there in occupied.flip(0).to(torch.int8):  # tiles of alike layers together
+            places = places[torch.sort(there[places], stable=True)[1]]
+        for border, alone in itertools.product((False, True), repeat=2):
+            chosen = places[((inside != border) & (single == alone))[places]]
+            for tiles in chosen.split(TILES_AT_ONCE) if len(chosen) else ():
+                widest, there = int(halo[tiles].max()), occupied[:, tiles]
+                counts = zip(layers, there, there.sum(1).tolist(), strict=True)
+                some = [(k, None if n == len(tiles) else at.nonzero()[:, 0]) for k, at, n in counts if n]
+                yield Patch(tiles, self._window(widest, tiles, border, alone), widest, some)
+
+    def _single(self, reach: Tensor) -> Tensor:
+        """Tiles ``[tiles]`` that show the first sample alone, whole, as do so many cells around each."""
+        m, (height, width) = self.margin, self.area
+        other = self.samples[0].x.new_zeros(height // _CELL, width // _CELL)
+        for i, s in enumerate(self.samples):
+            weight = torch.ones_like(s.x) if s.weight is None else s.weight
+            if i == 0 and s.weight is None:
+                continue
+            there = weight[0, 0, m : m + height, m : m + width]
+            there = (1.0 - there if i == 0 else there).unflatten(0, (-1, _CELL)).amax(1)
+            other = torch.maximum(other, there.unflatten(1, (-1, _CELL)).amax(2))
+        single = torch.zeros_like(reach, dtype=torch.bool)
+        for cells in reach.unique().tolist():
+            single |= (reach == cells) & (_near_tiles(other, cells).flatten() == 0)
+        return single
 
     def _window(self, halo: int, places: Tensor | None, known: bool, single: bool = False) -> Window:
         samples = []
@@ -344,10 +375,18 @@ class Frame:
             mark(pixels, cells[r, c, None])
         occupied = []
         for layer, blur in zip(present.unflatten(0, (height // _CELL, -1, count)).permute(2, 0, 1), blurs, strict=True):
-            reach = -(-blur.halo // _CELL)
-            wide = functional.max_pool2d(layer[None, None], 2 * reach + 1, 1, reach)
-            occupied.append(functional.max_pool2d(wide, TILE // _CELL)[0, 0] > 0)
+            occupied.append(_near_tiles(layer, -(-blur.halo // _CELL)) > 0)
         return occupied
+
+
+def _part(values: Tensor, some: Tensor | None, less: int) -> Tensor:
+    values = values[..., less : values.shape[-2] - less, less : values.shape[-1] - less]
+    return values if some is None else values.index_select(0, some)
+
+
+def _near_tiles(cells: Tensor, reach: int) -> Tensor:
+    """Largest value of the cells of each tile and of so many around it: ``[rows, columns]``."""
+    return max_of_blocks(max_around(cells, reach), TILE // _CELL)
 
 
 def _finer(light: Tensor) -> Tensor:
@@ -366,12 +405,12 @@ def from_tiles(tiles: Tensor, area: Sequence[int]) -> Tensor:
     return tiles.unflatten(0, (rows, columns)).permute(2, 0, 3, 1, 4).reshape(1, -1, *area)
 
 
-def cut_tiles(values: Tensor, halo: int, places: Tensor) -> Tensor:
-    """Some tiles with their halo, ``[n, C, TILE + 2 halo, TILE + 2 halo]``, of ``[1, C, H + 2 halo, W + 2 halo]``."""
-    side, columns = TILE + 2 * halo, (values.shape[-1] - 2 * halo) // TILE
+def cut_tiles(values: Tensor, halo: int, places: Tensor, tile: int = TILE) -> Tensor:
+    """Some tiles with their halo, ``[n, C, tile + 2 halo, tile + 2 halo]``, of ``[1, C, H + 2 halo, W + 2 halo]``."""
+    side, columns = tile + 2 * halo, (values.shape[-1] - 2 * halo) // tile
     _, *steps = values.stride()
     shape, first = (values.shape[1], side, side), values.storage_offset()
-    corners = [(place // columns * TILE, place % columns * TILE) for place in places.tolist()]
+    corners = [(place // columns * tile, place % columns * tile) for place in places.tolist()]
     # one view a tile: slicing would make three
     return torch.stack([values.as_strided(shape, steps, first + y * steps[1] + x * steps[2]) for y, x in corners])
 
