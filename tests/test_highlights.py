@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable, blur_by_coc, highlights
@@ -49,6 +50,34 @@ def test_a_post_in_front_draws_its_shadow_where_its_rays_pass(coc_px: float, pos
             assert lands < 0.2, f"the post stops the ray at {dx}"
         elif not 39.5 <= passes_at <= 45.5 and kernel[half, half + dx] > 0:
             assert lands == pytest.approx(0.05 + LAMP * float(kernel[half, half + dx]), rel=0.1), f"ray at {dx}"
+
+
+def test_a_ray_meets_every_nearer_surface_in_its_way() -> None:
+    made = torch.Generator().manual_seed(1)
+    height, width, half = 90, 131, 9
+    coc_px = torch.full((1, 1, height, width), 9.0, dtype=torch.float64)
+    coc_px[..., :50] = -2.3
+    for top, left, near in ((10, 110, -6.0), (60, 70, 3.1), (20, 66, 5.0)):
+        coc_px[..., top : top + 12, left : left + 12] = near
+    at = torch.randint(height * width, (40,), generator=made)
+    at[0] = 45 * width + 8  # far from all that is as far away as it is
+    row, column = at // width, at % width
+    coc = torch.tensor([9.0, 4.5, -1.5, 1.1], dtype=torch.float64).repeat(10)
+    step = torch.arange(-half, half + 1)
+    surfaces = highlights._Surfaces(coc_px)
+    blocked = surfaces.blocked(coc, torch.zeros_like(at), row, column, step)
+
+    wanted = torch.zeros_like(blocked)
+    for k in range(20):
+        here = (1.0 - (coc_px - surfaces.low - k).abs()).clamp_min(0.0).expand(len(at), -1, -1, -1)
+        scale = (1.0 - (surfaces.low + k) / coc)[:, None]
+        y = ((row[:, None] + step * scale) * 2 / (height - 1) - 1)[:, :, None].expand_as(wanted)
+        x = ((column[:, None] + step * scale) * 2 / (width - 1) - 1)[:, None, :].expand_as(wanted)
+        seen = functional.grid_sample(here, torch.stack([x, y], -1), padding_mode="border", align_corners=True)
+        wanted += seen[:, 0] * (coc - 1.5 >= surfaces.low + k)[:, None, None]
+    wanted = wanted.clamp(max=1.0)
+    assert 0.1 < float(wanted.mean()) < 0.9, "the scene tests nothing"
+    torch.testing.assert_close(blocked, wanted, rtol=0, atol=1e-9)
 
 
 def test_ordinary_light_stays_in_the_layers() -> None:

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import max_around, places
+from .pool import max_around, max_of_blocks, places
 from .table import BlurTable
 
 __all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
@@ -223,16 +223,27 @@ class _Surfaces:
         below = self.place.detach().floor().long()
         self.bins = (torch.bincount(below) > 0).nonzero()[:, 0].tolist()
         self.bins = sorted({*self.bins, *(k + 1 for k in self.bins)})
+        ends = [-n % _COARSE_CELL for n in self.size]
+        place = functional.pad(coc_px.detach() - self.low, (0, ends[1], 0, ends[0]), mode="replicate")
+        self.ends = [max_of_blocks(place * sign, _COARSE_CELL) for sign in (-1, 1)]
 
     def blocked(self, coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor) -> Tensor:
         """Share of each ray ``[n, k, k]`` that nearer surfaces take."""
         height, width = self.size
         blocked = coc.new_zeros(len(coc), len(step), len(step))
         y, x = row[:, None].to(coc.dtype), column[:, None].to(coc.dtype)
+        # least and greatest place of what a ray can meet
+        reach = len(step) // 2 * float((1.0 - self.low / coc.detach()).abs().max())
+        radius = min(math.ceil(reach / _COARSE_CELL) + 1, max(self.ends[0].shape[-2:]))
+        cell = (item, 0, row // _COARSE_CELL, column // _COARSE_CELL)
+        least, most = (sign * max_around(end, radius)[cell] for sign, end in zip((-1, 1), self.ends, strict=True))
         for k in self.bins:
-            meets = coc - _NEARER_PX >= self.low + k
-            if not bool(meets.any()):
+            behind = coc - _NEARER_PX >= self.low + k
+            if not bool(behind.any()):
                 break
+            meets = behind & (least < k + 1) & (most > k - 1)
+            if not bool(meets.any()):
+                continue
             scale = (1.0 - (self.low + k) / coc[meets])[:, None]
             at_y = (y[meets] + step * scale).clamp(0, height - 1)  # surfaces go on beyond the border
             at_x = (x[meets] + step * scale).clamp(0, width - 1)
@@ -251,4 +262,4 @@ class _Surfaces:
 
     def _share(self, at: Tensor, k: int) -> Tensor:
         """How much of pixels lies in bin k."""
-        return (1.0 - (self.place[at] - k).abs()).clamp_min(0.0)
+        return (1.0 - (self.place.index_select(0, at.flatten()).view(at.shape) - k).abs()).clamp_min(0.0)
