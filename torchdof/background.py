@@ -446,23 +446,21 @@ def _pick(values: Tensor, at: Tensor) -> Tensor:
 
 def _place(new: Tensor, at: Tensor, like: Tensor) -> Tensor:
     """Zeros like ``[B, C, H, W]``, but for what :func:`_pick` would take."""
-    batch, channels, height, width = like.shape
-    flat = like.new_zeros(channels, batch * height * width)
-    flat.index_copy_(1, at, new.reshape(channels, -1).to(like.dtype))
-    return flat.reshape(channels, batch, height, width).transpose(0, 1)
+    batch, channels, *size = like.shape
+    return _fill(like.new_zeros(channels, batch, *size).transpose(0, 1), at, new)
 
 
 def _put(values: Tensor, at: Tensor, new: Tensor) -> Tensor:
     """A copy of ``values`` with what :func:`_pick` would take replaced."""
-    batch, channels, height, width = values.shape
-    flat = values.transpose(0, 1).flatten(1)
-    flat = flat.index_copy(1, at, new.reshape(channels, -1).to(values.dtype))
-    return flat.reshape(channels, batch, height, width).transpose(0, 1)
+    batch, channels, *size = values.shape
+    flat = values.transpose(0, 1).flatten(1).index_copy(1, at, new.reshape(channels, -1).to(values.dtype))
+    return flat.unflatten(1, (batch, *size)).transpose(0, 1)
 
 
 def _fill(values: Tensor, at: Tensor, new: Tensor) -> Tensor:
     """As :func:`_put`, into the result of it or of :func:`_place` itself."""
-    values.transpose(0, 1).view(values.shape[1], -1).index_copy_(1, at, new.reshape(values.shape[1], -1))
+    channels = values.shape[1]
+    values.transpose(0, 1).view(channels, -1).index_copy_(1, at, new.reshape(channels, -1).to(values.dtype))
     return values
 
 
