@@ -235,3 +235,13 @@ def test_a_large_kernel_uses_the_halo_as_if_the_frame_went_on() -> None:
     assert_close(spread.conv(light, kernels, half), whole, rtol=1e-5, atol=1e-6)
     some = spread.conv(light, kernels, 5)
     assert_close(some, spread.conv(light, kernels)[..., 5:-5, 5:-5], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("items", [1, 2, 7])
+@pytest.mark.parametrize("channels", [1, 3, 4, 5, 8, 9])
+@pytest.mark.parametrize("rows", [1, 2, 13])
+def test_the_halo_is_used_whatever_shares_a_convolution(rows: int, channels: int, items: int) -> None:
+    bank = torch.stack([kernel.disc(1.6 + 0.2 * c, size=7) for c in range(channels)])
+    light = torch.rand(items, channels, rows + 6, 17, dtype=torch.float64)
+    wanted = spread.fold(light, bank)[..., 3:-3, 3:-3]
+    assert_close(spread.conv(light, bank, halo=3), wanted, rtol=0, atol=1e-12)

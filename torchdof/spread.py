@@ -111,14 +111,30 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
         return light * kernels[:, 0, 0, None, None]
     if (2 * half + 1) ** 2 > _DIRECT_TAPS and not _traced():
         return _fourier(light, kernels, halo)
-    batch, channels = light.shape[:2]
-    together = _PACK // channels if not _traced() and batch > 1 and channels <= _PACK // 2 else 1
-    if together > 1:  # items as channels of one convolution
+    channels = light.shape[1]
+    together = 1 if _traced() or channels > _PACK // 2 else _PACK // channels  # items as channels of one convolution
+    rows = light.shape[-2] - 2 * halo
+    in_strips = together > 1 and light.shape[0] == 1 and halo == half
+    if in_strips:
+        light = _strips(light, half, together)
+    items = light.shape[0]
+    together = min(together, items)
+    if together > 1:
         light = _filled(light, 0, together).reshape(-1, together * channels, *light.shape[-2:])
     light = _filled(light, 1, _PACK)
     weights = _filled(kernels.repeat(together, 1, 1), 0, _PACK).unsqueeze(1)
     out = functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, : together * channels]
-    return out.reshape(-1, channels, *out.shape[-2:])[:batch] if together > 1 else out
+    if together > 1:
+        out = out.reshape(-1, channels, *out.shape[-2:])[:items]
+    return out.transpose(0, 1).flatten(1, 2)[None, :, :rows] if in_strips else out
+
+
+def _strips(light: Tensor, halo: int, count: int) -> Tensor:
+    """One item in strips of rows: ``[1, C, H + 2 halo, W] -> [count, C, ceil(H / count) + 2 halo, W]``."""
+    height = light.shape[-2] - 2 * halo
+    rows = -(-height // count)
+    light = functional.pad(light, (0, 0, 0, rows * count - height))
+    return light[0].unfold(1, rows + 2 * halo, rows).permute(1, 0, 3, 2)
 
 
 def _filled(values: Tensor, dim: int, multiple: int) -> Tensor:
