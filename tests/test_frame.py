@@ -37,11 +37,11 @@ def _frame(height: int, width: int, margin: int, second: bool) -> Frame:
 def _shares(frame: Frame, k: int) -> Tensor:
     """Whether some light of a pixel of the frame is in layer k: ``[1, 1, H, W]``, 0 or 1."""
     found = torch.zeros(1, 1, *frame.area)
-    inner = (..., *(slice(frame.margin, frame.margin + n) for n in frame.area))
+    rows, columns = (slice(frame.margin, frame.margin + n) for n in frame.area)
     for s in frame.samples:
         share = share_at_or_behind(s.x, NODES, k) - share_at_or_behind(s.x, NODES, k + 1)
         there = share if s.weight is None else share * s.weight
-        found = torch.maximum(found, (there[inner] > 0).float())
+        found = torch.maximum(found, (there[..., rows, columns] > 0).float())
     return found
 
 
