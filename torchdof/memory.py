@@ -7,12 +7,13 @@ from pathlib import Path
 
 __all__ = ["keep_freed", "peak_mb", "reset_peak"]
 
-# names of malloc.h, and the largest value they take
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _MOST = -1, -3, 2**31 - 1
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # as malloc.h has them
+_ALWAYS = 2**31 - 1
+_LARGEST = 2**26  # bytes; larger blocks leave gaps that the next ones do not fit
 
 
 def keep_freed() -> bool:
-    """Have this process keep what it frees, to use it again, for as long as it runs.
+    """Have this process keep what it frees, to use it again, for as long as it runs: blocks of up to 64 MiB.
 
     Large blocks otherwise go back to the system after each rendering, which hands them out again page by page, each
     cleared: at 1920 x 1080 tens of thousands of page faults for each image. For processes that render one image after
@@ -28,7 +29,7 @@ def keep_freed() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError, TypeError):  # no such library, no such function; Windows has no name for it
         return False
-    return bool(mallopt(_M_MMAP_THRESHOLD, _MOST)) and bool(mallopt(_M_TRIM_THRESHOLD, _MOST))
+    return bool(mallopt(_M_MMAP_THRESHOLD, _LARGEST)) and bool(mallopt(_M_TRIM_THRESHOLD, _ALWAYS))
 
 
 def peak_mb() -> float:
