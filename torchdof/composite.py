@@ -169,7 +169,7 @@ def _lay_all(
         if scale == 1:
             canvas = own
         elif isinstance(part, Coarse):
-            _join_finer(part.image(own), scale, canvas, frame, join)
+            _join_finer(part.image(own), scale, canvas, frame.colours, join)
         else:
 
             def joined(canvas: Tensor, own: Tensor = own, scale: int = scale) -> Tensor:
@@ -197,7 +197,7 @@ def _lay_patches(
                     _lay_at(canvas, tiles, layer, lay)
             continue
         for patch in frame.patches(blurs, list(some)):
-            own = canvas[patch.tiles]
+            own = canvas.index_select(0, patch.tiles)
             for k, tiles in patch.layers:
                 window = patch.window.part(tiles, patch.halo - blurs[k].halo)
                 (layer,) = _spread([window.terms(plan.nodes, k, with_room)], blurs, [k], spread)
@@ -213,11 +213,10 @@ def _lay_at(canvas: Tensor, tiles: Tensor | None, layer: Tensor, lay: Callable[[
 
 
 def _runs(groups: list[list[int]], plan: Plan, blurs: list[Blur]) -> list[list[list[int]]]:
-    """Neighbouring groups of one resolution together; at full resolution on both sides of the focus."""
+    """Neighbouring groups of one resolution together."""
     runs: list[list[list[int]]] = []
     for group in groups:
-        last = runs[-1][0][0] if runs else group[0]
-        if runs and (blurs[last].scale == blurs[group[0]].scale == 1 or alike(plan, blurs, last, group[0])):
+        if runs and alike(plan, blurs, runs[-1][0][0], group[0]):
             runs[-1].append(group)
         else:
             runs.append([group])
@@ -242,10 +241,10 @@ def _finer(canvas: Tensor, scale: int) -> Tensor:
     return fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
 
 
-def _join_finer(front: Tensor, scale: int, canvas: Tensor, frame: Frame, join: Join) -> None:
+def _join_finer(front: Tensor, scale: int, canvas: Tensor, colours: int, join: Join) -> None:
     """Join what is on a coarser canvas with one in tiles, in the tiles that it reaches."""
     step = TILE // scale
-    there = front[0, frame.colours :].amax(0).unfold(0, step + 2, step).unfold(1, step + 2, step).amax((2, 3)) > 0
+    there = front[0, colours:].amax(0).unfold(0, step + 2, step).unfold(1, step + 2, step).amax((2, 3)) > 0
     for tiles in there.flatten().nonzero()[:, 0].split(TILES_AT_ONCE):
         if len(tiles):
             _lay_at(canvas, tiles, _finer(cut_tiles(front, 1, tiles, step), scale), join)

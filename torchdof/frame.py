@@ -7,7 +7,7 @@ recorded or code is traced, the whole frame is one window.
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -55,6 +55,10 @@ class Sample:
     x: Tensor
     weight: Tensor | None = None
 
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Sample":
+        """The same change to each of its maps."""
+        return Sample(change(self.light), change(self.x), None if self.weight is None else change(self.weight))
+
 
 @dataclasses.dataclass(frozen=True)
 class Window:
@@ -73,11 +77,13 @@ class Window:
 
     def part(self, some: Tensor | None, less: int) -> "Window":
         """Some of the windows, with so many pixels less of halo."""
-        samples = []
-        for s in self.samples:
-            weight = None if s.weight is None else _part(s.weight, some, less)
-            samples.append(Sample(_part(s.light, some, less), _part(s.x, some, less), weight))
-        return Window(samples, None if self.known is None else _part(self.known, some, less), self.independent)
+
+        def cut(values: Tensor) -> Tensor:
+            values = values[..., less : values.shape[-2] - less, less : values.shape[-1] - less]
+            return values if some is None else values.index_select(0, some)
+
+        known = None if self.known is None else cut(self.known)
+        return Window([s.each(cut) for s in self.samples], known, self.independent)
 
     def _shared(self, nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
         light = share = room = None
@@ -291,8 +297,8 @@ class Frame:
         occupied = torch.stack([self._occupied[k].flatten() for k in layers])
         halos = torch.tensor([blurs[k].halo for k in layers], device=occupied.device)
         halo = (occupied * halos[:, None]).amax(0)
-        places = torch.arange(len(halo), device=occupied.device)
-        row, column = places // (self.area[1] // TILE) * TILE, places % (self.area[1] // TILE) * TILE
+        every, columns = torch.arange(len(halo), device=occupied.device), self.area[1] // TILE
+        row, column = every // columns * TILE, every % columns * TILE
         inside = (row >= halo) & (row + TILE + halo <= self.size[0])
         inside &= (column >= halo) & (column + TILE + halo <= self.size[1])
         single = self._single(-(-halo // _CELL))
@@ -312,24 +318,24 @@ class Frame:
         m, (height, width) = self.margin, self.area
         other = self.samples[0].x.new_zeros(height // _CELL, width // _CELL)
         for i, s in enumerate(self.samples):
-            weight = torch.ones_like(s.x) if s.weight is None else s.weight
             if i == 0 and s.weight is None:
                 continue
+            weight = torch.ones_like(s.x) if s.weight is None else s.weight
             there = weight[0, 0, m : m + height, m : m + width]
-            there = (1.0 - there if i == 0 else there).unflatten(0, (-1, _CELL)).amax(1)
-            other = torch.maximum(other, there.unflatten(1, (-1, _CELL)).amax(2))
+            other = torch.maximum(other, max_of_blocks(1.0 - there if i == 0 else there, _CELL))
         single = torch.zeros_like(reach, dtype=torch.bool)
         for cells in reach.unique().tolist():
             single |= (reach == cells) & (_near_tiles(other, cells).flatten() == 0)
         return single
 
     def _window(self, halo: int, places: Tensor | None, known: bool, single: bool = False) -> Window:
-        samples = []
-        for s in self.samples[:1] if single else self.samples:
-            weight = None if s.weight is None or single else self._cut(s.weight, halo, places)
-            samples.append(Sample(self._cut(s.light, halo, places), self._cut(s.x, halo, places), weight))
-        seen = self._cut(self.known, halo, places) if known and self.known is not None else None
-        return Window(samples, seen, self.independent)
+        def cut(values: Tensor) -> Tensor:
+            return self._cut(values, halo, places)
+
+        first = self.samples[0]
+        samples = [Sample(first.light, first.x)] if single else self.samples
+        seen = cut(self.known) if known and self.known is not None else None
+        return Window([s.each(cut) for s in samples], seen, self.independent)
 
     def _cut(self, values: Tensor, halo: int, places: Tensor | None) -> Tensor:
         start = self.margin - halo
@@ -379,11 +385,6 @@ class Frame:
         return occupied
 
 
-def _part(values: Tensor, some: Tensor | None, less: int) -> Tensor:
-    values = values[..., less : values.shape[-2] - less, less : values.shape[-1] - less]
-    return values if some is None else values.index_select(0, some)
-
-
 def _near_tiles(cells: Tensor, reach: int) -> Tensor:
     """Largest value of the cells of each tile and of so many around it: ``[rows, columns]``."""
     return max_of_blocks(max_around(cells, reach), TILE // _CELL)
@@ -422,8 +423,12 @@ def margin_and_align(blurs: Sequence[Blur]) -> tuple[int, int]:
 
 
 def alike(plan: Plan, blurs: Sequence[Blur], j: int, k: int) -> bool:
-    """Whether two layers are of one resolution and on one side of the focus; so it does not matter what is between."""
-    return blurs[j].scale == blurs[k].scale and (plan.nodes[j] < 0) == (plan.nodes[k] < 0)
+    """Whether two layers go on one canvas: at full resolution all do, else what is between must not matter.
+
+    So these are of one resolution and on one side of the focus.
+    """
+    scale, other = blurs[j].scale, blurs[k].scale
+    return scale == other and (scale == 1 or (plan.nodes[j] < 0) == (plan.nodes[k] < 0))
 
 
 def _traced() -> bool:

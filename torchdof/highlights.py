@@ -201,7 +201,7 @@ def _to_border(at: Tensor, coc_px: Tensor) -> Tensor:
 def _something_nearer(at: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     """Whether a ray of a pixel could meet a nearer surface, or land where layers would scale it; none too few."""
     item, row, column = places(at, int(nearest_px.shape[-2]), int(nearest_px.shape[-1]))
-    cells = functional.max_pool2d(-nearest_px.detach(), _COARSE_CELL, ceil_mode=True)
+    cells = _cells(-nearest_px.detach())
     rows, columns = row // _COARSE_CELL, column // _COARSE_CELL
     found = torch.zeros_like(coc, dtype=torch.bool)
     inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells
@@ -211,6 +211,13 @@ def _something_nearer(at: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
         found |= (near < coc - inner) | ((near < coc - _NEARER_PX) & (2.0 * coc.abs() > inner))
         inner, radius = max(_NEARER_PX, float(radius * _COARSE_CELL)), 2 * radius
     return found
+
+
+def _cells(values: Tensor) -> Tensor:
+    """Largest of ``[B, 1, H, W]`` in cells of so many pixels a side, the last ones cut off by the border."""
+    height, width = values.shape[-2:]
+    ends = (0, -width % _COARSE_CELL, 0, -height % _COARSE_CELL)
+    return max_of_blocks(functional.pad(values, ends, mode="replicate"), _COARSE_CELL)
 
 
 class _Surfaces:
@@ -223,9 +230,7 @@ class _Surfaces:
         below = self.place.detach().floor().long()
         self.bins = (torch.bincount(below) > 0).nonzero()[:, 0].tolist()
         self.bins = sorted({*self.bins, *(k + 1 for k in self.bins)})
-        ends = [-n % _COARSE_CELL for n in self.size]
-        place = functional.pad(coc_px.detach() - self.low, (0, ends[1], 0, ends[0]), mode="replicate")
-        self.ends = [max_of_blocks(place * sign, _COARSE_CELL) for sign in (-1, 1)]
+        self.ends = [_cells((coc_px.detach() - self.low) * sign) for sign in (-1, 1)]
 
     def blocked(self, coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor) -> Tensor:
         """Share of each ray ``[n, k, k]`` that nearer surfaces take."""

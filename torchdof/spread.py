@@ -111,22 +111,18 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
         return light * kernels[:, 0, 0, None, None]
     if (2 * half + 1) ** 2 > _DIRECT_TAPS and not _traced():
         return _fourier(light, kernels, halo)
-    channels = light.shape[1]
-    together = 1 if _traced() or channels > _PACK // 2 else _PACK // channels  # items as channels of one convolution
-    rows = light.shape[-2] - 2 * halo
-    in_strips = together > 1 and light.shape[0] == 1 and halo == half
-    if in_strips:
-        light = _strips(light, half, together)
-    items = light.shape[0]
-    together = min(together, items)
-    if together > 1:
+    batch, channels = light.shape[:2]
+    together = 1 if _traced() or channels > _PACK // 2 else _PACK // channels
+    if batch == 1 and together > 1 and halo == half:  # strips of its rows as items
+        strips = conv(_strips(light, half, together), kernels, half)
+        return strips.transpose(0, 1).flatten(1, 2)[None, :, : light.shape[-2] - 2 * half]
+    together = min(together, batch)
+    if together > 1:  # items as channels of one convolution
         light = _filled(light, 0, together).reshape(-1, together * channels, *light.shape[-2:])
     light = _filled(light, 1, _PACK)
     weights = _filled(kernels.repeat(together, 1, 1), 0, _PACK).unsqueeze(1)
     out = functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, : together * channels]
-    if together > 1:
-        out = out.reshape(-1, channels, *out.shape[-2:])[:items]
-    return out.transpose(0, 1).flatten(1, 2)[None, :, :rows] if in_strips else out
+    return out.reshape(-1, channels, *out.shape[-2:])[:batch] if together > 1 else out
 
 
 def _strips(light: Tensor, halo: int, count: int) -> Tensor:
