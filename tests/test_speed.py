@@ -13,6 +13,8 @@ from typer.testing import CliRunner, Result
 from torchdof import Camera, DepthOfField, growth, metrics, speed
 from torchdof.command import app
 from torchdof.files import Picture, read_image, write_image
+from torchdof.render import RenderSettings
+from torchdof.subject import Subject, from_files, shipped
 
 LEVELS = ["8/255", "4/255", "2/255", "1/255", "0.5/255", "exact"]
 EXACT = speed.Setting("layered", True, 0.0)
@@ -29,21 +31,21 @@ def row(setting: speed.Setting, median_s: float, rms_255: float) -> speed.Row:
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
     image, depth = tmp_path / "image.exr", tmp_path / "depth.exr"
-    write_image(image, Picture(speed.shipped(36, 64).image), sample="float")
+    write_image(image, Picture(shipped(36, 64).image), sample="float")
     metres = torch.linspace(1.0, 4.0, 64).expand(1, 1, 36, 64)
     write_image(depth, Picture(metres, ("Y",)), sample="float")
     return image, depth
 
 
 @pytest.fixture(scope="module")
-def measured() -> tuple[list[speed.Row], speed.Subject]:
-    subject = speed.shipped(48, 96)
+def measured() -> tuple[list[speed.Row], Subject]:
+    subject = shipped(48, 96)
     # blurred enough for coarse layers to show
-    subject = speed.Subject("wide", subject.image, 5.0 * subject.coc_px)
+    subject = Subject("wide", subject.image, 5.0 * subject.coc_px)
     return speed.measure_all(subject, repeat=1)[0], subject
 
 
-def test_every_setting_has_its_row(measured: tuple[list[speed.Row], speed.Subject]) -> None:
+def test_every_setting_has_its_row(measured: tuple[list[speed.Row], Subject]) -> None:
     rows, _ = measured
     assert [r.setting.name for r in rows] == [*LEVELS, *LEVELS, "1/255 looked at", "fold 1/255", "fold 1/255"]
     assert [r.setting.occlusion for r in rows] == [True] * 6 + [False] * 6 + [True, True, False]
@@ -52,7 +54,7 @@ def test_every_setting_has_its_row(measured: tuple[list[speed.Row], speed.Subjec
     assert all(r.keeps for r in rows)
 
 
-def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed.Row], speed.Subject]) -> None:
+def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed.Row], Subject]) -> None:
     rows, subject = measured
     for r in (r for r in rows if r.setting.method == "layered" and not r.setting.attention):
         out, wanted = (
@@ -67,7 +69,7 @@ def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed
 
 
 def test_where_the_viewer_looks_the_error_is_that_of_the_tolerance() -> None:
-    subject = speed.shipped(192, 320)
+    subject = shipped(192, 320)
     look = speed.Setting("layered", True, 1 / 255, attention=(160.0, 96.0, 12.0))
     wanted = speed.exact(subject, occlusion=True)
     row = speed.measure(subject, look, wanted, 1, 1.0)
@@ -78,7 +80,7 @@ def test_where_the_viewer_looks_the_error_is_that_of_the_tolerance() -> None:
 
 
 def test_a_wrong_exact_shows(monkeypatch: pytest.MonkeyPatch) -> None:
-    subject = speed.shipped(36, 64)
+    subject = shipped(36, 64)
     right = speed.exact
     monkeypatch.setattr(speed, "exact", lambda part, occlusion: right(part, occlusion) + 0.2 * (not occlusion))
     rows, unit = speed.measure_all(subject, repeat=1)
@@ -90,7 +92,7 @@ def test_a_wrong_exact_shows(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_rendering_that_is_not_finite_breaks_the_promise(monkeypatch: pytest.MonkeyPatch) -> None:
-    subject = speed.shipped(36, 64)
+    subject = shipped(36, 64)
     wanted = speed.exact(subject, True).clone()
     assert speed.measure(subject, EXACT, wanted, 1, 1.0).keeps
 
@@ -113,7 +115,7 @@ def test_one_run_more_warms_up() -> None:
 
 
 def test_median_and_spread_are_those_of_the_timed_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    subject = speed.shipped(36, 64)
+    subject = shipped(36, 64)
     wanted = speed.exact(subject, True)
     ticks = iter([-9.0, 0.0, 1.0, 10.0, 12.0, 20.0, 23.0, 30.0, 34.0, 40.0, 60.0])
     monkeypatch.setattr(speed.time, "perf_counter", lambda: next(ticks))
@@ -123,7 +125,7 @@ def test_median_and_spread_are_those_of_the_timed_runs(monkeypatch: pytest.Monke
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="this system does not tell its peak memory")
 def test_peak_memory_is_that_of_the_setting_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    subject = speed.shipped(36, 64)
+    subject = shipped(36, 64)
     wanted = speed.exact(subject, True)
     sizes = [64, 8]
 
@@ -148,7 +150,7 @@ def test_the_front_is_what_nothing_like_it_beats() -> None:
 
 
 def test_the_built_in_scene_is_blurred_alike_before_and_behind_the_focus() -> None:
-    subject = speed.shipped()
+    subject = shipped()
     assert subject.image.shape == (1, 3, 540, 960)
     assert float(subject.coc_px.min()) == pytest.approx(-16, abs=0.5)
     assert float(subject.coc_px.max()) == pytest.approx(16, abs=0.5)
@@ -158,7 +160,7 @@ def test_the_built_in_scene_is_blurred_alike_before_and_behind_the_focus() -> No
 
 def test_fold_gets_a_crop_whose_columns_fit() -> None:
     image, coc = torch.rand(1, 3, 200, 300), torch.full((1, 1, 200, 300), 60.0)
-    subject = speed.Subject("x", image, coc)
+    subject = Subject("x", image, coc)
     crops = [s for s in speed.settings(subject) if s.method == "fold"]
     assert [s.occlusion for s in crops] == [True, False]
     side = crops[0].side
@@ -197,11 +199,11 @@ def test_bench_measures_ones_own_scene_and_writes(files: tuple[Path, Path], tmp_
 
 
 def test_bench_focuses_where_it_is_told(files: tuple[Path, Path], tmp_path: Path) -> None:
-    how = speed.RenderSettings(focus=[(0, 1.0)])
-    subject = speed.from_files(*files, how)
+    how = RenderSettings(focus=[(0, 1.0)])
+    subject = from_files(*files, how)
     assert float(subject.coc_px.min()) == pytest.approx(0.0, abs=1e-5)
     assert "focus as stated" in subject.remark
-    given = speed.from_files(*files, speed.RenderSettings(depth_kind="coc", depth_scale=2.0))
+    given = from_files(*files, RenderSettings(depth_kind="coc", depth_scale=2.0))
     assert float(given.coc_px.max()) == pytest.approx(8.0)
 
 
@@ -209,7 +211,7 @@ def test_alpha_is_left_out(tmp_path: Path) -> None:
     pixels = torch.full((1, 4, 20, 24), 0.5)
     write_image(tmp_path / "a.exr", Picture(pixels, ("R", "G", "B", "A")))
     write_image(tmp_path / "d.exr", Picture(torch.full((1, 1, 20, 24), 2.0), ("Y",)))
-    assert speed.from_files(tmp_path / "a.exr", tmp_path / "d.exr", speed.RenderSettings()).image.shape[1] == 3
+    assert from_files(tmp_path / "a.exr", tmp_path / "d.exr", RenderSettings()).image.shape[1] == 3
 
 
 @pytest.mark.parametrize(
@@ -246,7 +248,7 @@ def test_bad_arguments_are_refused_in_a_sentence(
 
 
 def test_an_exported_file_has_its_row() -> None:
-    subject = speed.shipped(64, 160)
+    subject = shipped(64, 160)
     found = [s for s in speed.settings(subject, ["onnxruntime"]) if s.runtime == "onnxruntime"]
     assert [(s.name, s.occlusion) for s in found] == [("onnx 1/255", True), ("onnx 1/255", False)]
     wanted = speed.exact(subject, occlusion=False)
@@ -257,7 +259,7 @@ def test_an_exported_file_has_its_row() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
 def test_a_compiled_module_has_its_row_and_tells_what_compiling_took() -> None:
-    subject = speed.shipped(64, 96)
+    subject = shipped(64, 96)
     found = [s for s in speed.settings(subject, ["compiled"]) if s.runtime == "compiled"]
     assert [(s.name, s.occlusion) for s in found] == [("compiled 1/255", True), ("compiled 1/255", False)]
     here = speed.measure(subject, found[1], speed.exact(subject, occlusion=False), 1, 1.0)
@@ -273,7 +275,7 @@ def test_bench_needs_a_compiler_to_compile(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_scans_change_the_radius_or_the_frame_alone() -> None:
-    subject = speed.shipped(64, 128)
+    subject = shipped(64, 128)
     scenes = growth.scenes(subject)
     assert [name for name, _ in scenes] == ["radius"] * 5 + ["size"] * 3
     for radius, (_, scene) in zip((4, 8, 16, 32, 64), scenes, strict=False):
@@ -282,7 +284,7 @@ def test_scans_change_the_radius_or_the_frame_alone() -> None:
     widest = [float(s.coc_px.abs().max()) / s.image.shape[-1] for _, s in scenes[5:]]
     assert widest == pytest.approx([widest[-1]] * 3, rel=0.05)
     assert torch.equal(scenes[-1][1].image, subject.image)
-    assert growth.scenes(speed.Subject("sharp", subject.image, torch.zeros(1, 1, 64, 128))) == []
+    assert growth.scenes(Subject("sharp", subject.image, torch.zeros(1, 1, 64, 128))) == []
 
 
 def test_the_scan_is_printed_and_written(files: tuple[Path, Path], tmp_path: Path) -> None:
@@ -306,7 +308,7 @@ def test_without_matplotlib_it_says_so_before_it_measures(tmp_path: Path, monkey
 
 
 def test_a_scene_without_any_error_is_drawn_as_well(tmp_path: Path) -> None:
-    speed.write(tmp_path, [row(EXACT, 1.0, 0.0)], speed.shipped(36, 64), 1.0, 1)
+    speed.write(tmp_path, [row(EXACT, 1.0, 0.0)], shipped(36, 64), 1.0, 1)
     assert float(read_image(tmp_path / "speed.png").pixels.std()) > 0.05
 
 
@@ -316,7 +318,7 @@ def test_a_table_that_fails_leaves_no_file(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(speed, "_csv", full)
     (tmp_path / "speed.md").write_text("before")
-    subject = speed.shipped(36, 64)
+    subject = shipped(36, 64)
     with pytest.raises(OSError, match="no space"):
         speed.write(tmp_path, [row(EXACT, 1.0, 1.0)], subject, 1.0, 1)
     assert [p.name for p in tmp_path.iterdir()] == ["speed.md"]

@@ -1,14 +1,12 @@
 """``torchdof bench``: speed against error on a scene; or how close to the truth each renderer comes."""
 
 import contextlib
-import csv
 import dataclasses
 import importlib.util
-import io
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,13 +18,15 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from . import metrics, peers, speed
+from . import goals, metrics, peers, speed
 from .files import Picture, whole_file, write_image
 from .growth import lines, measure_growth, show_growth
 from .module import DepthOfField
 from .reference import lens_views
 from .render import RenderSettings
+from .report import csv_of, markdown
 from .scenes import Scene, read_scenes
+from .subject import from_files, shipped
 from .table import BlurTable
 from .transfer import decode
 
@@ -163,7 +163,9 @@ def bench(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, accuracy.csv, .md and .png, or peers.*."),
+        typer.Option(
+            "--out", "-o", help="Folder for speed.csv, .md and .png, accuracy.csv, .md and .png, goals.* or peers.*."
+        ),
     ] = None,
     repeat: Annotated[int, typer.Option(help="Timed renderings of each setting or tool.", min=1)] = 5,
     focus_m: Annotated[
@@ -231,6 +233,16 @@ def bench(
             rich_help_panel=_PEERS,
         ),
     ] = None,
+    costs: Annotated[
+        Path | None,
+        typer.Option(
+            "--goals",
+            metavar="SCENES",
+            help="Folder with scenes as for --truth: what whole frames, crops, batches and gradients cost, beside the "
+            "goals of this project; takes minutes, and 8 GB of memory.",
+            rich_help_panel=_SPEED,
+        ),
+    ] = None,
     peers_folder: Annotated[
         Path,
         typer.Option(help="Where the other tools are described, a Python file each.", rich_help_panel=_PEERS),
@@ -250,16 +262,24 @@ def bench(
     The picture of the latter shows, for each scene, the place where torchdof is farthest from the truth: sharp, truth,
     each renderer with its error below it, four times enlarged.
 
+    What whole frames, crops, batches and gradients cost, beside what this project wants them to cost at most:
+
+        torchdof bench --goals scenes --out results
+
     torchdof and what else is installed, GEGL, FFmpeg or Blender, in one run on the same scenes:
 
         torchdof bench --peers scenes --out results
     """
     if out is not None and not out.is_dir():
         raise FileNotFoundError(f"{out}: there is no such folder; make it first")
-    if compared is not None:
-        if image is not None or truth is not None or views or inner or onnx or compiled or scan:
-            raise ValueError("--peers measures the scenes of its folder; of the other options it takes --out, --repeat")
-        peers.compare(compared, peers_folder, out, repeat)
+    if compared is not None or costs is not None:
+        name = "--goals" if compared is None else "--peers"
+        if image is not None or truth is not None or views or inner or onnx or compiled or scan or (compared and costs):
+            raise ValueError(f"{name} measures the scenes of its folder; of the other options it takes --out, --repeat")
+        if compared is not None:
+            peers.compare(compared, peers_folder, out, repeat)
+        if costs is not None:
+            goals.compare(costs, out, repeat)
         return
     if truth is not None:
         if image is not None or onnx or compiled or scan:
@@ -292,7 +312,7 @@ def bench(
         raise FileNotFoundError(
             "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
         )
-    subject = speed.shipped() if image is None else speed.from_files(image, depth, how)
+    subject = shipped() if image is None else from_files(image, depth, how)
     console = Console(stderr=True)
     runtimes: list[speed.Runtime] = []
     if onnx:
@@ -330,21 +350,10 @@ def _accuracy(truth: Path, out: Path, views: Sequence[int] | None, inner: bool) 
         csv_file, md_file, png_file = (
             files.enter_context(whole_file(out / f"accuracy.{s}")) for s in ("csv", "md", "png")
         )
-        csv_file.write_text(_csv(scores), encoding="utf-8")
+        csv_file.write_text(csv_of(scores), encoding="utf-8")
         md_file.write_text(text, encoding="utf-8")
         write_image(png_file, sheet)
     _show(scores, names, [scene.name for scene in scenes])
-
-
-def _csv(scores: Iterable[Score]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in dataclasses.fields(Score)])
-    writer.writerows(
-        [f"{value:.6g}" if isinstance(value, float) else value for value in dataclasses.astuple(score)]
-        for score in scores
-    )
-    return text.getvalue()
 
 
 def _cells(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str], what: str) -> list[list[str]]:
@@ -365,8 +374,7 @@ def _markdown(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[st
     for what, meaning in _MEASURES.items():
         if all(math.isnan(getattr(score, what)) for score in scores):
             continue
-        lines = [["scene", *names], ["---"] * (len(names) + 1), *_cells(scores, names, scenes, what)]
-        parts += [f"## {meaning}\n", *("| " + " | ".join(line) + " |" for line in lines), ""]
+        parts += [f"## {meaning}\n", markdown([["scene", *names], *_cells(scores, names, scenes, what)]), ""]
     parts += [
         "## accuracy.png\n",
         f"A row a scene, in the order above: {_TILE_PX} pixels around the place where torchdof is worst. From the "

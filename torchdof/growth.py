@@ -5,13 +5,13 @@ import functools
 import math
 from collections.abc import Sequence
 
-import torch.nn.functional as functional
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from .speed import Setting, Subject, median_and_spread, render, times
+from .speed import Setting, median_and_spread, render, times
+from .subject import LEAST_PX, Subject
 
 __all__ = ["Growth", "lines", "measure_growth", "scenes", "show_growth"]
 
@@ -42,22 +42,18 @@ def scenes(subject: Subject) -> list[tuple[str, Subject]]:
     """The same scene with other largest radii, and in smaller frames with a blur as large relative to the width.
 
     Example:
-        >>> from torchdof.speed import shipped
+        >>> from torchdof.subject import shipped
         >>> [(name, s.image.shape[-1], round(float(s.coc_px.abs().max()))) for name, s in scenes(shipped(64, 128))][4:]
         [('radius', 128, 64), ('size', 32, 1), ('size', 64, 1), ('size', 128, 2)]
     """
-    widest = float(subject.coc_px.abs().max())
-    if not 0 < widest < math.inf:
+    if not 0 < subject.radius_px < math.inf:
         return []
-    found = [
-        ("radius", dataclasses.replace(subject, coc_px=subject.coc_px * (radius / widest))) for radius in _RADII_PX
+    height, width = subject.image.shape[-2:]
+    sizes = [(max(LEAST_PX, round(height * share)), max(LEAST_PX, round(width * share))) for share in _SIZES]
+    return [
+        *(("radius", subject.blurred(radius)) for radius in _RADII_PX),
+        *(("size", subject.resized(*size)) for size in sizes),
     ]
-    for share in _SIZES:
-        size = [max(16, round(n * share)) for n in subject.image.shape[-2:]]
-        image = functional.interpolate(subject.image, size, mode="area")
-        coc = functional.interpolate(subject.coc_px, size, mode="nearest") * share
-        found.append(("size", dataclasses.replace(subject, image=image, coc_px=coc)))
-    return found
 
 
 def measure_growth(subject: Subject, repeat: int, unit: float, console: Console | None = None) -> list[Growth]:
@@ -80,7 +76,7 @@ def measure_growth(subject: Subject, repeat: int, unit: float, console: Console 
             setting = Setting("layered", occlusion, _TOLERANCE)
             both.append(median_and_spread(times(functools.partial(render, scene, setting), repeat)))
         (median, spread), (plain, plain_spread) = both
-        radius, pixels = float(scene.coc_px.abs().max()), width * height
+        radius, pixels = scene.radius_px, width * height
         own = (median, spread, median / unit, 1e9 * median / pixels)
         rows.append(Growth(scan, width, height, radius, *own, plain, plain_spread, plain / unit))
     return rows

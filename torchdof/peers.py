@@ -13,15 +13,10 @@ Files that start with an underscore are left alone.
 """
 
 import contextlib
-import csv
 import dataclasses
 import functools
-import importlib.metadata
 import importlib.util
-import io
 import math
-import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -39,6 +34,7 @@ from . import metrics
 from .arguments import whole
 from .files import whole_file
 from .module import blur_by_coc
+from .report import csv_of, machine, markdown
 from .scenes import Scene, read_scenes
 from .speed import median_and_spread
 
@@ -212,7 +208,7 @@ def compare(scenes: Path, folder: Path, out: Path | None, repeat: int) -> None:
     if out is not None:
         with contextlib.ExitStack() as files:  # both of them or none
             csv_file, md_file = (files.enter_context(whole_file(out / f"peers.{s}")) for s in ("csv", "md"))
-            csv_file.write_text(_csv(rows), encoding="utf-8")
+            csv_file.write_text(csv_of(rows), encoding="utf-8")
             md_file.write_text(_markdown(rows, compared, absent, repeat), encoding="utf-8")
     _show(rows, compared, absent, repeat)
 
@@ -280,36 +276,17 @@ _ERRORS = "PSNR in dB against the truth: display-encoded (clipped to [0, 1], sRG
 _RATIOS = f"Against ours at {_LEVELS[-1]:g}/255: median over the cases (least to greatest)"
 
 
-def _machine() -> str:
-    threads = f"{os.cpu_count()} CPUs, threads for each renderer: {torch.get_num_threads()}"
-    versions = f"torchdof {importlib.metadata.version('torchdof')}, torch {torch.__version__}"
-    return (
-        f"{platform.processor() or platform.machine()}, {threads}; {versions}, Python {platform.python_version()}, "
-        f"{platform.system()}"
-    )
-
-
-def _csv(rows: Sequence[Row]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([field.name for field in dataclasses.fields(Row)])
-    for row in rows:
-        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in dataclasses.astuple(row)])
-    return text.getvalue()
-
-
 def _markdown(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, str], repeat: int) -> str:
     head = ["case", *_names(rows)]
     parts = [
         "# Beside other tools\n",
-        f"{_machine()}. Timed renderings of each, in turns, after one more: {repeat}.\n",
+        f"{machine()}. Timed renderings of each, in turns, after one more: {repeat}.\n",
         *(f"- {peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared),
         *(f"- {name}: {reason}" for name, reason in absent.items()),
     ]
     tables = ((_RATIOS, list(_SUMMARY), _summary(rows)), (_TIMES, head, _times(rows)), (_ERRORS, head, _errors(rows)))
     for title, columns, lines in tables:
-        table = [columns, ["---"] * len(columns), *lines]
-        parts += [f"\n## {title}\n", *("| " + " | ".join(line) + " |" for line in table)]
+        parts += [f"\n## {title}\n", markdown([columns, *lines])]
     return "\n".join(parts) + "\n"
 
 
@@ -324,7 +301,7 @@ def _show(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, str],
         for line in lines:
             table.add_row(*line)
         console.print(table)
-    console.print(f"{_machine()}; timed renderings of each: {repeat}.", markup=False, highlight=False)
+    console.print(f"{machine()}; timed renderings of each: {repeat}.", markup=False, highlight=False)
     for peer in compared[len(_LEVELS) :]:
         console.print(f"{peer.name} {peer.version}: {peer.note}", markup=False, highlight=False)
     for name, reason in absent.items():

@@ -4,11 +4,8 @@ import contextlib
 import csv
 import dataclasses
 import functools
-import importlib.metadata
 import io
 import math
-import os
-import platform
 import statistics
 import tempfile
 import time
@@ -29,18 +26,16 @@ from .arguments import whole
 from .attention import weight_map
 from .camera import Camera
 from .check import Method
-from .depthmap import depth_from_values, resolve_holes
-from .files import read_image, read_values, whole_file
+from .files import whole_file
 from .module import DepthOfField, blur_by_coc
-from .render import RenderSettings
-from .scenes import posts, waves
+from .report import machine, markdown
+from .subject import LEAST_PX, Subject
 
 __all__ = [
     "Row",
     "Setting",
-    "Subject",
     "exact",
-    "from_files",
+    "fold_side",
     "measure",
     "measure_all",
     "median_and_spread",
@@ -48,15 +43,14 @@ __all__ = [
     "render",
     "renderer",
     "settings",
-    "shipped",
     "show",
     "times",
     "unit_s",
+    "unit_work",
     "write",
 ]
 
 _LEVELS = (8.0, 4.0, 2.0, 1.0, 0.5)  # of 255
-_LEAST_PX = 16
 _LOOKED_AT = 8  # of the height: radius of what is looked at
 Runtime = Literal["torch", "compiled", "onnxruntime"]
 _SHORT = {"compiled": "compiled", "onnxruntime": "onnx"}
@@ -64,37 +58,6 @@ _FOLD_PX = 128  # largest side of the crop that the literal scatter gets
 _FOLD_BYTES = 256 * 2**20  # and the memory of its columns
 _ROUNDING = 1e-6
 _COLUMNS = ("ms", "± ms", "Y", "MP/s", "MiB", "RMS", "dB", "SSIM", "kept")
-
-
-@dataclasses.dataclass(frozen=True)
-class Subject:
-    """What is rendered.
-
-    Args:
-        name: For the report.
-        image: ``[1, C, H, W]``, linear light, without alpha.
-        coc_px: ``[1, 1, H, W]``, signed radius in pixels.
-        remark: Camera and focus, in words.
-    """
-
-    name: str
-    image: Tensor
-    coc_px: Tensor
-    remark: str = ""
-
-    def __post_init__(self) -> None:
-        height, width = self.image.shape[-2:]
-        if self.coc_px.shape[-2:] != (height, width):
-            h, w = self.coc_px.shape[-2:]
-            raise ValueError(f"{self.name}: depth is {w} x {h} pixels but the image is {width} x {height}")
-        if min(height, width) < _LEAST_PX:
-            raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {_LEAST_PX} pixels a side on")
-
-    def crop(self, side: int) -> "Subject":
-        """The square in the middle, at most ``side`` pixels wide."""
-        height, width = self.image.shape[-2:]
-        rows, columns = (slice((n - min(side, n)) // 2, (n + min(side, n)) // 2) for n in (height, width))
-        return dataclasses.replace(self, image=self.image[..., rows, columns], coc_px=self.coc_px[..., rows, columns])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,12 +116,9 @@ class Row:
 def settings(subject: Subject, runtimes: Sequence[Runtime] = ()) -> list[Setting]:
     """What is compared on a subject: from coarse to exact with and without occlusion, and the literal scatter.
 
-    That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB. Further
-    runtimes render at 1/255.
+    That one gets a crop from the middle, of :func:`fold_side`. Further runtimes render at 1/255.
     """
-    taps = (2 * math.ceil(float(subject.coc_px.abs().max())) + 3) ** 2
-    bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
-    side = min(_FOLD_PX, max(_LEAST_PX, math.isqrt(_FOLD_BYTES // bytes_a_pixel)))
+    side = fold_side(subject)
     found = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
     height, width = subject.image.shape[-2:]
     found.append(Setting("layered", True, 1 / 255, attention=(width / 2, height / 2, height / _LOOKED_AT)))
@@ -166,50 +126,11 @@ def settings(subject: Subject, runtimes: Sequence[Runtime] = ()) -> list[Setting
     return [*found, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
 
 
-def shipped(height: int = 540, width: int = 960) -> Subject:
-    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m, with a blur radius of up to a 60th of the width.
-
-    Example:
-        >>> shipped(54, 96).image.shape
-        torch.Size([1, 3, 54, 96])
-    """
-    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, width)), indexing="ij")
-    near = posts(width / 6, width / 40)(x, y)
-    light = torch.where(near, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]
-    depth = torch.where(near, 1.0 / (1.0 + 0.1 * x / width), 1.0 / (0.1 + 0.9 * y / height)).float()[None, None]
-    camera = Camera(50.0, 1.0, focus_m=1.0 / 0.6)  # the blur is as large far away as at the posts
-    camera = camera.replace(f_number=float(camera.coc_px(depth, width).abs().max()) / (width / 60))
-    return Subject("slope with posts", light, camera.coc_px(depth, width), f"{camera!r}")
-
-
-def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:
-    """An image and its depth from files; alpha is left out.
-
-    Args:
-        image: Image file.
-        depth: Depth file; None takes the depth channel of the image.
-        how: Camera and depth as for ``torchdof render``; without a focus it is at the median depth, so that there is
-            blur on both sides.
-
-    Raises:
-        ValueError: If input is wrong or missing.
-        OSError: If a file cannot be read.
-    """
-    picture = read_image(image, how.transfer, how.layer)
-    values = picture.depth if depth is None else read_values(depth, how.depth_channel)
-    if values is None:
-        raise ValueError(f"{image}: has no depth channel; name a depth file after it: torchdof bench IMAGE DEPTH")
-    values = depth_from_values(values, how.depth_kind, scale=how.depth_scale, offset=how.depth_offset)
-    values, _ = resolve_holes(values, str(depth or image), how.fill)
-    light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
-    if how.depth_kind == "coc":
-        return Subject(image.name, light, values, "blur as given")
-    focus = "focus as stated"
-    if how.focus is None:
-        focus, how = "focus at the median depth", dataclasses.replace(how, focus=[(0, float(values.median()))])
-    camera, remarks = how.camera(picture.metadata, light.shape[-1], 0)
-    words = f"{camera!r}; {', '.join([focus, *remarks])}"
-    return Subject(image.name, light, camera.coc_px(values, light.shape[-1]), words)
+def fold_side(subject: Subject) -> int:
+    """Side of a crop for the literal scatter: it holds k * k columns a pixel, which here stay within 256 MiB."""
+    taps = (2 * math.ceil(subject.radius_px) + 3) ** 2
+    bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
+    return min(_FOLD_PX, max(LEAST_PX, math.isqrt(_FOLD_BYTES // bytes_a_pixel)))
 
 
 def exact(subject: Subject, occlusion: bool) -> Tensor:
@@ -217,14 +138,19 @@ def exact(subject: Subject, occlusion: bool) -> Tensor:
     return render(subject, Setting("layered", occlusion, 0.0))
 
 
-def unit_s(repeat: int = 5) -> float:
-    """Unit Y in seconds: one depthwise 17 x 17 convolution of ``[1, 16, 540, 960]`` in ``channels_last``, float32.
+def unit_work() -> Callable[[], Tensor]:
+    """What unit Y is the time of: a depthwise 17 x 17 convolution of ``[1, 16, 540, 960]``, channels last.
 
     Times in it can be compared between machines.
     """
     frame = torch.rand(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
     weight = torch.rand(16, 1, 17, 17)
-    return statistics.median(times(lambda: functional.conv2d(frame, weight, padding=8, groups=16), repeat))
+    return lambda: functional.conv2d(frame, weight, padding=8, groups=16)
+
+
+def unit_s(repeat: int = 5) -> float:
+    """Seconds of :func:`unit_work`: their median."""
+    return statistics.median(times(unit_work(), repeat))
 
 
 def render(subject: Subject, setting: Setting) -> Tensor:
@@ -271,7 +197,7 @@ def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
     """
     if setting.runtime == "torch":
         return lambda: render(subject, setting)
-    reach = max(1.0, float(math.ceil(float(subject.coc_px.abs().max()))))
+    reach = max(1.0, float(math.ceil(subject.radius_px)))
     options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
     if setting.runtime == "compiled":
         compiled = torch.compile(functools.partial(blur_by_coc, max_coc_px=reach, check=False, **options))
@@ -467,12 +393,10 @@ def _markdown(
 ) -> str:
     broken = [row.setting for row in rows if not row.keeps]
     names = "; ".join(f"{how.name}{'' if how.occlusion else ' without occlusion'}" for how in broken)
-    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {torch.get_num_threads()} threads"
-    versions = f"torchdof {importlib.metadata.version('torchdof')}, torch {torch.__version__}"
     parts = [
         "# Speed against error\n",
         f"{_title(subject)}. {subject.remark}.\n",
-        f"{machine}; {versions}, Python {platform.python_version()}, {platform.system()}.\n",
+        f"{machine()}.\n",
         f"Median and spread (interquartile range) of {repeat} renderings after one more. Y is the time of one "
         f"depthwise 17 x 17 convolution of 1 x 16 x 540 x 960, {1e3 * unit:.3g} ms in this run. MiB is the growth of "
         "resident memory. RMS (of 255), PSNR and SSIM are display-encoded, against the exact rendering with the same "
@@ -481,16 +405,14 @@ def _markdown(
         f"**The tolerance was not kept by: {names}.**\n" if broken else "Every tolerance was kept.\n",
     ]
     for seen in (True, False):
-        lines = [["setting", *_COLUMNS], ["---"] * (len(_COLUMNS) + 1)]
-        lines += [cells for row, cells in _lines(rows) if row.setting.occlusion == seen]
-        title = f"## {'With' if seen else 'Without'} occlusion\n"
-        parts += [title, *("| " + " | ".join(line).replace("*", "\\*") + " |" for line in lines), ""]
+        lines = [["setting", *_COLUMNS], *(cells for row, cells in _lines(rows) if row.setting.occlusion == seen)]
+        table = markdown(lines).replace("*", "\\*")
+        parts += [f"## {'With' if seen else 'Without'} occlusion\n", table, ""]
     if growth:
-        head, *body = growth
         parts += [
             "## How cost grows\n",
             "The same scene at 1/255 with other largest radii, and in smaller frames, as blurred for their width.\n",
-            *("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)),
+            markdown(growth),
             "",
         ]
     return "\n".join(parts)

@@ -1,0 +1,112 @@
+"""What speed is measured on: a scene that is built in, or one from files."""
+
+import dataclasses
+from pathlib import Path
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .camera import Camera
+from .depthmap import depth_from_values, resolve_holes
+from .files import read_image, read_values
+from .render import RenderSettings
+from .scenes import posts, waves
+
+__all__ = ["LEAST_PX", "Subject", "from_files", "shipped"]
+
+LEAST_PX = 16
+"""Smallest side of a subject."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What is rendered.
+
+    Args:
+        name: For the report.
+        image: ``[1, C, H, W]``, linear light, without alpha.
+        coc_px: ``[1, 1, H, W]``, signed radius in pixels.
+        remark: Camera and focus, in words.
+    """
+
+    name: str
+    image: Tensor
+    coc_px: Tensor
+    remark: str = ""
+
+    def __post_init__(self) -> None:
+        height, width = self.image.shape[-2:]
+        if self.coc_px.shape[-2:] != (height, width):
+            h, w = self.coc_px.shape[-2:]
+            raise ValueError(f"{self.name}: depth is {w} x {h} pixels but the image is {width} x {height}")
+        if min(height, width) < LEAST_PX:
+            raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {LEAST_PX} pixels a side on")
+
+    @property
+    def radius_px(self) -> float:
+        """Largest radius of the circle of confusion."""
+        return float(self.coc_px.abs().max())
+
+    def blurred(self, radius_px: float) -> "Subject":
+        """As blurred as this, relative to the largest radius, which is ``radius_px``."""
+        return dataclasses.replace(self, coc_px=self.coc_px * (radius_px / self.radius_px))
+
+    def resized(self, height: int, width: int) -> "Subject":
+        """The same picture in a frame of another size, as blurred for its width."""
+        how = "area" if height < self.image.shape[-2] else "bilinear"
+        image = functional.interpolate(self.image, (height, width), mode=how)
+        coc = functional.interpolate(self.coc_px, (height, width), mode="nearest")  # no radius that no surface has
+        return dataclasses.replace(self, image=image, coc_px=coc * (width / self.image.shape[-1]))
+
+    def crop(self, side: int) -> "Subject":
+        """The square in the middle, at most ``side`` pixels wide."""
+        height, width = self.image.shape[-2:]
+        rows, columns = (slice((n - min(side, n)) // 2, (n + min(side, n)) // 2) for n in (height, width))
+        return dataclasses.replace(self, image=self.image[..., rows, columns], coc_px=self.coc_px[..., rows, columns])
+
+
+def shipped(height: int = 540, width: int = 960) -> Subject:
+    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m, with a blur radius of up to a 60th of the width.
+
+    Example:
+        >>> shipped(54, 96).image.shape
+        torch.Size([1, 3, 54, 96])
+    """
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, width)), indexing="ij")
+    near = posts(width / 6, width / 40)(x, y)
+    light = torch.where(near, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]
+    depth = torch.where(near, 1.0 / (1.0 + 0.1 * x / width), 1.0 / (0.1 + 0.9 * y / height)).float()[None, None]
+    camera = Camera(50.0, 1.0, focus_m=1.0 / 0.6)  # the blur is as large far away as at the posts
+    camera = camera.replace(f_number=float(camera.coc_px(depth, width).abs().max()) / (width / 60))
+    return Subject("slope with posts", light, camera.coc_px(depth, width), f"{camera!r}")
+
+
+def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:
+    """An image and its depth from files; alpha is left out.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        how: Camera and depth as for ``torchdof render``; without a focus it is at the median depth, so that there is
+            blur on both sides.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read.
+    """
+    picture = read_image(image, how.transfer, how.layer)
+    values = picture.depth if depth is None else read_values(depth, how.depth_channel)
+    if values is None:
+        raise ValueError(f"{image}: has no depth channel; name a depth file after it: torchdof bench IMAGE DEPTH")
+    values = depth_from_values(values, how.depth_kind, scale=how.depth_scale, offset=how.depth_offset)
+    values, _ = resolve_holes(values, str(depth or image), how.fill)
+    light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
+    if how.depth_kind == "coc":
+        return Subject(image.name, light, values, "blur as given")
+    focus = "focus as stated"
+    if how.focus is None:
+        focus, how = "focus at the median depth", dataclasses.replace(how, focus=[(0, float(values.median()))])
+    camera, remarks = how.camera(picture.metadata, light.shape[-1], 0)
+    words = f"{camera!r}; {', '.join([focus, *remarks])}"
+    return Subject(image.name, light, camera.coc_px(values, light.shape[-1]), words)
