@@ -52,9 +52,10 @@ def test_a_post_in_front_draws_its_shadow_where_its_rays_pass(coc_px: float, pos
             assert lands == pytest.approx(0.05 + LAMP * float(kernel[half, half + dx]), rel=0.1), f"ray at {dx}"
 
 
-def test_a_ray_meets_every_nearer_surface_in_its_way() -> None:
+@pytest.mark.parametrize(("stretch", "half"), [(1.0, 9), (8.0, 40)])  # a patch of rays and bins with bits of their own
+def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) -> None:
     made = torch.Generator().manual_seed(1)
-    height, width, half = 90, 131, 9
+    height, width = 90, 131
     coc_px = torch.full((1, 1, height, width), 9.0, dtype=torch.float64)
     coc_px[..., :50] = -2.3
     for top, left, near in ((10, 110, -6.0), (60, 70, 3.1), (20, 66, 5.0)):
@@ -62,13 +63,14 @@ def test_a_ray_meets_every_nearer_surface_in_its_way() -> None:
     at = torch.randint(height * width, (40,), generator=made)
     at[0] = 45 * width + 8  # far from all that is as far away as it is
     row, column = at // width, at % width
-    coc = torch.tensor([9.0, 4.5, -1.5, 1.1], dtype=torch.float64).repeat(10)
+    coc = stretch * torch.tensor([9.0, 4.5, -1.5, 1.1], dtype=torch.float64).repeat(10)
+    coc_px = stretch * coc_px
     step = torch.arange(-half, half + 1)
     surfaces = highlights._Surfaces(coc_px)
     blocked = surfaces.blocked(coc, torch.zeros_like(at), row, column, step)
 
     wanted = torch.zeros_like(blocked)
-    for k in range(20):
+    for k in range(int(20 * stretch)):
         here = (1.0 - (coc_px - surfaces.low - k).abs()).clamp_min(0.0).expand(len(at), -1, -1, -1)
         scale = (1.0 - (surfaces.low + k) / coc)[:, None]
         y = ((row[:, None] + step * scale) * 2 / (height - 1) - 1)[:, :, None].expand_as(wanted)

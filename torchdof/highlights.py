@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import max_around, max_of_blocks, places
+from .pool import any_around, any_of_blocks, max_around, max_of_blocks, places
 from .table import BlurTable
 
 __all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
@@ -30,7 +30,9 @@ _CELL = 32  # pixels over which light is averaged to tell what is ordinary
 _COARSE_CELL = 8  # pixels in which the nearest surface is looked for
 _NEARER_PX = 1.5  # difference in coc from which on a surface is another one, in front
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
-_TAPS = 2**20  # rays traced together
+_TAPS = 2**21  # rays traced together
+_PATCH = 16  # rays a side that are looked at together
+_CLASSES = 62  # of coc, a bit each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,9 +217,14 @@ def _something_nearer(at: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
 
 def _cells(values: Tensor) -> Tensor:
     """Largest of ``[B, 1, H, W]`` in cells of so many pixels a side, the last ones cut off by the border."""
+    return max_of_blocks(_whole_cells(values), _COARSE_CELL)
+
+
+def _whole_cells(values: Tensor) -> Tensor:
+    """``[B, 1, H, W]`` with its last values repeated, up to sides that are multiples of a cell's."""
     height, width = values.shape[-2:]
     ends = (0, -width % _COARSE_CELL, 0, -height % _COARSE_CELL)
-    return max_of_blocks(functional.pad(values, ends, mode="replicate"), _COARSE_CELL)
+    return functional.pad(values, ends, mode="replicate")
 
 
 class _Surfaces:
@@ -230,41 +237,77 @@ class _Surfaces:
         below = self.place.detach().floor().long()
         self.bins = (torch.bincount(below) > 0).nonzero()[:, 0].tolist()
         self.bins = sorted({*self.bins, *(k + 1 for k in self.bins)})
-        self.ends = [_cells((coc_px.detach() - self.low) * sign) for sign in (-1, 1)]
+        self.width = max(1.0, (self.bins[-1] + 1) / _CLASSES)
+        classes = (_whole_cells(coc_px.detach() - self.low) / self.width).long()[:, 0]
+        self.cells = any_of_blocks(torch.ones_like(classes) << classes, _COARSE_CELL)
+        self.around: dict[int, Tensor] = {}
 
     def blocked(self, coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor) -> Tensor:
-        """Share of each ray ``[n, k, k]`` that nearer surfaces take."""
-        height, width = self.size
-        blocked = coc.new_zeros(len(coc), len(step), len(step))
-        y, x = row[:, None].to(coc.dtype), column[:, None].to(coc.dtype)
-        # least and greatest place of what a ray can meet
-        reach = len(step) // 2 * float((1.0 - self.low / coc.detach()).abs().max())
-        radius = min(math.ceil(reach / _COARSE_CELL) + 1, max(self.ends[0].shape[-2:]))
-        cell = (item, 0, row // _COARSE_CELL, column // _COARSE_CELL)
-        least, most = (sign * max_around(end, radius)[cell] for sign, end in zip((-1, 1), self.ends, strict=True))
+        """Share of each ray ``[n, k, k]`` that nearer surfaces take.
+
+        Rays of a pixel are looked at in patches, each only for the surfaces there are where the patch looks.
+        """
+        side = -(-len(step) // max(1, round(len(step) / _PATCH)))
+        patches = -(-len(step) // side)
+        blocked = coc.new_zeros(len(coc), patches, patches, side, side)
+        flat = blocked.view(-1, side, side)
+        offset = torch.arange(side, device=coc.device)
+        start = step[0] + side * torch.arange(patches, device=coc.device)
+        middle = start + (side - 1) / 2
         for k in self.bins:
             behind = coc - _NEARER_PX >= self.low + k
             if not bool(behind.any()):
                 break
-            meets = behind & (least < k + 1) & (most > k - 1)
-            if not bool(meets.any()):
+            scale = 1.0 - (self.low + k) / coc
+            reach = (side - 1) / 2 * float(scale.detach()[behind].abs().max())
+            which = self._meets(k, reach, item, row, column, scale, middle, behind)
+            if len(which) == 0:
                 continue
-            scale = (1.0 - (self.low + k) / coc[meets])[:, None]
-            at_y = (y[meets] + step * scale).clamp(0, height - 1)  # surfaces go on beyond the border
-            at_x = (x[meets] + step * scale).clamp(0, width - 1)
-            top, left = at_y.floor(), at_x.floor()
-            down, right = (at_y - top)[:, :, None], (at_x - left)[:, None, :]
-            first = item[meets][:, None] * height
-            rows = [(first + r.long().clamp(max=height - 1)) * width for r in (top, top + 1)]
-            columns = [c.long().clamp(max=width - 1) for c in (left, left + 1)]
-            upper, lower = (
-                self._share(r[:, :, None] + columns[0][:, None, :], k) * (1 - right)
-                + self._share(r[:, :, None] + columns[1][:, None, :], k) * right
-                for r in rows
-            )
-            blocked = blocked.index_add(0, meets.nonzero()[:, 0], upper * (1 - down) + lower * down)
-        return blocked.clamp(max=1.0)
+            ray, patch = which // patches**2, which % patches**2
+            along, first = scale[ray][:, None], item[ray][:, None]
+            at_y = row[ray][:, None] + (start[patch // patches][:, None] + offset) * along
+            at_x = column[ray][:, None] + (start[patch % patches][:, None] + offset) * along
+            flat.index_add_(0, which, self._share(first, at_y, at_x, k))
+        blocked = blocked.transpose(2, 3).reshape(len(coc), patches * side, patches * side)
+        return blocked[:, : len(step), : len(step)].clamp(max=1.0)
 
-    def _share(self, at: Tensor, k: int) -> Tensor:
-        """How much of pixels lies in bin k."""
-        return (1.0 - (self.place.index_select(0, at.flatten()).view(at.shape) - k).abs()).clamp_min(0.0)
+    def _meets(
+        self,
+        k: int,
+        reach: float,
+        item: Tensor,
+        row: Tensor,
+        column: Tensor,
+        scale: Tensor,
+        middle: Tensor,
+        behind: Tensor,
+    ) -> Tensor:
+        """Patches in whose surroundings something may lie in bin k: flat indices in ``[n, patches, patches]``."""
+        height, width = self.size
+        radius = min(math.ceil((reach + 1.0) / _COARSE_CELL), max(self.cells.shape[-2:]))
+        if radius not in self.around:
+            self.around[radius] = any_around(self.cells, radius)
+        found = self.around[radius]
+        steps = scale.detach()[:, None] * middle
+        rows = (row[:, None] + steps).clamp(0, height - 1).long() // _COARSE_CELL
+        columns = (column[:, None] + steps).clamp(0, width - 1).long() // _COARSE_CELL
+        cell = (item[:, None] * found.shape[-2] + rows)[:, :, None] * found.shape[-1] + columns[:, None, :]
+        first, last = (min(int(max(0, at) / self.width), _CLASSES - 1) for at in (k - 1, k + 1))
+        wanted = (2 << last) - (1 << first)
+        return (((found.flatten()[cell] & wanted) != 0) & behind[:, None, None]).flatten().nonzero()[:, 0]
+
+    def _share(self, item: Tensor, at_y: Tensor, at_x: Tensor, k: int) -> Tensor:
+        """How much of what the image shows at places lies in bin k: ``[n, rows, columns]``."""
+        height, width = self.size
+        at_y, at_x = at_y.clamp(0, height - 1), at_x.clamp(0, width - 1)  # surfaces go on beyond the border
+        top, left = at_y.floor(), at_x.floor()
+        down, right = (at_y - top)[:, :, None], (at_x - left)[:, None, :]
+        rows = [((item * height + r.long().clamp(max=height - 1)) * width)[:, :, None] for r in (top, top + 1)]
+        columns = [c.long().clamp(max=width - 1)[:, None, :] for c in (left, left + 1)]
+
+        def share(at: Tensor) -> Tensor:
+            place = self.place.index_select(0, at.flatten()).view(at.shape)
+            return (1.0 - (place - k).abs()).clamp_min(0.0)
+
+        upper, lower = (share(r + columns[0]) * (1 - right) + share(r + columns[1]) * right for r in rows)
+        return upper * (1 - down) + lower * down

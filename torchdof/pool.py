@@ -3,14 +3,25 @@
 These come from shifted views: on a CPU several times faster than PyTorch's pooling.
 """
 
+import functools
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-__all__ = ["bands", "max_around", "max_of_blocks", "max_of_four", "mean_of_blocks", "mean_of_four", "places"]
+__all__ = [
+    "any_around",
+    "any_of_blocks",
+    "bands",
+    "max_around",
+    "max_of_blocks",
+    "max_of_four",
+    "mean_of_blocks",
+    "mean_of_four",
+    "places",
+]
 
-
+OfTwo = Callable[[Tensor, Tensor], Tensor]
 _PIXELS = 2**17  # of a band: what fits the cache
 
 
@@ -39,17 +50,32 @@ def max_around(values: Tensor, reach: int = 1) -> Tensor:
         >>> max_around(torch.tensor([[3.0, 0, 0, 1]]), 2).tolist()
         [[3.0, 3.0, 3.0, 1.0]]
     """
+    return _around(torch.maximum, values, reach)
+
+
+def any_around(bits: Tensor, reach: int = 1) -> Tensor:
+    """Bits that any of the integers around each has, so many to each side: ``[..., H, W]``.
+
+    Example:
+        >>> any_around(torch.tensor([[1, 0, 4, 2]])).tolist()
+        [[1, 5, 6, 6]]
+    """
+    return _around(torch.bitwise_or, bits, reach)
+
+
+def _around(of_two: OfTwo, values: Tensor, reach: int) -> Tensor:
+    """What is around each, joined: an operation for which it does not matter that a value occurs twice."""
     side = 2 * reach + 1
     for dim in (-2, -1):
         size = values.shape[dim]
         ends = [[values.narrow(dim, at, 1)] * reach for at in (0, size - 1)]
         values = torch.cat([*ends[0], values, *ends[1]], dim)
-        length = 1  # of what each value is the largest of
+        length = 1  # of what each value joins
         while 2 * length <= side:
             count = values.shape[dim] - length
-            values = torch.maximum(values.narrow(dim, 0, count), values.narrow(dim, length, count))
+            values = of_two(values.narrow(dim, 0, count), values.narrow(dim, length, count))
             length *= 2
-        values = torch.maximum(values.narrow(dim, 0, size), values.narrow(dim, side - length, size))
+        values = of_two(values.narrow(dim, 0, size), values.narrow(dim, side - length, size))
     return values
 
 
@@ -60,8 +86,7 @@ def max_of_four(values: Tensor) -> Tensor:
         >>> max_of_four(torch.tensor([[1.0, 2, 0, 0], [3, 0, 0, 1]])).tolist()
         [[3.0, 1.0]]
     """
-    rows = torch.maximum(values[..., 0::2, :], values[..., 1::2, :])
-    return torch.maximum(rows[..., 0::2], rows[..., 1::2])
+    return _of_four(torch.maximum, values)
 
 
 def mean_of_four(values: Tensor) -> Tensor:
@@ -93,6 +118,21 @@ def max_of_blocks(values: Tensor, scale: int) -> Tensor:
         [[15.0]]
     """
     return _of_blocks(max_of_four, values, scale)
+
+
+def any_of_blocks(bits: Tensor, scale: int) -> Tensor:
+    """Bits that any of each ``scale`` x ``scale`` integers has, a power of two, as in :func:`max_of_blocks`.
+
+    Example:
+        >>> any_of_blocks(torch.tensor([[1, 0], [4, 1]]), 2).tolist()
+        [[5]]
+    """
+    return _of_blocks(functools.partial(_of_four, torch.bitwise_or), bits, scale)
+
+
+def _of_four(of_two: OfTwo, values: Tensor) -> Tensor:
+    rows = of_two(values[..., 0::2, :], values[..., 1::2, :])
+    return of_two(rows[..., 0::2], rows[..., 1::2])
 
 
 def _of_blocks(of_four: Callable[[Tensor], Tensor], values: Tensor, scale: int) -> Tensor:
