@@ -169,6 +169,9 @@ def test_fold_gets_a_crop_whose_columns_fit() -> None:
     part = subject.crop(20)
     assert torch.equal(part.image, image[..., 90:110, 140:160])
     assert part.coc_px.shape == (1, 1, 20, 20)
+    coc[..., 3, 297] = -61.0
+    part = subject.crop(20, widest=True)
+    assert torch.equal(part.image, image[..., :20, 280:]) and part.radius_px == 61.0
 
 
 def test_bench_measures_ones_own_scene_and_writes(files: tuple[Path, Path], tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ def _errors(subject: Subject) -> Iterator[Figure]:
             for image in (render(subject, Setting("layered", occlusion, _FINE)), exact(subject, occlusion))
         )
         error = (shown.double() - wanted.double()).abs()
-        rms, rare = math.sqrt(float(error.square().mean())), float(torch.quantile(_some(error), 0.999))
+        rms, rare = math.sqrt(float(error.square().mean())), float(torch.quantile(error, 0.999))
         what = f"{size}, {_USUAL_PX:g} px{_without(occlusion)}: error at 1/255"
         yield _figure(f"{what}, RMS", "of 255", [255 * rms], 255 * _FINE)
         yield _figure(f"{what}, of 99.9 % of all values", "of 255", [255 * rare], 255 * _FINE * _WITHIN)
@@ -146,7 +146,7 @@ def _frames(subject: Subject, repeat: int) -> Iterator[Figure]:
     works: dict[Hashable, Callable[[], object]] = {"Y": unit_work()}
     works["in focus"] = functools.partial(render, subject.blurred(0.0), Setting("layered", True, _FINE))
     usual = subject.blurred(_USUAL_PX)
-    part = usual.crop(fold_side(usual)).blurred(_USUAL_PX)  # kernels as large as the frame's
+    part = usual.crop(fold_side(usual), widest=True)  # its kernels are as large as the frame's
     for occlusion in (True, False):
         for radius in _GOALS:
             setting = Setting("layered", occlusion, _FINE)
@@ -261,12 +261,6 @@ def _ratios(found: Mapping[Hashable, Sequence[float]], over: Hashable, under: Ha
 
 def _figure(what: str, unit: str, values: Sequence[float], goal: float = math.nan, at_least: bool = False) -> Figure:
     return Figure("", what, unit, *median_and_spread(values), goal, at_least)
-
-
-def _some(values: Tensor) -> Tensor:
-    """So many of the values as ``torch.quantile`` takes, evenly."""
-    flat = values.flatten()
-    return flat[:: -(-len(flat) // 2**24)]
 
 
 def _size(size: tuple[int, int]) -> str:

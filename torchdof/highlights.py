@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import any_around, any_of_blocks, max_around, max_of_blocks, places
+from .pool import any_around, any_of_blocks, bands, max_around, max_of_blocks, places
 from .table import BlurTable
 
 __all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
@@ -238,8 +238,7 @@ class _Surfaces:
         self.bins = (torch.bincount(below) > 0).nonzero()[:, 0].tolist()
         self.bins = sorted({*self.bins, *(k + 1 for k in self.bins)})
         self.width = max(1.0, (self.bins[-1] + 1) / _CLASSES)
-        classes = (_whole_cells(coc_px.detach() - self.low) / self.width).long()[:, 0]
-        self.cells = any_of_blocks(torch.ones_like(classes) << classes, _COARSE_CELL)
+        self.cells = self._cells_of_bits(_whole_cells(coc_px.detach() - self.low)[:, 0])
         self.around: dict[int, Tensor] = {}
 
     def blocked(self, coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor) -> Tensor:
@@ -259,8 +258,9 @@ class _Surfaces:
             if not bool(behind.any()):
                 break
             scale = 1.0 - (self.low + k) / coc
-            reach = (side - 1) / 2 * float(scale.detach()[behind].abs().max())
-            which = self._meets(k, reach, item, row, column, scale, middle, behind)
+            steps, reach = scale.detach()[:, None] * middle, (side - 1) / 2 * float(scale.detach()[behind].abs().max())
+            meets = self._meets(k, reach, item, row[:, None] + steps, column[:, None] + steps) & behind[:, None, None]
+            which = meets.flatten().nonzero()[:, 0]
             if len(which) == 0:
                 continue
             ray, patch = which // patches**2, which % patches**2
@@ -271,30 +271,29 @@ class _Surfaces:
         blocked = blocked.transpose(2, 3).reshape(len(coc), patches * side, patches * side)
         return blocked[:, : len(step), : len(step)].clamp(max=1.0)
 
-    def _meets(
-        self,
-        k: int,
-        reach: float,
-        item: Tensor,
-        row: Tensor,
-        column: Tensor,
-        scale: Tensor,
-        middle: Tensor,
-        behind: Tensor,
-    ) -> Tensor:
-        """Patches in whose surroundings something may lie in bin k: flat indices in ``[n, patches, patches]``."""
+    def _meets(self, k: int, reach: float, item: Tensor, at_y: Tensor, at_x: Tensor) -> Tensor:
+        """Whether within reach of places there is anything in bin k; bool ``[n, rows, columns]``, none too few."""
         height, width = self.size
         radius = min(math.ceil((reach + 1.0) / _COARSE_CELL), max(self.cells.shape[-2:]))
         if radius not in self.around:
             self.around[radius] = any_around(self.cells, radius)
         found = self.around[radius]
-        steps = scale.detach()[:, None] * middle
-        rows = (row[:, None] + steps).clamp(0, height - 1).long() // _COARSE_CELL
-        columns = (column[:, None] + steps).clamp(0, width - 1).long() // _COARSE_CELL
+        rows = at_y.clamp(0, height - 1).long() // _COARSE_CELL
+        columns = at_x.clamp(0, width - 1).long() // _COARSE_CELL
         cell = (item[:, None] * found.shape[-2] + rows)[:, :, None] * found.shape[-1] + columns[:, None, :]
         first, last = (min(int(max(0, at) / self.width), _CLASSES - 1) for at in (k - 1, k + 1))
-        wanted = (2 << last) - (1 << first)
-        return (((found.flatten()[cell] & wanted) != 0) & behind[:, None, None]).flatten().nonzero()[:, 0]
+        return (found.flatten()[cell] & ((2 << last) - (1 << first))) != 0
+
+    def _cells_of_bits(self, place: Tensor) -> Tensor:
+        """The classes that occur in each cell of ``[B, H, W]``, a bit each."""
+        one = torch.ones((), dtype=torch.int64, device=place.device)
+        return torch.cat(
+            [
+                any_of_blocks(one << (place[:, rows] / self.width).long(), _COARSE_CELL)
+                for rows in bands(place, _COARSE_CELL)
+            ],
+            1,
+        )
 
     def _share(self, item: Tensor, at_y: Tensor, at_x: Tensor, k: int) -> Tensor:
         """How much of what the image shows at places lies in bin k: ``[n, rows, columns]``."""

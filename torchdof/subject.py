@@ -59,11 +59,13 @@ class Subject:
         coc = functional.interpolate(self.coc_px, (height, width), mode="nearest")  # no radius that no surface has
         return dataclasses.replace(self, image=image, coc_px=coc * (width / self.image.shape[-1]))
 
-    def crop(self, side: int) -> "Subject":
-        """The square in the middle, at most ``side`` pixels wide."""
+    def crop(self, side: int, widest: bool = False) -> "Subject":
+        """A square at most ``side`` pixels wide: in the middle, or where the blur is widest."""
         height, width = self.image.shape[-2:]
-        rows, columns = (slice((n - min(side, n)) // 2, (n + min(side, n)) // 2) for n in (height, width))
-        return dataclasses.replace(self, image=self.image[..., rows, columns], coc_px=self.coc_px[..., rows, columns])
+        row, column = divmod(int(self.coc_px.abs().argmax()), width) if widest else (height // 2, width // 2)
+        top, left = (min(max(0, at - side // 2), max(0, n - side)) for at, n in ((row, height), (column, width)))
+        part = (..., slice(top, top + side), slice(left, left + side))
+        return dataclasses.replace(self, image=self.image[part], coc_px=self.coc_px[part])
 
 
 def shipped(height: int = 540, width: int = 960) -> Subject:
