@@ -26,13 +26,13 @@ from .files import whole_file
 from .module import blur_by_coc
 from .report import csv_of, machine, markdown
 from .scenes import read_scenes
-from .speed import Setting, exact, fold_side, median_and_spread, render, unit_work
+from .speed import Setting, exact, median_and_spread, render, unit_work
 from .subject import Subject, shipped
 
 __all__ = ["Figure", "compare", "measure_goals", "subjects"]
 
 _FRAME, _HALF, _DOUBLE, _LARGEST = (1080, 1920), (540, 960), (2160, 3840), (4320, 7680)  # height, width
-_CROP_PX = 512
+_CROP_PX, _FOLD_PX = 512, 64
 _FINE, _LOOSE = 1 / 255, 4 / 255
 _GOALS = {8.0: (10.0, 5.0), 16.0: (12.0, 6.0), 32.0: (16.0, 8.0), 64.0: (math.nan, math.nan)}  # of Y, by radius in px
 _USUAL_PX, _WIDE_PX, _CROP_RADIUS_PX = 16.0, 64.0, 8.0
@@ -146,7 +146,7 @@ def _frames(subject: Subject, repeat: int) -> Iterator[Figure]:
     works: dict[Hashable, Callable[[], object]] = {"Y": unit_work()}
     works["in focus"] = functools.partial(render, subject.blurred(0.0), Setting("layered", True, _FINE))
     usual = subject.blurred(_USUAL_PX)
-    part = usual.crop(fold_side(usual), widest=True)  # its kernels are as large as the frame's
+    part = usual.crop(_FOLD_PX, widest=True)  # its kernels are as large as the frame's
     for occlusion in (True, False):
         for radius in _GOALS:
             setting = Setting("layered", occlusion, _FINE)

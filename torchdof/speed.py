@@ -35,7 +35,6 @@ __all__ = [
     "Row",
     "Setting",
     "exact",
-    "fold_side",
     "measure",
     "measure_all",
     "median_and_spread",
@@ -116,21 +115,17 @@ class Row:
 def settings(subject: Subject, runtimes: Sequence[Runtime] = ()) -> list[Setting]:
     """What is compared on a subject: from coarse to exact with and without occlusion, and the literal scatter.
 
-    That one gets a crop from the middle, of :func:`fold_side`. Further runtimes render at 1/255.
+    That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB. Further
+    runtimes render at 1/255.
     """
-    side = fold_side(subject)
+    taps = (2 * math.ceil(subject.radius_px) + 3) ** 2
+    bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
+    side = min(_FOLD_PX, max(LEAST_PX, math.isqrt(_FOLD_BYTES // bytes_a_pixel)))
     found = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
     height, width = subject.image.shape[-2:]
     found.append(Setting("layered", True, 1 / 255, attention=(width / 2, height / 2, height / _LOOKED_AT)))
     found += [Setting("layered", seen, 1 / 255, runtime=runtime) for runtime in runtimes for seen in (True, False)]
     return [*found, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
-
-
-def fold_side(subject: Subject) -> int:
-    """Side of a crop for the literal scatter: it holds k * k columns a pixel, which here stay within 256 MiB."""
-    taps = (2 * math.ceil(subject.radius_px) + 3) ** 2
-    bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
-    return min(_FOLD_PX, max(LEAST_PX, math.isqrt(_FOLD_BYTES // bytes_a_pixel)))
 
 
 def exact(subject: Subject, occlusion: bool) -> Tensor:
