@@ -1,13 +1,14 @@
 """Highlights: crisp discs of the right radius and energy, with the shadows of what stands in their rays' way."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof import BlurTable, blur_by_coc, highlights
+from torchdof import BlurTable, blur_by_coc, highlights, metrics
 
 LAMP = 3000.0
 
@@ -134,3 +135,18 @@ def test_rays_are_differentiable_in_light_and_coc() -> None:
         values = [(blur_by_coc(a, b.requires_grad_()) * target).sum().detach() for a, b in inputs]
         slope = float(values[0] - values[1]) / (2 * step)
         assert float(gradient[0, 0, row, column]) == pytest.approx(slope, rel=1e-3)
+
+
+@pytest.mark.parametrize("normalize", [True, False])
+def test_lamps_keep_the_tolerance_where_nothing_hides_anything(normalize: bool) -> None:
+    image = torch.full((1, 3, 200, 240), 0.02)
+    for row, column in ((30, 40), (100, 120), (150, 60), (3, 180), (120, 238)):  # the last two beside the border
+        image[..., row : row + 2, column : column + 2] = 200.0
+    coc_px = torch.linspace(12.0, 20.0, 240).expand(1, 1, 200, 240).contiguous()
+    coc_px[..., 80:110, 50:60] = -14.0
+    options: dict[str, Any] = {"occlusion": False, "normalize": normalize}
+    out, exact = (metrics.display(blur_by_coc(image, coc_px, tolerance=t, **options)) for t in (1 / 255, 0))
+    error = (out - exact).abs().amax(1)
+    assert float(exact.amax()) > 0.5, "the scene tests nothing"
+    assert float(torch.quantile(error, 0.999)) < 8 / 255
+    assert float(error.square().mean().sqrt()) < 1 / 255

@@ -70,7 +70,9 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
     return frame.image(_mean(canvas, colours))
 
 
-def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, normalize: bool) -> Tensor:
+def accumulate(
+    frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, normalize: bool, traced: Tensor | None = None
+) -> Tensor:
     """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
 
     Args:
@@ -79,6 +81,7 @@ def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, norm
         blurs: Kernel and resolution of each layer.
         spread: How a layer is scattered.
         normalize: False leaves the plain sum, which is dark at the frame's border and uneven at depth edges.
+        traced: Light that was taken out of the layers and accumulated ray by ray, ``[B, C, H, W]``.
 
     Returns:
         ``[B, C, H, W]``.
@@ -88,7 +91,11 @@ def accumulate(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread, norm
     """
     colours = frame.colours
     canvas = _lay_all(frame, plan, blurs, spread, False, lambda layer: layer, torch.add)
-    return frame.image(_mean(canvas, colours) if normalize else canvas[:, :colours])
+    if traced is None:
+        return frame.image(_mean(canvas, colours) if normalize else canvas[:, :colours])
+    light, covered = frame.image(canvas).tensor_split((colours,), 1)
+    light = light + traced
+    return _mean(torch.cat([light, covered], 1), colours) if normalize else light
 
 
 def accumulate_once(frame: Frame, plan: Plan, blurs: list[Blur], normalize: bool) -> Tensor:

@@ -7,7 +7,8 @@ with coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sh
 
 Highlights are few. What exceeds the ordinary light around it is taken out of the layers, and added again as rays:
 where something nearer could stand in the way, where its layer is too coarse for a crisp edge, and at the frame's
-border, where layers make up for the light that is not seen with the light that is.
+border, where layers make up for the light that is not seen with the light that is. Without occlusion nothing stands in
+the way, and the rays' light is divided by the same sum of weights as the layers'.
 """
 
 import dataclasses
@@ -78,7 +79,7 @@ def ordinary(light: Tensor, valid: Tensor | None = None) -> Tensor:
 
 
 def take(
-    light: Tensor, coc_px: Tensor, weight: Tensor | None, limit: Tensor, nearest_px: Tensor, crisp_px: float
+    light: Tensor, coc_px: Tensor, weight: Tensor | None, limit: Tensor, nearest_px: Tensor | None, crisp_px: float
 ) -> tuple[Tensor, Rays | None]:
     """Take out of a surface the light above a limit that needs to be traced.
 
@@ -87,7 +88,7 @@ def take(
         coc_px: ``[B, 1, H, W]``.
         weight: Share of each pixel that the surface covers ``[B, 1, H, W]``; None is 1.
         limit: Largest ordinary light, ``[B, 1, H, W]``.
-        nearest_px: Coc of what each pixel shows, ``[B, 1, H, W]``.
+        nearest_px: Coc of what each pixel shows, ``[B, 1, H, W]``; None if nothing hides anything.
         crisp_px: Blurs from this radius on lose their edge in coarse layers, so they are traced in any case.
 
     Returns:
@@ -102,7 +103,9 @@ def take(
         return light, None
     place = coc_px.detach().flatten()[at]
     blur = place.abs()
-    traced = (blur >= crisp_px) | (2.0 * blur > _to_border(at, coc_px)) | _something_nearer(at, place, nearest_px)
+    traced = blur >= crisp_px
+    if nearest_px is not None:
+        traced |= (2.0 * blur > _to_border(at, coc_px)) | _something_nearer(at, place, nearest_px)
     at = at[traced & (blur > 1.0)]
     if len(at) == 0:
         return light, None
@@ -124,7 +127,7 @@ def take(
     return left, Rays(at, excess if weight is None else excess * weight.flatten()[at], coc)
 
 
-def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int) -> Tensor:
+def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int, occlusion: bool = True) -> Tensor:
     """Scatter highlights, each ray to where it lands unless a nearer surface is in its way.
 
     Args:
@@ -132,6 +135,7 @@ def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int)
         coc_px: What each pixel shows, ``[B, 1, H, W]``.
         table: Blur of the lens.
         channels: C.
+        occlusion: False lets all rays pass.
 
     Returns:
         ``[B, C, H, W]``. Differentiable in the light and coc of the rays.
@@ -141,7 +145,7 @@ def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int)
     margin = max(_half(table, float(some.coc_px.detach().abs().max()), height, width) for some in rays)
     area = (height + 2 * margin) * (width + 2 * margin)
     out = rays[0].light.new_zeros(channels, batch * area)
-    surfaces = _Surfaces(coc_px)
+    surfaces = _Surfaces(coc_px) if occlusion else None
     for some, sorted_ in zip(rays, order, strict=True):
         for chunk in _chunks(some.coc_px.detach()[sorted_], table, height, width):
             chosen = sorted_[chunk]
@@ -151,8 +155,9 @@ def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int)
             kernels = _kernels(table, coc, width, max(height, width)).to(light.dtype)  # [n, 1 or C, k, k]
             half = kernels.shape[-1] // 2
             step = torch.arange(-half, half + 1, device=at.device)
-            passes = 1.0 - surfaces.blocked(coc, item, row, column, step)
-            spread = kernels * passes.unsqueeze(1)
+            spread = kernels
+            if surfaces is not None:
+                spread = spread * (1.0 - surfaces.blocked(coc, item, row, column, step)).unsqueeze(1)
             lands = (row[:, None, None] + margin + step[:, None]) * (width + 2 * margin)
             lands = (item * area)[:, None, None] + lands + column[:, None, None] + margin + step
             for channel in range(channels):

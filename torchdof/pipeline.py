@@ -147,13 +147,20 @@ def _render(
         coc, light = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0)
     coc = _within(coc, plan)
     weight = None if valid is None else valid.to(light.dtype)
-    limit = highlights.ordinary(light, valid) if options.occlusion and len(plan.nodes) > 1 else None
-    shown = _shown(plan, options, light, coc, weight, limit, behind_light, behind_coc)
+    limit = None
+    if len(plan.nodes) > 1 and (options.occlusion or _needs_rays(plan, options, light)):
+        limit = highlights.ordinary(light, valid)
+    shown = _shown(plan, options, light, coc, weight, limit if options.occlusion else None, behind_light, behind_coc)
     rays = [] if limit is None or not plan.rays else _take_highlights(shown, plan, options, limit, coc)
-    out = _composite(shown, plan, options, behind_light is not None)
-    if rays:
-        out = out + highlights.trace(rays, coc, options.table, light.shape[1])
+    traced = highlights.trace(rays, coc, options.table, light.shape[1], options.occlusion) if rays else None
+    out = _composite(shown, plan, options, behind_light is not None, traced)
     return out if valid is None else torch.where(valid, out, image)
+
+
+def _needs_rays(plan: Plan, options: Options, light: Tensor) -> bool:
+    """Whether without occlusion a light may be too bright for a coarse layer: brighter than a display shows."""
+    coarse = plan.rays and options.method == "layered" and plan.crisp_px < max(abs(c) for c in plan.coc_px)
+    return coarse and bool((light.detach() > 1.0).any())
 
 
 def _shown(
@@ -181,7 +188,7 @@ def _take_highlights(shown: _Shown, plan: Plan, options: Options, limit: Tensor,
     rays = []
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
     for i, (light, place, weight) in enumerate(shown.surfaces):
-        left, some = highlights.take(light, place, weight, limit, coc, crisp_px)
+        left, some = highlights.take(light, place, weight, limit, coc if options.occlusion else None, crisp_px)
         shown.surfaces[i] = (left, place, weight)
         rays += [] if some is None else [some]
     return rays
@@ -205,8 +212,8 @@ def _before(
     return [(other, other_coc, share), (own, coc, seen), (behind, behind_coc, behind_weight)]
 
 
-def _composite(shown: _Shown, plan: Plan, options: Options, independent: bool) -> Tensor:
-    """Render what is shown. Takes it over: the frame copies it to give it a margin."""
+def _composite(shown: _Shown, plan: Plan, options: Options, independent: bool, traced: Tensor | None = None) -> Tensor:
+    """Render what is shown, and the light of rays. Takes it over: the frame copies it to give it a margin."""
     light = shown.surfaces[0][0]
     layered = options.method == "layered"
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
@@ -227,10 +234,11 @@ def _composite(shown: _Shown, plan: Plan, options: Options, independent: bool) -
 
     def rendered(frame: Frame, blurs: list[Blur]) -> Tensor:
         if options.occlusion:
-            return composite.over(frame, plan, blurs, layers_by_conv if layered else layers_by_fold)
+            out = composite.over(frame, plan, blurs, layers_by_conv if layered else layers_by_fold)
+            return out if traced is None else out + traced
         if not layered:
             return composite.accumulate_once(frame, plan, blurs, options.normalize)
-        return composite.accumulate(frame, plan, blurs, layers_by_conv, options.normalize)
+        return composite.accumulate(frame, plan, blurs, layers_by_conv, options.normalize, traced)
 
     return tile_by_tile(frame, blurs, rendered) if exporting else rendered(frame, blurs)
 
