@@ -52,6 +52,11 @@ def test_a_goal_is_missed_beyond_it(value: float, goal: float, at_least: bool, m
     assert Figure("a", "b", "Y", value, 0.0, goal, at_least).missed == missed
 
 
+def test_large_figures_are_written_out() -> None:
+    written = [goals._measured(Figure("a", "b", "ms", *pair)) for pair in ((1716.4, 472.2), (3.14159, 0.123))]
+    assert written == ["1716 ± 472", "3.14 ± 0.12"]
+
+
 def test_turns_go_through_all_works_and_the_first_only_warms_up() -> None:
     calls: list[str] = []
     found = goals._in_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 2)

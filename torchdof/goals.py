@@ -276,7 +276,8 @@ def _goal(figure: Figure) -> str:
 
 
 def _measured(figure: Figure) -> str:
-    return f"{figure.value:.3g} ± {figure.spread:.2g}"
+    value, spread = (f"{x:.0f}" if x >= 100 else f"{x:.{n}g}" for x, n in ((figure.value, 3), (figure.spread, 2)))
+    return f"{value} ± {spread}"
 
 
 def _lines(figures: Sequence[Figure]) -> list[list[str]]:
