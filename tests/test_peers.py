@@ -130,7 +130,7 @@ def test_bench_measures_peers_beside_torchdof(tmp_path: Path) -> None:
     assert float(times.split()[0]) == pytest.approx(ratio, rel=0.01)
     assert float(gains.split()[0]) == pytest.approx(gain, abs=0.01)
     assert (faster, nearer) == ("1 of 1", f"{int(gain > 0)} of 1")
-    assert f" {torch.get_num_threads()} threads;" in text and "after one more: 1." in text
+    assert f"threads for each renderer: {torch.get_num_threads()};" in text and "after one more: 1." in text
     for said in (
         "toy (7): a note",
         "absent: not installed: apt install absent",

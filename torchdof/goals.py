@@ -4,7 +4,6 @@ What is compared is timed in turns, so that whatever else the machine does meets
 median, and the interquartile range, of the ratios within the turns.
 """
 
-import contextlib
 import dataclasses
 import functools
 import itertools
@@ -22,9 +21,8 @@ from torch import Tensor
 
 from . import memory, metrics
 from .arguments import whole
-from .files import whole_file
 from .module import blur_by_coc
-from .report import csv_of, machine, markdown
+from .report import csv_of, machine, markdown, write
 from .scenes import read_scenes
 from .speed import Setting, exact, median_and_spread, render, unit_work
 from .subject import Subject, shipped
@@ -108,10 +106,7 @@ def compare(scenes: Path, out: Path | None, repeat: int) -> None:
         _show(found)  # the next one takes a minute
         figures += found
     if out is not None:
-        with contextlib.ExitStack() as files:  # both of them or none
-            csv_file, md_file = (files.enter_context(whole_file(out / f"goals.{s}")) for s in ("csv", "md"))
-            csv_file.write_text(csv_of(figures), encoding="utf-8")
-            md_file.write_text(_markdown(figures, repeat), encoding="utf-8")
+        write(out, "goals", {"csv": csv_of(figures), "md": _markdown(figures, repeat)})
     Console().print(f"{machine()}. {_remark(figures, repeat)}", markup=False, highlight=False)
 
 
@@ -148,8 +143,8 @@ def _frames(subject: Subject, repeat: int) -> Iterator[Figure]:
     usual = subject.blurred(_USUAL_PX)
     part = usual.crop(_FOLD_PX, widest=True)  # its kernels are as large as the frame's
     for occlusion in (True, False):
+        setting = Setting("layered", occlusion, _FINE)
         for radius in _GOALS:
-            setting = Setting("layered", occlusion, _FINE)
             works[radius, occlusion] = functools.partial(render, subject.blurred(radius), setting)
         works["loose", occlusion] = functools.partial(render, usual, Setting("layered", occlusion, _LOOSE))
         works["fold", occlusion] = functools.partial(render, part, Setting("fold", occlusion, _FINE))
@@ -292,7 +287,7 @@ def _lines(figures: Sequence[Figure]) -> list[list[str]]:
 
 
 def _remark(figures: Sequence[Figure], repeat: int) -> str:
-    asked = [figure for figure in figures if figure.goal == figure.goal]
+    asked = [figure for figure in figures if not math.isnan(figure.goal)]
     return (
         f"Median and spread (interquartile range) of {repeat} turns after one more, each figure from within the turns; "
         "the errors from one rendering, memory and time of the largest frame from two. Y: one depthwise 17 x 17 "

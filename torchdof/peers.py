@@ -12,7 +12,6 @@ A peer is a Python file in a folder (``examples/peers`` in the repository)::
 Files that start with an underscore are left alone.
 """
 
-import contextlib
 import dataclasses
 import functools
 import importlib.util
@@ -32,9 +31,8 @@ from torch import Tensor
 
 from . import metrics
 from .arguments import whole
-from .files import whole_file
 from .module import blur_by_coc
-from .report import csv_of, machine, markdown
+from .report import csv_of, machine, markdown, write
 from .scenes import Scene, read_scenes
 from .speed import median_and_spread
 
@@ -206,10 +204,7 @@ def compare(scenes: Path, folder: Path, out: Path | None, repeat: int) -> None:
         rows += measure(scene, compared, repeat)
     absent = {name: reason for name, reason in wrong.items() if reason is not None}
     if out is not None:
-        with contextlib.ExitStack() as files:  # both of them or none
-            csv_file, md_file = (files.enter_context(whole_file(out / f"peers.{s}")) for s in ("csv", "md"))
-            csv_file.write_text(csv_of(rows), encoding="utf-8")
-            md_file.write_text(_markdown(rows, compared, absent, repeat), encoding="utf-8")
+        write(out, "peers", {"csv": csv_of(rows), "md": _markdown(rows, compared, absent, repeat)})
     _show(rows, compared, absent, repeat)
 
 
@@ -276,11 +271,15 @@ _ERRORS = "PSNR in dB against the truth: display-encoded (clipped to [0, 1], sRG
 _RATIOS = f"Against ours at {_LEVELS[-1]:g}/255: median over the cases (least to greatest)"
 
 
+def _machine() -> str:
+    return machine(f"threads for each renderer: {torch.get_num_threads()}")
+
+
 def _markdown(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, str], repeat: int) -> str:
     head = ["case", *_names(rows)]
     parts = [
         "# Beside other tools\n",
-        f"{machine()}. Timed renderings of each, in turns, after one more: {repeat}.\n",
+        f"{_machine()}. Timed renderings of each, in turns, after one more: {repeat}.\n",
         *(f"- {peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared),
         *(f"- {name}: {reason}" for name, reason in absent.items()),
     ]
@@ -301,7 +300,7 @@ def _show(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, str],
         for line in lines:
             table.add_row(*line)
         console.print(table)
-    console.print(f"{machine()}; timed renderings of each: {repeat}.", markup=False, highlight=False)
+    console.print(f"{_machine()}; timed renderings of each: {repeat}.", markup=False, highlight=False)
     for peer in compared[len(_LEVELS) :]:
         console.print(f"{peer.name} {peer.version}: {peer.note}", markup=False, highlight=False)
     for name, reason in absent.items():

@@ -159,8 +159,13 @@ def _render(
 
 def _needs_rays(plan: Plan, options: Options, light: Tensor) -> bool:
     """Whether without occlusion a light may be too bright for a coarse layer: brighter than a display shows."""
-    coarse = plan.rays and options.method == "layered" and plan.crisp_px < max(abs(c) for c in plan.coc_px)
+    coarse = plan.rays and _crisp_px(plan, options) < max(abs(c) for c in plan.coc_px)
     return coarse and bool((light.detach() > 1.0).any())
+
+
+def _crisp_px(plan: Plan, options: Options) -> float:
+    """Radius from which on layers soften highlights."""
+    return plan.crisp_px if options.method == "layered" else math.inf
 
 
 def _shown(
@@ -186,7 +191,7 @@ def _shown(
 def _take_highlights(shown: _Shown, plan: Plan, options: Options, limit: Tensor, coc: Tensor) -> list[highlights.Rays]:
     """Take the highlights that must be traced out of what is shown."""
     rays = []
-    crisp_px = plan.crisp_px if options.method == "layered" else math.inf
+    crisp_px = _crisp_px(plan, options)
     for i, (light, place, weight) in enumerate(shown.surfaces):
         left, some = highlights.take(light, place, weight, limit, coc if options.occlusion else None, crisp_px)
         shown.surfaces[i] = (left, place, weight)

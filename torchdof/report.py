@@ -1,5 +1,6 @@
 """What every report of ``torchdof bench`` has: the machine it is from, tables as CSV and as Markdown."""
 
+import contextlib
 import csv
 import dataclasses
 import importlib.metadata
@@ -7,20 +8,24 @@ import io
 import os
 import platform
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
+from .files import whole_file
+
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-__all__ = ["csv_of", "machine", "markdown"]
+__all__ = ["csv_of", "machine", "markdown", "write"]
 
 
-def machine() -> str:
-    """Hardware, threads and versions."""
+def machine(threads: str = "") -> str:
+    """Hardware, threads and versions; ``threads`` says more of the threads than their number."""
+    threads = threads or f"{torch.get_num_threads()} threads"
     return (
-        f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {torch.get_num_threads()} threads; "
+        f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {threads}; "
         f"torchdof {importlib.metadata.version('torchdof')}, torch {torch.__version__}, "
         f"Python {platform.python_version()}, {platform.system()}"
     )
@@ -36,6 +41,17 @@ def csv_of(rows: Iterable["DataclassInstance"]) -> str:
             writer.writerow(head)
         writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in dataclasses.astuple(row)])
     return text.getvalue()
+
+
+def write(folder: Path, name: str, texts: dict[str, str]) -> None:
+    """Writes files of one name, a text for each suffix: all of them or none.
+
+    Raises:
+        OSError: If a file cannot be written.
+    """
+    with contextlib.ExitStack() as files:
+        for suffix, text in texts.items():
+            files.enter_context(whole_file(folder / f"{name}.{suffix}")).write_text(text, encoding="utf-8")
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:
