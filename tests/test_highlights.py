@@ -53,8 +53,9 @@ def test_a_post_in_front_draws_its_shadow_where_its_rays_pass(coc_px: float, pos
             assert lands == pytest.approx(0.05 + LAMP * float(kernel[half, half + dx]), rel=0.1), f"ray at {dx}"
 
 
+@pytest.mark.parametrize("side", [1, 2, 4])
 @pytest.mark.parametrize(("stretch", "half"), [(1.0, 9), (8.0, 40)])  # a patch of rays and bins with bits of their own
-def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) -> None:
+def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int, side: int) -> None:
     made = torch.Generator().manual_seed(1)
     height, width = 90, 131
     coc_px = torch.full((1, 1, height, width), 9.0, dtype=torch.float64)
@@ -68,19 +69,67 @@ def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) 
     coc_px = stretch * coc_px
     step = torch.arange(-half, half + 1)
     surfaces = highlights._Surfaces(coc_px)
-    blocked = surfaces.blocked(coc, torch.zeros_like(at), row, column, step)
+    light = torch.rand(len(at), 1, side, side, dtype=torch.float64, generator=made)
+    blocked = surfaces.blocked(highlights._Sources(torch.zeros_like(at), row, column, coc, light), step)
+    down, right = (  # the rays come from the middle of the light
+        torch.stack([(part * torch.arange(side)).sum() / part.sum() for part in light[:, 0].sum(dim)])[:, None]
+        for dim in (2, 1)
+    )
 
     wanted = torch.zeros_like(blocked)
     for k in range(int(20 * stretch)):
         here = (1.0 - (coc_px - surfaces.low - k).abs()).clamp_min(0.0).expand(len(at), -1, -1, -1)
         scale = (1.0 - (surfaces.low + k) / coc)[:, None]
-        y = ((row[:, None] + step * scale) * 2 / (height - 1) - 1)[:, :, None].expand_as(wanted)
-        x = ((column[:, None] + step * scale) * 2 / (width - 1) - 1)[:, None, :].expand_as(wanted)
+        y, x = row[:, None] + down + (step - down) * scale, column[:, None] + right + (step - right) * scale
+        y, x = (y * 2 / (height - 1) - 1)[:, :, None], (x * 2 / (width - 1) - 1)[:, None, :]
+        y, x = y.expand_as(wanted), x.expand_as(wanted)
         seen = functional.grid_sample(here, torch.stack([x, y], -1), padding_mode="border", align_corners=True)
         wanted += seen[:, 0] * (coc - 1.5 >= surfaces.low + k)[:, None, None]
     wanted = wanted.clamp(max=1.0)
     assert 0.1 < float(wanted.mean()) < 0.9, "the scene tests nothing"
     torch.testing.assert_close(blocked, wanted, rtol=0, atol=1e-9)
+
+
+def lamps(size: int, gap: int, post_px: float) -> tuple[list[highlights.Rays], Tensor]:
+    """Lamps so large and so far apart, every other pixel of another blur and surface; coc with posts before them."""
+    coc_px = torch.full((1, 1, 150, 170), 43.0)
+    coc_px[..., 20:26] = coc_px[..., 90:94] = post_px
+    offset = torch.arange(size)
+    first = 61 + gap * torch.arange(3)
+    rows = (first[:, None] + offset).flatten()
+    at = torch.cat([(rows[:, None] * 170 + rows).flatten(), torch.tensor([149 * 170 + 169])])
+    light = torch.rand(3, len(at), generator=torch.Generator().manual_seed(4)) * 1000.0
+    coc = torch.where(torch.arange(len(at)) % 2 == 0, 43.0, 40.0)
+    return [highlights.Rays(at[i::2], light[:, i::2], coc[i::2]) for i in (0, 1)], coc_px
+
+
+@pytest.mark.parametrize(("size", "gap", "post_px"), [(1, 4, -9.0), (3, 20, 43.0)])
+def test_shared_looks_change_nothing_for_single_pixels_or_where_nothing_hides(
+    size: int, gap: int, post_px: float
+) -> None:
+    rays, coc_px = lamps(size, gap, post_px)
+    alone, two, four = (highlights.trace(rays, coc_px, BlurTable.disc(), 3, px) for px in (math.inf, 39.0, 9.0))
+    assert 0.2 < float((alone > 0).float().mean()), "the scene tests nothing"
+    torch.testing.assert_close(two, alone, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(four, alone, rtol=1e-4, atol=1e-4)
+
+
+def test_shared_looks_move_shadows_by_less_than_a_block() -> None:
+    rays, coc_px = lamps(3, 20, -9.0)
+    alone, two, four = (highlights.trace(rays, coc_px, BlurTable.disc(), 3, px) for px in (math.inf, 39.0, 9.0))
+    error = [float((shared - alone).square().mean().sqrt() / alone.square().mean().sqrt()) for shared in (two, four)]
+    assert 1e-4 < error[0] < 0.004, "two pixels a side"
+    assert error[0] < error[1] < 0.012, "four pixels a side"
+    assert float(two.sum()) == pytest.approx(float(alone.sum()), rel=1e-3)
+
+
+def test_looks_are_not_shared_where_coc_has_a_gradient() -> None:
+    rays, coc_px = lamps(3, 20, -9.0)
+    moving = [highlights.Rays(some.at, some.light, some.coc_px.clone().requires_grad_()) for some in rays]
+    alone, with_gradient = (
+        highlights.trace(some, coc_px, BlurTable.disc(), 3, px) for some, px in ((rays, math.inf), (moving, 9.0))
+    )
+    torch.testing.assert_close(with_gradient.detach(), alone, rtol=1e-4, atol=1e-4)
 
 
 def test_ordinary_light_stays_in_the_layers() -> None:

@@ -12,8 +12,9 @@ the way, and the rays' light is divided by the same sum of weights as the layers
 """
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -32,6 +33,8 @@ _COARSE_CELL = 8  # pixels in which the nearest surface is looked for
 _NEARER_PX = 1.5  # difference in coc from which on a surface is another one, in front
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
 _TAPS = 2**21  # rays traced together
+_BLOCKS = {1: 0.0, 2: 1.0, 4: 4.0}  # pixels a side whose rays look together, by blur in units of where sharing begins
+_KERNELS_PER_PX = 32  # of radius
 _PATCH = 16  # rays a side that are looked at together
 _CLASSES = 62  # of coc, a bit each
 
@@ -127,71 +130,155 @@ def take(
     return left, Rays(at, excess if weight is None else excess * weight.flatten()[at], coc)
 
 
-def trace(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int, occlusion: bool = True) -> Tensor:
+def trace(
+    rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, channels: int, shared_px: float, occlusion: bool = True
+) -> Tensor:
     """Scatter highlights, each ray to where it lands unless a nearer surface is in its way.
+
+    Neighbouring pixels of one large blur share a look for what is in the way of those of their rays that land in the
+    same place, as if these came from the middle of their light. Where gradients of the coc are recorded, none do.
 
     Args:
         rays: From :func:`take`.
         coc_px: What each pixel shows, ``[B, 1, H, W]``.
         table: Blur of the lens.
         channels: C.
+        shared_px: Blur from which on neighbours share looks.
         occlusion: False lets all rays pass.
 
     Returns:
         ``[B, C, H, W]``. Differentiable in the light and coc of the rays.
     """
     batch, _, height, width = coc_px.shape
-    order = [torch.argsort(some.coc_px.detach().abs()) for some in rays]
-    margin = max(_half(table, float(some.coc_px.detach().abs().max()), height, width) for some in rays)
-    area = (height + 2 * margin) * (width + 2 * margin)
-    out = rays[0].light.new_zeros(channels, batch * area)
+    every = Rays(*(torch.cat(parts, -1) for parts in zip(*((r.at, r.light, r.coc_px) for r in rays), strict=True)))
+    margin = _half(table, float(every.coc_px.detach().abs().max()), height, width) + max(_BLOCKS) - 1
+    across = width + 2 * margin
+    area = (height + 2 * margin) * across
+    out = every.light.new_zeros(channels, batch * area)
     surfaces = _Surfaces(coc_px) if occlusion else None
-    for some, sorted_ in zip(rays, order, strict=True):
-        for chunk in _chunks(some.coc_px.detach()[sorted_], table, height, width):
-            chosen = sorted_[chunk]
-            at, coc = some.at[chosen], some.coc_px[chosen]
-            light = some.light[:, chosen]
-            item, row, column = places(at, height, width)
-            kernels = _kernels(table, coc, width, max(height, width)).to(light.dtype)  # [n, 1 or C, k, k]
+    for sources in _by_block(every, shared_px, height, width):
+        for chunk in _chunks(sources.coc_px.detach(), sources.side, table, height, width):
+            some = sources.part(chunk)
+            kernels = _kernels(table, some.coc_px, width, max(height, width)).to(out.dtype)  # [n, 1 or C, k, k]
             half = kernels.shape[-1] // 2
-            step = torch.arange(-half, half + 1, device=at.device)
-            spread = kernels
+            step = torch.arange(-half, half + sources.side, device=out.device)
+            spread = some.spread(kernels)
             if surfaces is not None:
-                spread = spread * (1.0 - surfaces.blocked(coc, item, row, column, step)).unsqueeze(1)
-            lands = (row[:, None, None] + margin + step[:, None]) * (width + 2 * margin)
-            lands = (item * area)[:, None, None] + lands + column[:, None, None] + margin + step
+                spread = spread * (1.0 - surfaces.blocked(some, step)).unsqueeze(1)
+            lands = (some.row[:, None, None] + margin + step[:, None]) * across
+            lands = (some.item * area)[:, None, None] + lands + some.column[:, None, None] + margin + step
             for channel in range(channels):
-                tap = spread[:, channel % spread.shape[1]] * light[channel, :, None, None]
-                out[channel].index_add_(0, lands.flatten(), tap.flatten())
-    frame = out.unflatten(1, (batch, height + 2 * margin, width + 2 * margin)).transpose(0, 1)
+                out[channel].index_add_(0, lands.flatten(), spread[:, channel].flatten())
+    frame = out.unflatten(1, (batch, height + 2 * margin, across)).transpose(0, 1)
     return frame[..., margin : margin + height, margin : margin + width]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sources:
+    """Blocks of pixels, each with light of one blur in it.
+
+    Args:
+        item: ``[n]``.
+        row: Of a block's first pixel, ``[n]``.
+        column: Of a block's first pixel, ``[n]``.
+        coc_px: ``[n]``.
+        light: Of its pixels, ``[n, C, side, side]``.
+    """
+
+    item: Tensor
+    row: Tensor
+    column: Tensor
+    coc_px: Tensor
+    light: Tensor
+
+    @classmethod
+    def of_rays(cls, rays: Rays, side: int, height: int, width: int) -> "_Sources":
+        """All of some rays, by increasing blur."""
+        item, row, column = places(rays.at, height, width)
+        down, right = row % side, column % side
+        row, column = row - down, column - right
+        which = torch.arange(len(rays.at), device=rays.at.device)
+        if side > 1:
+            blur = (rays.coc_px.detach().double() * _KERNELS_PER_PX).round().long()
+            least, most = int(blur.min()), int(blur.max())
+            block = (item * height + row) * width + column
+            which = torch.unique(block * (most - least + 1) + blur - least, return_inverse=True)[1]
+        count = int(which.max()) + 1
+        light = rays.light.new_zeros(len(rays.light), count * side**2)
+        light = light.index_add(1, (which * side + down) * side + right, rays.light)
+        light = light.unflatten(1, (count, side, side)).transpose(0, 1)
+        one = torch.empty_like(which[:count]).scatter_(0, which, torch.arange(len(which), device=which.device))
+        sources = cls(item[one], row[one], column[one], rays.coc_px[one], light)
+        return sources.part(torch.argsort(sources.coc_px.detach().abs()))
+
+    @property
+    def side(self) -> int:
+        """Pixels of a block along each axis."""
+        return int(self.light.shape[-1])
+
+    def part(self, some: Tensor | slice) -> "_Sources":
+        """Some of them."""
+        return _Sources(self.item[some], self.row[some], self.column[some], self.coc_px[some], self.light[some])
+
+    def middle(self) -> tuple[Tensor, Tensor]:
+        """Rows and columns from a block's first pixel to the middle of its light, ``[n]`` each."""
+        light = self.light.detach().amax(1).clamp_min(0.0)
+        light = light / light.amax((1, 2), keepdim=True).clamp_min(torch.finfo(light.dtype).tiny)
+        step, whole = torch.arange(self.side, device=light.device), light.sum((1, 2)).clamp_min(1.0)
+        return (light.sum(2) * step).sum(1) / whole, (light.sum(1) * step).sum(1) / whole
+
+    def spread(self, kernels: Tensor) -> Tensor:
+        """Their light where it lands, for kernels ``[n, 1 or C, k, k]``: ``[n, C, k + side - 1, k + side - 1]``."""
+        if self.side == 1:
+            return kernels * self.light
+        count, channels, side, _ = self.light.shape
+        length = kernels.shape[-1]
+        out = self.light.new_zeros(count, channels, length + side - 1, length + side - 1)
+        for y, x in itertools.product(range(side), repeat=2):
+            out[..., y : y + length, x : x + length].addcmul_(kernels, self.light[..., y : y + 1, x : x + 1])
+        return out
+
+
+def _by_block(rays: Rays, shared_px: float, height: int, width: int) -> Iterator[_Sources]:
+    """Rays by the size of the blocks that their blur allows for."""
+    if torch.is_grad_enabled() and rays.coc_px.requires_grad:
+        yield _Sources.of_rays(rays, 1, height, width)
+        return
+    blur, ends = rays.coc_px.detach().abs() / shared_px, [*_BLOCKS.values(), math.inf]
+    for side, least, end in zip(_BLOCKS, ends, ends[1:], strict=False):
+        some = ((blur >= least) & (blur < end)).nonzero()[:, 0]
+        if len(some):
+            yield _Sources.of_rays(Rays(rays.at[some], rays.light[:, some], rays.coc_px[some]), side, height, width)
 
 
 def _half(table: BlurTable, coc_px: float, height: int, width: int) -> int:
     return min(math.ceil(table.reach_px(coc_px, width) + 0.5), max(height, width) - 1)
 
 
-def _chunks(sorted_coc: Tensor, table: BlurTable, height: int, width: int) -> list[slice]:
-    """Rays of increasing blur in parts of a bounded number of taps."""
+def _chunks(sorted_coc: Tensor, side: int, table: BlurTable, height: int, width: int) -> list[slice]:
+    """Blocks of increasing blur in parts of a bounded number of taps."""
+
+    def most(which: int) -> int:
+        """Blocks of such a blur."""
+        half = _half(table, float(sorted_coc[which].abs()), height, width)
+        return max(1, _TAPS // (2 * half + side) ** 2)
+
     chunks, start = [], 0
     while start < len(sorted_coc):
-        stop = start
-        # the first guess is for the first ray; the last ray of the part needs the widest kernel
-        count = _TAPS // (2 * _half(table, float(sorted_coc[start].abs()), height, width) + 1) ** 2
-        stop = min(len(sorted_coc), start + max(1, count))
-        widest = 2 * _half(table, float(sorted_coc[stop - 1].abs()), height, width) + 1
-        stop = min(stop, start + max(1, _TAPS // widest**2))
+        # the first guess is for the first block; the last one of the part needs the widest kernel
+        stop = min(len(sorted_coc), start + most(start))
+        stop = min(stop, start + most(stop - 1))
         chunks.append(slice(start, stop))
         start = stop
     return chunks
 
 
 def _kernels(table: BlurTable, coc: Tensor, width: int, largest: int) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]``, each as exact as 1/32 px of radius where no gradient asks for more."""
+    """Kernels ``[n, 1 or C, k, k]``, each for the nearest of so many radii a pixel where no gradient asks for more."""
     if torch.is_grad_enabled() and coc.requires_grad:
         kernels = table.kernels(coc, width)
     else:
-        values, which = torch.unique((coc.double() * 32).round() / 32, return_inverse=True)
+        values, which = torch.unique((coc.double() * _KERNELS_PER_PX).round() / _KERNELS_PER_PX, return_inverse=True)
         kernels = table.kernels(values.cpu(), width).to(coc.device)[which]
     spare = max(0, kernels.shape[-1] // 2 - (largest - 1))
     return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
@@ -246,33 +333,39 @@ class _Surfaces:
         self.cells = self._cells_of_bits(_whole_cells(coc_px.detach() - self.low)[:, 0])
         self.around: dict[int, Tensor] = {}
 
-    def blocked(self, coc: Tensor, item: Tensor, row: Tensor, column: Tensor, step: Tensor) -> Tensor:
-        """Share of each ray ``[n, k, k]`` that nearer surfaces take.
+    def blocked(self, sources: _Sources, step: Tensor) -> Tensor:
+        """Share of each ray that nearer surfaces take, ``[n, k, k]`` for rays that land so many pixels from the first.
 
-        Rays of a pixel are looked at in patches, each only for the surfaces there are where the patch looks.
+        Rays of a block are looked at in patches, each only for the surfaces there are where the patch looks.
         """
+        coc, item = sources.coc_px, sources.item
+        down, right = sources.middle()
         side = -(-len(step) // max(1, round(len(step) / _PATCH)))
         patches = -(-len(step) // side)
         blocked = coc.new_zeros(len(coc), patches, patches, side, side)
         flat = blocked.view(-1, side, side)
         offset = torch.arange(side, device=coc.device)
         start = step[0] + side * torch.arange(patches, device=coc.device)
-        middle = start + (side - 1) / 2
+        start_y, start_x = start - down[:, None], start - right[:, None]
+        row, column = (sources.row + down)[:, None], (sources.column + right)[:, None]
+        to_middle = (side - 1) / 2
         for k in self.bins:
             behind = coc - _NEARER_PX >= self.low + k
             if not bool(behind.any()):
                 break
             scale = 1.0 - (self.low + k) / coc
-            steps, reach = scale.detach()[:, None] * middle, (side - 1) / 2 * float(scale.detach()[behind].abs().max())
-            meets = self._meets(k, reach, item, row[:, None] + steps, column[:, None] + steps) & behind[:, None, None]
+            along = scale.detach()[:, None]
+            reach = to_middle * float(along[behind].abs().max())
+            rows, columns = row + (start_y + to_middle) * along, column + (start_x + to_middle) * along
+            meets = self._meets(k, reach, item, rows, columns) & behind[:, None, None]
             which = meets.flatten().nonzero()[:, 0]
             if len(which) == 0:
                 continue
             ray, patch = which // patches**2, which % patches**2
-            along, first = scale[ray][:, None], item[ray][:, None]
-            at_y = row[ray][:, None] + (start[patch // patches][:, None] + offset) * along
-            at_x = column[ray][:, None] + (start[patch % patches][:, None] + offset) * along
-            flat.index_add_(0, which, self._share(first, at_y, at_x, k))
+            along = scale[ray][:, None]
+            at_y = row[ray] + (start_y[ray, patch // patches][:, None] + offset) * along
+            at_x = column[ray] + (start_x[ray, patch % patches][:, None] + offset) * along
+            flat.index_add_(0, which, self._share(item[ray][:, None], at_y, at_x, k))
         blocked = blocked.transpose(2, 3).reshape(len(coc), patches * side, patches * side)
         return blocked[:, : len(step), : len(step)].clamp(max=1.0)
 
@@ -304,14 +397,15 @@ class _Surfaces:
         """How much of what the image shows at places lies in bin k: ``[n, rows, columns]``."""
         height, width = self.size
         at_y, at_x = at_y.clamp(0, height - 1), at_x.clamp(0, width - 1)  # surfaces go on beyond the border
-        top, left = at_y.floor(), at_x.floor()
+        top, left = at_y.floor().clamp(max=max(0, height - 2)), at_x.floor().clamp(max=max(0, width - 2))
         down, right = (at_y - top)[:, :, None], (at_x - left)[:, None, :]
-        rows = [((item * height + r.long().clamp(max=height - 1)) * width)[:, :, None] for r in (top, top + 1)]
-        columns = [c.long().clamp(max=width - 1)[:, None, :] for c in (left, left + 1)]
+        first = ((item * height + top.long()) * width)[:, :, None] + left.long()[:, None, :]
 
-        def share(at: Tensor) -> Tensor:
-            place = self.place.index_select(0, at.flatten()).view(at.shape)
+        def share(rows: int, columns: int) -> Tensor:
+            """At places so many pixels down and right; none are where the image has but one."""
+            after = min(rows, height - 1) * width + min(columns, width - 1)
+            place = self.place[after:].index_select(0, first.flatten()).view(first.shape)
             return (1.0 - (place - k).abs()).clamp_min(0.0)
 
-        upper, lower = (share(r + columns[0]) * (1 - right) + share(r + columns[1]) * right for r in rows)
-        return upper * (1 - down) + lower * down
+        upper, lower = (torch.lerp(share(rows, 0), share(rows, 1), right) for rows in (0, 1))
+        return torch.lerp(upper, lower, down)

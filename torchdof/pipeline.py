@@ -152,7 +152,9 @@ def _render(
         limit = highlights.ordinary(light, valid)
     shown = _shown(plan, options, light, coc, weight, limit if options.occlusion else None, behind_light, behind_coc)
     rays = [] if limit is None or not plan.rays else _take_highlights(shown, plan, options, limit, coc)
-    traced = highlights.trace(rays, coc, options.table, light.shape[1], options.occlusion) if rays else None
+    traced = None
+    if rays:
+        traced = highlights.trace(rays, coc, options.table, light.shape[1], plan.shared_px, options.occlusion)
     out = _composite(shown, plan, options, behind_light is not None, traced)
     return out if valid is None else torch.where(valid, out, image)
 

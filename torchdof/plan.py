@@ -22,6 +22,7 @@ _SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next 
 _SPACING_POWER = 0.8  # of the tolerance
 _LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consists of two layers
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
+_SHARED_FROM_PX = 32.0  # blur from which on pixels of a highlight share looks for what hides it, at 1/255
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,6 +123,11 @@ class Plan:
         coarse = [abs(coc) for coc in self.coc_px if self._scale(coc) > 1]
         finer = [abs(coc) for coc in self.coc_px if abs(coc) < min(coarse, default=0.0)]
         return math.inf if not coarse else max(finer, default=0.0)
+
+    @property
+    def shared_px(self) -> float:
+        """Radius from which on neighbouring pixels of a highlight share looks for what hides it."""
+        return _SHARED_FROM_PX / (self.tolerance * 255.0) if self.tolerance else math.inf
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is blurred at: every ``scale``-th pixel, a power of two."""
