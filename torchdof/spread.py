@@ -112,17 +112,14 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     if (2 * half + 1) ** 2 > _DIRECT_TAPS and not _traced():
         return _fourier(light, kernels, halo)
     batch, channels = light.shape[:2]
-    together = 1 if _traced() or channels > _PACK // 2 else _PACK // channels
-    if batch == 1 and together > 1 and halo == half:  # strips of its rows as items
-        strips = conv(_strips(light, half, together), kernels, half)
+    if batch == 1 and 2 * channels <= _PACK and halo == half and not _traced():  # strips of its rows as items
+        strips = conv(_strips(light, half, _PACK // channels), kernels, half)
         return strips.transpose(0, 1).flatten(1, 2)[None, :, : light.shape[-2] - 2 * half]
-    together = min(together, batch)
-    if together > 1:  # items as channels of one convolution
-        light = _filled(light, 0, together).reshape(-1, together * channels, *light.shape[-2:])
-    light = _filled(light, 1, _PACK)
+    together = 1 if _traced() else batch  # items as channels of one convolution
+    light = _filled(light.reshape(-1, together * channels, *light.shape[-2:]), 1, _PACK)
     weights = _filled(kernels.repeat(together, 1, 1), 0, _PACK).unsqueeze(1)
     out = functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, : together * channels]
-    return out.reshape(-1, channels, *out.shape[-2:])[:batch] if together > 1 else out
+    return out.reshape(batch, channels, *out.shape[-2:])
 
 
 def _strips(light: Tensor, halo: int, count: int) -> Tensor:
