@@ -88,6 +88,9 @@ def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, in
     x = torch.full((1, 1, *size), 3.0)
     for tiled in (False, True):
         frame = Frame([Sample(torch.zeros_like(light), x)], 4, 1, tiled, extend=False, behind=cells)
-        canvas = frame.start(1)
-        torch.testing.assert_close(frame.image(canvas[:, :3]), light, rtol=0, atol=1e-6)
-        assert bool((canvas[:, 3:] == 1.0).all())
+        assert frame.behind is not None
+        for cover in (0.0, 0.75, 1.0):
+            canvas = torch.full_like(frame.canvas(1), 0.2)
+            canvas[:, 3:] = cover
+            shown = frame.image(frame.over_behind(canvas, frame.behind))
+            torch.testing.assert_close(shown, 0.2 + (1 - cover) * light, rtol=0, atol=1e-6)

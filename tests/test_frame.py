@@ -71,11 +71,13 @@ def test_patches_show_each_layer_what_the_frame_shows(second: bool) -> None:
     assert order == [4, 3, 2, 1, 0]
     columns, alone = frame.area[1] // TILE, 0
     computed: dict[int, list[int]] = {k: [] for k in order}
+    kinds: set[type] = set()
     for patch in frame.patches(blurs, order):
         assert [k for k, _ in patch.layers] == [k for k in order if k in dict(patch.layers)]
         alone += second and len(patch.window.samples) == 1
         for k, some in patch.layers:
-            tiles = (patch.tiles if some is None else patch.tiles[some]).tolist()
+            kinds.add(type(some))
+            tiles = patch.tiles[some].tolist()
             computed[k] += tiles
             window = patch.window.part(some, patch.halo - halves[k])
             light, share, room, *seen = window.terms(NODES, k, with_room=True)
@@ -86,6 +88,7 @@ def test_patches_show_each_layer_what_the_frame_shows(second: bool) -> None:
                     torch.testing.assert_close(mine[i], wanted[:, rows, across], rtol=0, atol=1e-6)
                 known = seen[0][i] if seen else share[i]
                 torch.testing.assert_close(known, whole[3][:, rows, across], rtol=0, atol=1e-6)
+    assert kinds == {slice, torch.Tensor}, "tiles in one piece, and others"
     assert not second or alone, "no patch shows the first surface alone"
     for k, occupied in enumerate(frame.occupancy(plan, blurs)):
         assert sorted(computed[k]) == occupied.flatten().nonzero()[:, 0].tolist()

@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import bands, max_around, max_of_blocks, max_of_four, mean_of_four, places
+from .pool import bands, max_around, max_of_blocks, max_of_four, mean_of_four, min_of_blocks, places
 
 __all__ = ["fill_hidden", "split_mixed", "surfaces"]
 
@@ -238,7 +238,7 @@ def _cells(wanted: Tensor, coc_px: Tensor, extra: tuple[int, int]) -> _Cells:
     """Cells of maps that are continued by so many pixels to the right and below."""
     right, below = extra
     ends = (0, right, 0, below)
-    near = -max_of_blocks(functional.pad(-coc_px, ends, value=-_NEVER_PX), BEHIND_STEP)
+    near = min_of_blocks(functional.pad(coc_px, ends, value=_NEVER_PX), BEHIND_STEP)
     any_wanted = max_of_blocks(functional.pad(wanted.to(coc_px.dtype), ends), BEHIND_STEP)
     return _Cells(near, _positions(any_wanted > 0))
 
@@ -377,14 +377,15 @@ def _finest(
     colour = torch.where(mixed, other_light, light)
     brightest = colour.amax(1, keepdim=True)
     bright = brightest > most
-    colour = colour * torch.where(bright, most / torch.where(bright, brightest, 1.0), 1.0)
+    if torch.compiler.is_exporting() or bool(bright.any()):
+        colour = colour * torch.where(bright, most / torch.where(bright, brightest, 1.0), 1.0)
     weight = torch.where(mixed, share, 1.0 - share)
     if valid is not None:
         depth, weight = torch.where(valid > 0, depth, -_NEVER_PX), weight * valid
     colour, depth, weight, coc_px = (
         functional.pad(t, extra, mode="replicate") for t in (colour, depth, weight, coc_px)
     )
-    near, blur = -max_of_blocks(-coc_px, cell), max_of_blocks(coc_px.abs(), cell)
+    near, blur = min_of_blocks(coc_px, cell), max_of_blocks(coc_px.abs(), cell)
     return *_farthest(colour, depth, weight), near, blur
 
 

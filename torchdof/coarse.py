@@ -14,7 +14,7 @@ from torch import Tensor
 from .frame import TILE, TILES_AT_ONCE, Frame, cut_tiles, from_tiles
 from .layers import share_at_or_behind
 from .plan import Blur, Plan
-from .pool import max_of_blocks, mean_of_blocks
+from .pool import max_of_blocks, mean_of_blocks, min_of_blocks
 
 __all__ = ["Coarse"]
 
@@ -162,7 +162,7 @@ class _Blocks:
         self.sample, self.known, self.scale = coarse.frame.samples[which], coarse.frame.known, coarse.scale
         self.layers, self.nodes = layers, torch.tensor(nodes, device=self.sample.x.device, dtype=self.sample.x.dtype)
         x = coarse.pixels(self.sample.x)
-        low, high = -max_of_blocks(-x, self.scale), max_of_blocks(x, self.scale)
+        low, high = min_of_blocks(x, self.scale), max_of_blocks(x, self.scale)
         weight = torch.ones_like(low) if self.sample.weight is None else coarse.pixels(self.sample.weight)
         mean = weight if self.sample.weight is None else mean_of_blocks(weight, self.scale)
         near, far = (self._end(end) for end in (layers.start - 1, layers.stop))

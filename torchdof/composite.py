@@ -67,7 +67,8 @@ def over(frame: Frame, plan: Plan, blurs: list[Blur], spread: Spread) -> Tensor:
         return torch.addcmul(front, _each(left, colours), canvas)
 
     canvas = _lay_all(frame, plan, blurs, spread, True, settle, join)
-    return frame.image(_mean(canvas, colours))
+    behind = frame.behind
+    return frame.image(_mean(canvas, colours) if behind is None else frame.over_behind(canvas, behind))
 
 
 def accumulate(
@@ -147,7 +148,7 @@ def _lay_all(
     Neighbouring layers of one coarser resolution are laid on a canvas of that resolution first.
     """
     exporting, kernels = torch.compiler.is_exporting(), blurs[0].kernel.shape[0]
-    canvas = frame.start(kernels)
+    canvas = frame.canvas(kernels)
 
     def lay(layer: Tensor, canvas: Tensor) -> Tensor:
         return join(settle(layer), canvas)
@@ -212,10 +213,15 @@ def _lay_patches(
             canvas.index_copy_(0, patch.tiles, own)
 
 
-def _lay_at(canvas: Tensor, tiles: Tensor | None, layer: Tensor, lay: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+def _lay_at(
+    canvas: Tensor, tiles: Tensor | slice | None, layer: Tensor, lay: Callable[[Tensor, Tensor], Tensor]
+) -> Tensor:
     """Lay a scattered layer on tiles of a canvas, which are changed, or on all of it."""
     if tiles is None:
         return lay(layer, canvas)
+    if isinstance(tiles, slice):
+        canvas[tiles] = lay(layer, canvas[tiles])
+        return canvas
     return canvas.index_copy_(0, tiles, lay(layer, canvas.index_select(0, tiles)))
 
 

@@ -39,6 +39,7 @@ TILES_AT_ONCE = 48
 _CELL = 8  # occupancy is known in cells of this many pixels
 _BLOCK = 4  # pixels a side that are looked at together to find occupied layers
 _CHANNELS = 16  # channels that are spread together
+_COVERED = 1e-5  # so little is left uncovered by rounding alone
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,12 +76,12 @@ class Window:
             return [light, share if self.known is None else share * self.known]
         return [light, share, room] if self.known is None else [light, share, room, share * self.known]
 
-    def part(self, some: Tensor | None, less: int) -> "Window":
+    def part(self, some: Tensor | slice, less: int) -> "Window":
         """Some of the windows, with so many pixels less of halo."""
 
         def cut(values: Tensor) -> Tensor:
             values = values[..., less : values.shape[-2] - less, less : values.shape[-1] - less]
-            return values if some is None else values.index_select(0, some)
+            return values[some] if isinstance(some, slice) else values.index_select(0, some)
 
         known = None if self.known is None else cut(self.known)
         return Window([s.each(cut) for s in self.samples], known, self.independent)
@@ -124,13 +125,13 @@ class Patch:
         window: What they show, with a halo.
         halo: Its pixels on each side.
         layers: Layers whose light falls there, in the order they were asked for, each with the tiles that it falls in
-            (of the n); None: all.
+            (of the n); a slice where these are neighbours, which need no copy.
     """
 
     tiles: Tensor
     window: Window
     halo: int
-    layers: list[tuple[int, Tensor | None]]
+    layers: list[tuple[int, Tensor | slice]]
 
 
 class Frame:
@@ -218,28 +219,30 @@ class Frame:
         ring = 0 if scale == 1 else 1
         return self.samples[0].light.shape[0], self.colours + kernels, *(n // scale + 2 * ring for n in self.area)
 
-    def start(self, kernels: int) -> Tensor:
-        """The canvas before any layer: what is behind all of them, or nothing."""
-        if self.behind is None:
-            return self.canvas(kernels)
-        if not self.tiled:
-            seen = torch.ones_like(self.behind[:, :1]).expand(-1, kernels, -1, -1)
-            return torch.cat([self.behind, seen], 1)
-        canvas = self.behind.new_ones(self._canvas_shape(kernels))
-        columns, step = self.area[1] // TILE, TILE // BEHIND_STEP
-        for row in range(self.area[0] // TILE):  # a row of tiles at a time
-            start, above = row * step, min(row, 1)
-            strip = _finer(self.behind[:, :, start - above : start + step + 1])
-            strip = strip[:, :, above * BEHIND_STEP :][:, :, :TILE, : self.area[1]]
-            strip = functional.pad(strip, (0, self.area[1] - strip.shape[3], 0, TILE - strip.shape[2]))
-            canvas[row * columns : (row + 1) * columns, : self.colours] = in_tiles(strip)
-        return canvas
-
     def image(self, canvas: Tensor) -> Tensor:
         """What a canvas, or a part of its channels, shows: ``[B, C, H, W]``."""
         if self.tiled:
             canvas = from_tiles(canvas, self.area)
         return canvas[..., : self.size[0], : self.size[1]]
+
+    def over_behind(self, canvas: Tensor, behind: Tensor) -> Tensor:
+        """Light of a canvas, over what is behind all layers where they leave it uncovered; the canvas may change."""
+        light, covered = canvas.tensor_split((self.colours,), 1)
+        if not self.tiled:
+            return torch.addcmul(light, (1.0 - covered).clamp_min(0.0), behind)
+        uncovered = covered.amin((1, 2, 3)) < 1.0 - _COVERED
+        columns, step = self.area[1] // TILE, TILE // BEHIND_STEP
+        for row, there in enumerate(uncovered.split(columns)):
+            at = there.nonzero()[:, 0]
+            if len(at):
+                start, above = row * step, min(row, 1)
+                strip = _finer(behind[:, :, start - above : start + step + 1])
+                strip = strip[:, :, above * BEHIND_STEP :][:, :, :TILE, : self.area[1]]
+                strip = functional.pad(strip, (0, self.area[1] - strip.shape[3], 0, TILE - strip.shape[2]))
+                tiles = row * columns + at
+                left = (1.0 - covered[tiles]).clamp_min(0.0)
+                light[tiles] = torch.addcmul(light[tiles], left, in_tiles(strip)[at])
+        return light
 
     def at(self, scattered: Tensor, places: Tensor | None) -> Tensor:
         """What was scattered in a window, as tiles where the canvas is made of tiles."""
@@ -310,7 +313,7 @@ class Frame:
             for tiles in chosen.split(TILES_AT_ONCE) if len(chosen) else ():
                 widest, there = int(halo[tiles].max()), occupied[:, tiles]
                 counts = zip(layers, there, there.sum(1).tolist(), strict=True)
-                some = [(k, None if n == len(tiles) else at.nonzero()[:, 0]) for k, at, n in counts if n]
+                some = [(k, _places(at)) for k, at, n in counts if n]
                 yield Patch(tiles, self._window(widest, tiles, border, alone), widest, some)
 
     def _single(self, reach: Tensor) -> Tensor:
@@ -363,7 +366,7 @@ class Frame:
         def mark(x: Tensor, at: Tensor) -> Tensor:
             below = (torch.bucketize(x, nodes, right=True) - 1).clamp(0, count - 1)
             for layer in (below, below + (x > nodes[below])):
-                present[(at + layer.clamp(max=count - 1)).flatten()] = 1.0
+                present.index_fill_(0, (at + layer.clamp(max=count - 1)).flatten(), 1.0)
             return below
 
         m, first = self.margin, None
@@ -383,6 +386,18 @@ class Frame:
         for layer, blur in zip(present.unflatten(0, (height // _CELL, -1, count)).permute(2, 0, 1), blurs, strict=True):
             occupied.append(_near_tiles(layer, -(-blur.halo // _CELL)) > 0)
         return occupied
+
+
+def _places(there: Tensor) -> Tensor | slice:
+    """Where there is anything; a slice if that is in one piece.
+
+    Example:
+        >>> _places(torch.tensor([False, True, True])), _places(torch.tensor([True, False, True]))
+        (slice(1, 3, None), tensor([0, 2]))
+    """
+    at = there.nonzero()[:, 0]
+    first, last = int(at[0]), int(at[-1])
+    return slice(first, last + 1) if len(at) == last + 1 - first else at
 
 
 def _near_tiles(cells: Tensor, reach: int) -> Tensor:

@@ -98,10 +98,10 @@ def take(
         The light that is left, and the rays; None where there are none.
     """
     brightest = light.amax(1, keepdim=True)
-    bright = brightest > limit
+    bright = (brightest > limit).flatten()
+    at = bright.nonzero()[:, 0] if bool(bright.any()) else bright.new_empty(0, dtype=torch.int64)
     if weight is not None:
-        bright &= weight > 0
-    at = bright.flatten().nonzero()[:, 0]
+        at = at[weight.flatten()[at] > 0]
     if len(at) == 0:
         return light, None
     place = coc_px.detach().flatten()[at]

@@ -18,6 +18,7 @@ __all__ = [
     "max_of_four",
     "mean_of_blocks",
     "mean_of_four",
+    "min_of_blocks",
     "places",
 ]
 
@@ -118,6 +119,16 @@ def max_of_blocks(values: Tensor, scale: int) -> Tensor:
         [[15.0]]
     """
     return _of_blocks(max_of_four, values, scale)
+
+
+def min_of_blocks(values: Tensor, scale: int) -> Tensor:
+    """Least of each ``scale`` x ``scale`` values, a power of two, as in :func:`max_of_blocks`.
+
+    Example:
+        >>> min_of_blocks(torch.tensor([[1.0, 2], [3, 5]]), 2).tolist()
+        [[1.0]]
+    """
+    return _of_blocks(functools.partial(_of_four, torch.minimum), values, scale)
 
 
 def any_of_blocks(bits: Tensor, scale: int) -> Tensor:
