@@ -406,16 +406,17 @@ def _behind(level: _Level, item: Tensor, row: Tensor, column: Tensor, here: Tens
     Light and coc ``[C + 1, P]`` and their weight, 0 where nothing is behind.
     """
     height, width = level.size
-    y, x = (row + 0.5) / level.step - 0.5, (column + 0.5) / level.step - 0.5
-    top, left = y.floor(), x.floor()
+    y, x = (
+        ((row + 0.5) / level.step - 0.5).clamp(0, height - 1),
+        ((column + 0.5) / level.step - 0.5).clamp(0, width - 1),
+    )
+    top, left = y.floor().clamp(max=max(0, height - 2)), x.floor().clamp(max=max(0, width - 2))
     down, right = y - top, x - left
-    first = item * height
-    rows = [(first + (top.long() + i).clamp(0, height - 1)) * width for i in (0, 1)]
-    columns = [(left.long() + i).clamp(0, width - 1) for i in (0, 1)]
+    first = (item * height + top.long()) * width + left.long()
     seen = total = torch.zeros_like(here)
-    for line, vertical in zip(rows, (1 - down, down), strict=True):
-        for place, horizontal in zip(columns, (1 - right, right), strict=True):
-            its = level.flat.index_select(1, line + place)
+    for i, vertical in enumerate((1 - down, down)):
+        for j, horizontal in enumerate((1 - right, right)):  # where there is but one, it is both
+            its = level.flat.index_select(1, first + (min(i, height - 1) * width + min(j, width - 1)))
             share = vertical * horizontal * its[-1] * (its[-2] > here + _BEHIND_PX)
             seen, total = seen + its[:-1] * share, total + share
     total = torch.where(total > 1e-4, total, 0.0)

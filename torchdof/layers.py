@@ -45,4 +45,4 @@ def share_at_or_behind(x: Tensor, nodes: Sequence[float], k: int) -> Tensor:
         return torch.ones_like(x)
     if k == len(nodes):
         return torch.zeros_like(x)
-    return ((x - nodes[k - 1]) / (nodes[k] - nodes[k - 1])).clamp(0.0, 1.0)
+    return (x - nodes[k - 1]).div_(nodes[k] - nodes[k - 1]).clamp_(0.0, 1.0)

@@ -101,7 +101,6 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
         True
     """
     _check(light, kernels)
-    kernels = kernels.expand(light.shape[1], -1, -1)
     half = kernels.shape[-1] // 2
     if halo > half:
         spare = halo - half
@@ -110,14 +109,16 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     if half == 0:
         return light * kernels[:, 0, 0, None, None]
     if (2 * half + 1) ** 2 > _DIRECT_TAPS and not _traced():
-        return _fourier(light, kernels, halo)
+        return _fourier(light, kernels.expand(light.shape[1], -1, -1), halo)
     batch, channels = light.shape[:2]
     if batch == 1 and 2 * channels <= _PACK and halo == half and not _traced():  # strips of its rows as items
         strips = conv(_strips(light, half, _PACK // channels), kernels, half)
         return strips.transpose(0, 1).flatten(1, 2)[None, :, : light.shape[-2] - 2 * half]
     together = 1 if _traced() else batch  # items as channels of one convolution
     light = _filled(light.reshape(-1, together * channels, *light.shape[-2:]), 1, _PACK)
-    weights = _filled(kernels.repeat(together, 1, 1), 0, _PACK).unsqueeze(1)
+    if kernels.shape[0] > 1:
+        kernels = _filled(kernels.repeat(together, 1, 1), 0, _PACK)
+    weights = kernels.expand(light.shape[1], -1, -1).unsqueeze(1)
     out = functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, : together * channels]
     return out.reshape(batch, channels, *out.shape[-2:])
 
@@ -152,6 +153,9 @@ def layers_by_fold(light: Tensor, blurs: Sequence[tuple[Blur, int]], halo: int) 
 
 
 def _side_by_side(blurs: Sequence[tuple[Blur, int]]) -> Tensor:
+    """Kernels of all channels, or one for all of them."""
+    if len(blurs) == 1 and blurs[0][0].kernel.shape[0] == 1:
+        return blurs[0][0].kernel
     half = max(blur.half for blur, _ in blurs)
     kernels = [functional.pad(blur.kernel, (half - blur.half,) * 4) for blur, _ in blurs]
     # a kernel for each channel: the same one, or one colour after the other in each part of the layer
