@@ -226,7 +226,15 @@ class Frame:
         return canvas[..., : self.size[0], : self.size[1]]
 
     def over_behind(self, canvas: Tensor, behind: Tensor) -> Tensor:
-        """Light of a canvas, over what is behind all layers where they leave it uncovered; the canvas may change."""
+        """Light of a canvas where all layers are laid, over what is behind them, which shows where they leave gaps.
+
+        Args:
+            canvas: As :meth:`canvas`; it may be changed.
+            behind: That of this frame.
+
+        Returns:
+            The canvas's first C channels.
+        """
         light, covered = canvas.tensor_split((self.colours,), 1)
         if not self.tiled:
             return torch.addcmul(light, (1.0 - covered).clamp_min(0.0), behind)

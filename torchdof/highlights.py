@@ -207,8 +207,9 @@ class _Sources:
         light = rays.light.new_zeros(len(rays.light), count * side**2)
         light = light.index_add(1, (which * side + down) * side + right, rays.light)
         light = light.unflatten(1, (count, side, side)).transpose(0, 1)
-        one = torch.empty_like(which[:count]).scatter_(0, which, torch.arange(len(which), device=which.device))
-        sources = cls(item[one], row[one], column[one], rays.coc_px[one], light)
+        every = torch.arange(len(which), device=which.device)
+        first = every.new_full((count,), len(which)).scatter_reduce(0, which, every, "amin")
+        sources = cls(item[first], row[first], column[first], rays.coc_px[first], light)
         return sources.part(torch.argsort(sources.coc_px.detach().abs()))
 
     @property
@@ -245,7 +246,7 @@ def _by_block(rays: Rays, shared_px: float, height: int, width: int) -> Iterator
         yield _Sources.of_rays(rays, 1, height, width)
         return
     blur, ends = rays.coc_px.detach().abs() / shared_px, [*_BLOCKS.values(), math.inf]
-    for side, least, end in zip(_BLOCKS, ends, ends[1:], strict=False):
+    for side, (least, end) in zip(_BLOCKS, itertools.pairwise(ends), strict=True):
         some = ((blur >= least) & (blur < end)).nonzero()[:, 0]
         if len(some):
             yield _Sources.of_rays(Rays(rays.at[some], rays.light[:, some], rays.coc_px[some]), side, height, width)
