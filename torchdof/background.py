@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import bands, max_around, max_of_blocks, max_of_four, mean_of_four, min_of_blocks, places
+from .pool import bands, between, max_around, max_of_blocks, max_of_four, mean_of_four, min_of_blocks, places
 
 __all__ = ["fill_hidden", "split_mixed", "surfaces"]
 
@@ -406,16 +406,12 @@ def _behind(level: _Level, item: Tensor, row: Tensor, column: Tensor, here: Tens
     Light and coc ``[C + 1, P]`` and their weight, 0 where nothing is behind.
     """
     height, width = level.size
-    y, x = (
-        ((row + 0.5) / level.step - 0.5).clamp(0, height - 1),
-        ((column + 0.5) / level.step - 0.5).clamp(0, width - 1),
-    )
-    top, left = y.floor().clamp(max=max(0, height - 2)), x.floor().clamp(max=max(0, width - 2))
-    down, right = y - top, x - left
-    first = (item * height + top.long()) * width + left.long()
+    top, down = between((row + 0.5) / level.step - 0.5, height)
+    left, right = between((column + 0.5) / level.step - 0.5, width)
+    first = (item * height + top) * width + left
     seen = total = torch.zeros_like(here)
     for i, vertical in enumerate((1 - down, down)):
-        for j, horizontal in enumerate((1 - right, right)):  # where there is but one, it is both
+        for j, horizontal in enumerate((1 - right, right)):
             its = level.flat.index_select(1, first + (min(i, height - 1) * width + min(j, width - 1)))
             share = vertical * horizontal * its[-1] * (its[-2] > here + _BEHIND_PX)
             seen, total = seen + its[:-1] * share, total + share

@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .pool import any_around, any_of_blocks, bands, max_around, max_of_blocks, places
+from .pool import any_around, any_of_blocks, bands, between, max_around, max_of_blocks, places
 from .table import BlurTable
 
 __all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
@@ -397,13 +397,12 @@ class _Surfaces:
     def _share(self, item: Tensor, at_y: Tensor, at_x: Tensor, k: int) -> Tensor:
         """How much of what the image shows at places lies in bin k: ``[n, rows, columns]``."""
         height, width = self.size
-        at_y, at_x = at_y.clamp(0, height - 1), at_x.clamp(0, width - 1)  # surfaces go on beyond the border
-        top, left = at_y.floor().clamp(max=max(0, height - 2)), at_x.floor().clamp(max=max(0, width - 2))
-        down, right = (at_y - top)[:, :, None], (at_x - left)[:, None, :]
-        first = ((item * height + top.long()) * width)[:, :, None] + left.long()[:, None, :]
+        (top, down), (left, right) = between(at_y, height), between(at_x, width)  # surfaces go on beyond the border
+        down, right = down[:, :, None], right[:, None, :]
+        first = ((item * height + top) * width)[:, :, None] + left[:, None, :]
 
         def share(rows: int, columns: int) -> Tensor:
-            """At places so many pixels down and right; none are where the image has but one."""
+            """At places so many pixels down and right."""
             after = min(rows, height - 1) * width + min(columns, width - 1)
             place = self.place[after:].index_select(0, first.flatten()).view(first.shape)
             return (1.0 - (place - k).abs()).clamp_min(0.0)

@@ -13,6 +13,7 @@ __all__ = [
     "any_around",
     "any_of_blocks",
     "bands",
+    "between",
     "max_around",
     "max_of_blocks",
     "max_of_four",
@@ -162,3 +163,17 @@ def places(at: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]
     line = at // width
     item = line // height
     return item, line - item * height, at - line * width
+
+
+def between(at: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """The pixel before each place along an axis, and the share of the next one, for linear interpolation.
+
+    Values go on beyond both ends as they are there. An axis of one pixel has no next one, and gives it no share.
+
+    Example:
+        >>> [part.tolist() for part in between(torch.tensor([-1.0, 0.25, 2.0]), 3)]
+        [[0, 0, 1], [0.0, 0.25, 1.0]]
+    """
+    at = at.clamp(0, size - 1)
+    before = at.floor().clamp(max=max(0, size - 2))
+    return before.long(), at - before
