@@ -55,6 +55,18 @@ def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> N
     assert torch.allclose(behind[0, :, 24 // 4, 5:7], BLUE[:, None].expand(3, 2), atol=1e-5)
 
 
+def test_a_highlight_beside_what_is_hidden_is_not_hidden_there_too() -> None:
+    image, coc = edge(1.0, near_px=-12.0)
+    image = image.clone()
+    image[..., 20:28, 32:36] = 500.0
+    *_, other, _, share, behind = background.surfaces(image, coc, None, ordinary(image), levels=5)
+    assert float(share[0, 0, 24, 26]) > 0
+    most = float(ordinary(image).max())
+    assert most < 10.0, "the scene tests nothing"
+    assert float(other[0, :, 24, :32].max()) <= most
+    assert float(behind[0, :, 24 // 4, 5:7].max()) <= most
+
+
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("levels", [2, 3, 5])
 def test_bands_and_parts_change_nothing(known: bool, levels: int, monkeypatch: pytest.MonkeyPatch) -> None:

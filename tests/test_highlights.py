@@ -149,6 +149,13 @@ def test_what_is_taken_and_what_is_left_sum_to_the_light() -> None:
     assert float(left.max()) <= highlights.FACTOR * 0.05 * 1.001
 
 
+def test_where_a_surface_is_not_it_has_no_rays() -> None:
+    image, coc, _ = street()
+    left, rays = highlights.take(image, coc, torch.zeros_like(coc), highlights.ordinary(image), coc, 1.0)
+    assert rays is None
+    assert left is image
+
+
 def test_many_bright_pixels_are_left_to_the_layers_but_for_the_brightest() -> None:
     generator = torch.Generator().manual_seed(2)
     image = torch.rand(1, 1, 128, 128, generator=generator)

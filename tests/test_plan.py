@@ -111,6 +111,11 @@ def test_highlights_are_traced_wherever_a_coarse_layer_has_a_share_of_them(toler
     assert any(abs(c) < plan.crisp_px for c in plan.coc_px if c) and any(blur.scale > 1 for blur in blurs)
 
 
+def test_looks_for_what_hides_a_highlight_are_shared_the_sooner_the_looser_the_tolerance() -> None:
+    shared = [Plan((-3.0, 0.0, 3.0), tolerance).shared_px for tolerance in (0.0, 1 / 255, 4 / 255)]
+    assert shared == [math.inf, pytest.approx(32.0), pytest.approx(8.0)]
+
+
 def test_the_larger_a_blur_the_coarser_its_layer() -> None:
     plan = Plan.of_scene(coc_map(0.0, 100.0).expand(1, 1, 100, 2), 1 / 255)
     blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)

@@ -206,10 +206,10 @@ def _lay_patches(
             continue
         for patch in frame.patches(blurs, list(some)):
             own = canvas.index_select(0, patch.tiles)
-            for k, tiles in patch.layers:
-                window = patch.window.part(tiles, patch.halo - blurs[k].halo)
+            for k, its in patch.layers:
+                window = patch.window.part(its, patch.halo - blurs[k].halo)
                 (layer,) = _spread([window.terms(plan.nodes, k, with_room)], blurs, [k], spread)
-                own = _lay_at(own, tiles, layer, lay)
+                own = _lay_at(own, its, layer, lay)
             canvas.index_copy_(0, patch.tiles, own)
 
 

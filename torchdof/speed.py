@@ -442,6 +442,7 @@ def _plot(path: Path, rows: Sequence[Row], subject: Subject) -> None:
     axes.plot([], [], ":", color="grey", label="exact: no error")
     if not any(row.rms_255 > 0 for row in rows if row.setting.side is None):  # all in focus, or one plane
         axes.set_ylim(1e-3, 1.0)
+    axes.margins(x=0.08)  # room for the names of the outermost
     axes.set(xscale="log", yscale="log", xlabel="median time [ms]", ylabel="RMS error, display-encoded [1/255]")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(LogFormatter())
