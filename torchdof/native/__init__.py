@@ -1,0 +1,266 @@
+"""The compiled engine: what :mod:`torchdof.render` states in PyTorch, for eager inference on the CPU.
+
+It is C++ behind a plain C interface (``src/api.h``), built when the package is installed. Where it could not be built,
+the plain engine serves. The environment variable ``TORCHDOF_ENGINE`` chooses: ``auto`` (the default) takes the compiled
+engine where it can serve, ``native`` refuses to go on without it, ``torch`` leaves it out.
+"""
+
+import ctypes
+import functools
+import importlib.resources
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+__all__ = ["HALF_LARGEST", "Kind", "chosen", "convolve", "describe", "render", "use_instructions"]
+
+Kind = Literal["image", "background", "stack"]
+"""What surfaces are: one image; an image and what lies behind it; any number that cover each other, near to far."""
+
+HALF_LARGEST = 64
+"""Kernels reach at most so many pixels of their layer's resolution to each side; larger ones are Fourier's."""
+
+_KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
+_SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
+_NO_MEMORY, _CANCELLED = 1, 2
+
+_Floats = ctypes.POINTER(ctypes.c_float)
+
+
+class _Scene(ctypes.Structure):
+    """``torchdof_scene`` of ``src/api.h``."""
+
+    _fields_ = [  # noqa: RUF012
+        ("height", ctypes.c_int32),
+        ("width", ctypes.c_int32),
+        ("channels", ctypes.c_int32),
+        ("kind", ctypes.c_int32),
+        ("surfaces", ctypes.c_int32),
+        ("light", ctypes.POINTER(ctypes.c_void_p)),
+        ("coc", ctypes.POINTER(ctypes.c_void_p)),
+        ("weight", ctypes.POINTER(ctypes.c_void_p)),
+        ("occlusion", ctypes.c_int32),
+        ("extend", ctypes.c_int32),
+        ("normalize", ctypes.c_int32),
+        ("masked", ctypes.c_int32),
+        ("highlights", ctypes.c_int32),
+        ("crisp_px", ctypes.c_float),
+        ("layers", ctypes.c_int32),
+        ("nodes", ctypes.POINTER(ctypes.c_double)),
+        ("scales", ctypes.POINTER(ctypes.c_int32)),
+        ("halves", ctypes.POINTER(ctypes.c_int32)),
+        ("kernel_colours", ctypes.c_int32),
+        ("kernels", ctypes.c_void_p),
+        ("threads", ctypes.c_int32),
+        ("cancelled", ctypes.POINTER(ctypes.c_int32)),
+    ]
+
+
+def chosen() -> bool:
+    """Whether the compiled engine serves.
+
+    Raises:
+        RuntimeError: If ``TORCHDOF_ENGINE`` is ``native`` and it is missing.
+        ValueError: If ``TORCHDOF_ENGINE`` names no engine.
+    """
+    wanted = os.environ.get("TORCHDOF_ENGINE", "auto")
+    if wanted not in ("auto", "native", "torch"):
+        raise ValueError(f"TORCHDOF_ENGINE must be auto, native or torch, got {wanted!r}")
+    if wanted == "torch":
+        return False
+    library, missing = _library()
+    if library is None and wanted == "native":
+        raise RuntimeError(f"TORCHDOF_ENGINE is native, but {missing}; install torchdof where there is a C++ compiler")
+    return library is not None
+
+
+def describe() -> str:
+    """Which engine is in use, and why, for people.
+
+    Example:
+        >>> describe().split()[0] in ("native", "torch")
+        True
+    """
+    if chosen():
+        return f"native ({_engine().torchdof_instructions().decode()})"
+    if os.environ.get("TORCHDOF_ENGINE") == "torch":
+        return "torch (as TORCHDOF_ENGINE says)"
+    return f"torch ({_library()[1]})"
+
+
+def use_instructions(name: Literal["avx2", "baseline"]) -> bool:
+    """Choose the processor's instructions, for tests; False if it lacks them."""
+    return bool(_engine().torchdof_use(name.encode()))
+
+
+def render(
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]],
+    kind: Kind,
+    *,
+    nodes: Sequence[float],
+    layers: Sequence[tuple[Tensor, int]],
+    psfs: Callable[[list[int]], Sequence[Tensor]],
+    occlusion: bool,
+    extend: bool,
+    normalize: bool,
+    masked: bool,
+    highlights: bool,
+    crisp_px: float,
+) -> Tensor:
+    """Depth of field of one item, on as many threads as PyTorch uses.
+
+    Args:
+        surfaces: Light ``[C, H, W]``, signed coc in pixels ``[H, W]`` and weight ``[H, W]`` (None: 1) of each, float32.
+        kind: What they are.
+        nodes: Places of the layers on the blur axis, near to far.
+        layers: Kernel ``[1 or C, k, k]`` and resolution (every so many pixels) of each.
+        psfs: Kernels ``[1 or C, k, k]`` for signed radii of highlights, in steps of 1/32 pixel.
+        occlusion: As in :class:`torchdof.DepthOfField`.
+        extend: Light goes on beyond the frame.
+        normalize: As in :class:`torchdof.DepthOfField`.
+        masked: Values may be NaN or infinite; such pixels pass through.
+        highlights: Highlights are traced where layers would not do.
+        crisp_px: Blur from which on layers soften highlights.
+
+    Returns:
+        ``[C, H, W]``, float32; the same bits for any number of threads.
+
+    Raises:
+        MemoryError: If there is too little.
+    """
+    lights = [light.float().contiguous() for light, _, _ in surfaces]
+    cocs = [coc.float().contiguous() for _, coc, _ in surfaces]
+    weights = [None if weight is None else weight.float().contiguous() for _, _, weight in surfaces]
+    kernels = [kernel.float() for kernel, _ in layers]
+    colours = max(kernel.shape[0] for kernel in kernels)
+    bank = torch.cat([kernel.expand(colours, -1, -1).flatten() for kernel in kernels])
+    cancelled = ctypes.c_int32(0)
+    channels, height, width = lights[0].shape
+    scene = _Scene(
+        height,
+        width,
+        channels,
+        _KINDS[kind],
+        len(surfaces),
+        _pointers(lights),
+        _pointers(cocs),
+        _pointers(weights),
+        occlusion,
+        extend,
+        normalize,
+        masked,
+        highlights,
+        crisp_px,
+        len(nodes),
+        (ctypes.c_double * len(nodes))(*nodes),
+        (ctypes.c_int32 * len(nodes))(*(scale for _, scale in layers)),
+        (ctypes.c_int32 * len(nodes))(*(kernel.shape[-1] // 2 for kernel in kernels)),
+        colours,
+        bank.data_ptr(),
+        torch.get_num_threads(),
+        ctypes.pointer(cancelled),
+    )
+    out = torch.empty(channels, height, width)
+
+    def run() -> None:
+        engine, job = _engine(), ctypes.c_void_p()
+        try:
+            _check(engine.torchdof_begin(ctypes.byref(scene), ctypes.byref(job)))
+            steps = ctypes.POINTER(ctypes.c_int32)()
+            count = engine.torchdof_radii(job, ctypes.byref(steps))
+            rays = [psf.contiguous() for psf in psfs(steps[:count])] if count else []
+            halves = (ctypes.c_int32 * max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
+            _check(engine.torchdof_finish(job, _pointers(rays), halves, out.data_ptr()))
+        finally:
+            engine.torchdof_free(job)
+
+    _interruptible(run, cancelled)
+    return out
+
+
+def convolve(values: Tensor, kernel: Tensor) -> Tensor:
+    """Values ``[H, W]`` spread with a kernel ``[k, k]``, float32; what falls outside is lost."""
+    out, values, kernel = torch.empty_like(values), values.contiguous(), kernel.contiguous()
+    _engine().torchdof_convolve(
+        values.data_ptr(), *values.shape, kernel.data_ptr(), kernel.shape[-1] // 2, out.data_ptr()
+    )
+    return out
+
+
+def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32) -> None:
+    """Run something that takes long outside of Python; Ctrl-C stops it.
+
+    Only the main thread hears of signals, and only between two steps of Python. So there the work goes to another
+    thread, and the main thread waits for it, which signals can interrupt.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        run()
+        return
+    failure: list[BaseException] = []
+    grad_enabled, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def guarded() -> None:
+        try:
+            with torch.inference_mode(inference), torch.set_grad_enabled(grad_enabled):
+                run()
+        except BaseException as error:  # whatever it is, the main thread raises it
+            failure.append(error)
+
+    worker = threading.Thread(target=guarded, name="torchdof")
+    worker.start()
+    try:
+        worker.join()
+    except BaseException:
+        cancelled.value = 1
+        worker.join()
+        raise
+    if failure:
+        raise failure[0]
+
+
+def _check(status: int) -> None:
+    if status == _NO_MEMORY:
+        raise MemoryError("there is too little memory to render this image")
+    if status == _CANCELLED:
+        raise KeyboardInterrupt
+
+
+def _pointers(tensors: Sequence[Tensor | None]) -> Any:
+    return (ctypes.c_void_p * max(1, len(tensors)))(*(None if t is None else t.data_ptr() for t in tensors))
+
+
+def _engine() -> ctypes.CDLL:
+    library, missing = _library()
+    if library is None:
+        raise RuntimeError(missing)
+    return library
+
+
+@functools.cache
+def _library() -> tuple[ctypes.CDLL | None, str]:
+    """The compiled engine, or why there is none."""
+    file = importlib.resources.files(__name__) / f"_engine{_SUFFIXES.get(sys.platform, '.so')}"
+    if not file.is_file():
+        return None, "the compiled engine was not built when torchdof was installed"
+    try:
+        with importlib.resources.as_file(file) as path:
+            library = ctypes.CDLL(str(path))
+    except OSError as error:
+        return None, f"the compiled engine cannot be loaded: {error}"
+    pointer = ctypes.c_void_p
+    library.torchdof_begin.argtypes = [ctypes.POINTER(_Scene), ctypes.POINTER(pointer)]
+    library.torchdof_radii.argtypes = [pointer, ctypes.POINTER(ctypes.POINTER(ctypes.c_int32))]
+    library.torchdof_radii.restype = ctypes.c_int64
+    library.torchdof_finish.argtypes = [pointer, ctypes.POINTER(pointer), ctypes.POINTER(ctypes.c_int32), pointer]
+    library.torchdof_free.argtypes = [pointer]
+    library.torchdof_free.restype = None
+    library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]
+    library.torchdof_convolve.restype = None
+    library.torchdof_instructions.restype = ctypes.c_char_p
+    library.torchdof_use.argtypes = [ctypes.c_char_p]
+    return library, ""

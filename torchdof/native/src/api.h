@@ -1,0 +1,68 @@
+// The C interface of the compiled engine: from a map of coc to the picture. Plain arrays, no Python, no PyTorch.
+//
+// A picture takes two calls, for the kernels of highlights are made by the caller, who knows the lens:
+// torchdof_begin looks at the scene and tells which radii its highlights have; torchdof_finish renders.
+#pragma once
+#include <stdint.h>
+
+#if defined(_WIN32)
+#define TORCHDOF_API extern "C" __declspec(dllexport)
+#else
+#define TORCHDOF_API extern "C" __attribute__((visibility("default")))
+#endif
+
+enum { TORCHDOF_OK = 0, TORCHDOF_NO_MEMORY = 1, TORCHDOF_CANCELLED = 2 };
+
+// What the given surfaces are.
+enum {
+  TORCHDOF_IMAGE = 0,       // one image: its mixed pixels are split, what it hides is filled in
+  TORCHDOF_BACKGROUND = 1,  // an image and, second, what is seen where its nearer surfaces are taken away
+  TORCHDOF_STACK = 2,       // surfaces that cover each other, near to far, as they are
+};
+
+typedef struct {
+  int32_t height, width, channels;
+  int32_t kind;                // as above
+  int32_t surfaces;            // how many are given: 1, 2, or any number
+  const float *const *light;   // of each surface [channels, height, width]
+  const float *const *coc;     // of each surface [height, width]: signed radius in pixels, negative in front of the focus
+  const float *const *weight;  // of each surface [height, width], or null: it covers its pixels wholly
+  int32_t occlusion;           // 0: light accumulates, whatever lies in front
+  int32_t extend;              // 1: light goes on beyond the frame as it is at its border
+  int32_t normalize;           // 0: without occlusion, the plain sum
+  int32_t masked;              // 1: values may be NaN or infinite; such pixels pass through and touch nothing else
+  int32_t highlights;          // 0: highlights are spread with their layers
+  float crisp_px;              // blur from which on layers soften highlights
+
+  int32_t layers;          // near to far
+  const double *nodes;     // places of the layers on the blur axis, strictly increasing
+  const int32_t *scales;   // each is spread at every so many pixels, a power of two up to 16
+  const int32_t *halves;   // its kernel reaches so many of these to each side
+  int32_t kernel_colours;  // 1, or channels: kernels for each colour
+  const float *kernels;    // one layer after the other, [kernel_colours, 2 half + 1, 2 half + 1]
+
+  int32_t threads;
+  const volatile int32_t *cancelled;  // rendering stops soon after it becomes 1
+} torchdof_scene;
+
+typedef struct torchdof_job torchdof_job;
+
+// The scene must stay as it is until torchdof_finish has returned.
+TORCHDOF_API int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **job);
+
+// Signed radii of highlights, in steps of 1/32 pixel; returns how many.
+TORCHDOF_API int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps);
+
+// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. out: [channels, height, width].
+TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves, float *out);
+
+TORCHDOF_API void torchdof_free(torchdof_job *job);
+
+// out[y, x] = sum of kernel[v, u] in[y - v, x - u]: what spreads a layer. For tests and benchmarks.
+TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half,
+                                    float *out);
+
+// "avx2" or "baseline".
+TORCHDOF_API const char *torchdof_instructions(void);
+// Chooses them, for tests; returns 0 if the processor lacks them.
+TORCHDOF_API int32_t torchdof_use(const char *instructions);

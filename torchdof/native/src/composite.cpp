@@ -1,0 +1,780 @@
+// Composite: soft layers, far to near, each spread with its kernel and laid over what is behind it. The formulas are
+// told in render/composite.py. Layers of full resolution are laid tile by tile, all of them while the tile is in the
+// cache; coarser ones before that, each run of them on a canvas of its resolution.
+#include "engine.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+namespace {
+
+constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing is known
+constexpr float COVERED = 1e-5f;  // so little is left uncovered by rounding alone
+constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
+constexpr int TILE_PIXELS = TILE * TILE;
+
+inline float axis(float coc, float low, float high) { return clamp(coc - clamp(coc, -0.5f, 0.5f), low, high); }
+
+// Neighbouring layers of one resolution and, if it is a coarser one, one side of the focus.
+struct Run {
+  int scale, first, last, half;
+  int tile_rows = 0, tile_columns = 0, rows = 0, columns = 0;  // of its canvas, one pixel more on each side
+  Buffer<float> canvas;                                        // light and coverage
+  std::vector<uint8_t> used;                                   // tiles with anything in them
+};
+
+// Parts of blocks of pixels that lie between two nodes: for each its place in the window, the node before, and
+// 2 (channels + 2) sums: share, seen share and light; and these times how far between the nodes each pixel lies.
+struct Pieces {
+  std::vector<int> at, node, order;
+  std::vector<float> values;
+};
+
+// Planes of a window, `pitch` values a row.
+struct Scratch {
+  std::vector<float> memory;
+  std::vector<float *> light, coc, weight;  // of each surface (light: [surfaces, channels])
+  float *known;
+  std::vector<float *> term;    // what a layer spreads: light, share, room, seen
+  std::vector<float *> spread;  // the same spread: light, then share, room and seen of each colour
+  std::vector<float *> canvas;  // light and coverage of a tile
+  std::vector<float *> mine;    // a row of each surface's share
+  float *rest;                  // what lies wholly behind a coarse layer
+  std::vector<uint32_t> rows, every;
+  std::vector<const float *> pointers;
+  std::vector<uint64_t> layers;
+  Pieces pieces;
+};
+
+}  // namespace
+
+class Composite {
+ public:
+  Composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out)
+      : job_(job), s_(job.surfaces), layers_(job.layers), ray_kernels_(ray_kernels), ray_halves_(ray_halves), out_(out) {}
+
+  void run() {
+    H_ = job_.height, W_ = job_.width, C_ = job_.channels, E_ = job_.colours, N_ = (int)layers_.size();
+    over_ = job_.scene.occlusion;
+    extend_ = job_.scene.extend;
+    low_ = (float)layers_.front().node;
+    high_ = (float)layers_.back().node;
+    int half = 0;
+    for (int k = 0; k < N_; k++) {
+      const Layer &l = layers_[k];
+      half = std::max(half, l.half);
+      const bool near = l.node < 0;
+      if (!runs_.empty() && runs_.back().scale == l.scale && (l.scale == 1 || (layers_[runs_.back().first].node < 0) == near)) {
+        runs_.back().last = k;
+        runs_.back().half = std::max(runs_.back().half, l.half);
+      } else {
+        runs_.push_back(Run{l.scale, k, k, l.half});
+      }
+    }
+    window_ = TILE + 2 * half;
+    pitch_ = (window_ + 15) / 16 * 16 + 16;
+    scratches_.resize(std::max(1, job_.scene.threads));
+    index();
+    std::vector<std::pair<int, int>> coarse;  // run and tile
+    for (int r = 0; r < (int)runs_.size(); r++) {
+      Run &run = runs_[r];
+      if (run.scale == 1) continue;
+      run.rows = ceil_div(H_, run.scale) + 2;
+      run.columns = ceil_div(W_, run.scale) + 2;
+      run.tile_rows = ceil_div(run.rows, TILE);
+      run.tile_columns = ceil_div(run.columns, TILE);
+      run.used.assign(run.tile_rows * run.tile_columns, 0);
+      run.canvas = Buffer<float>((size_t)(C_ + E_) * run.rows * run.columns);
+      for (int t = 0; t < run.tile_rows * run.tile_columns; t++) coarse.push_back({r, t});
+    }
+    job_.parallel((int)coarse.size(), [&](int i, int worker) { coarse_tile(runs_[coarse[i].first], coarse[i].second, scratch(worker)); });
+    if (!job_.rays.empty()) sort_rays();
+    const int columns = ceil_div(W_, TILE);
+    job_.parallel(ceil_div(H_, TILE) * columns, [&](int i, int worker) { tile(i / columns, i % columns, scratch(worker)); });
+  }
+
+ private:
+  Scratch &scratch(int worker) {
+    if (!scratches_[worker]) {
+      scratches_[worker].reset(new Scratch());
+      Scratch &b = *scratches_[worker];
+      const size_t plane = (size_t)window_ * pitch_;
+      const int count = s_.count, planes = count * (C_ + 2) + 1 + (C_ + 3) + 1;
+      b.memory.assign(planes * plane + (size_t)(2 * C_ + 4 * E_) * TILE_PIXELS + (size_t)count * pitch_ * 2 + 16, 0.0f);
+      float *p = b.memory.data();
+      auto take = [&](size_t size) { return (p += size) - size; };
+      for (int i = 0; i < count * C_; i++) b.light.push_back(take(plane));
+      for (int i = 0; i < count; i++) b.coc.push_back(take(plane)), b.weight.push_back(take(plane));
+      b.known = take(plane);
+      for (int i = 0; i < C_ + 3; i++) b.term.push_back(take(plane));
+      b.rest = take(plane);
+      for (int i = 0; i < C_ + 3 * E_; i++) b.spread.push_back(take(TILE_PIXELS));
+      for (int i = 0; i < C_ + E_; i++) b.canvas.push_back(take(TILE_PIXELS));
+      for (int i = 0; i < 2 * count; i++) b.mine.push_back(take(pitch_));
+      b.rows.resize(window_);
+      b.every.assign(window_, ~0u);
+      b.pointers.resize(C_);
+      b.layers.resize(words_);
+    }
+    return *scratches_[worker];
+  }
+
+  // For each pixel of each surface the node before it, and for each cell the layers in it.
+  void index() {
+    words_ = (N_ + 63) / 64;
+    cell_rows_ = ceil_div(H_, CELL);
+    cell_columns_ = ceil_div(W_, CELL);
+    cells_.assign((size_t)cell_rows_ * cell_columns_ * words_, 0);
+    single_.assign((size_t)cell_rows_ * cell_columns_, 0);
+    for (int i = 0; i < s_.count; i++) intervals_.emplace_back(s_.area());
+    constexpr int STEPS = 4096;
+    std::vector<int> start(STEPS + 2);
+    const double reach = (double)high_ - low_;
+    for (int i = 0, k = 0; i <= STEPS + 1; i++) {
+      while (k + 1 < N_ && (float)layers_[k + 1].node <= low_ + (i - 1) * reach / STEPS) k++;
+      start[i] = k;
+    }
+    const float scale = reach > 0 ? (float)(STEPS / reach) : 0.0f;
+    job_.parallel(cell_rows_, [&](int row, int) {
+      std::vector<const float *> light(C_);
+      const float *coc, *weight;
+      for (int column = 0; column < cell_columns_; column++) {
+        const size_t cell = (size_t)row * cell_columns_ + column;
+        uint64_t *bits = &cells_[cell * words_];
+        const int x0 = column * CELL, n = std::min(CELL, W_ - x0);
+        bool single = true;
+        for (int i = 0; i < s_.count; i++)
+          for (int y = row * CELL; y < std::min(H_, (row + 1) * CELL); y++) {
+            if (!s_.row(i, y, x0, light.data(), coc, weight)) break;
+            uint16_t *interval = &intervals_[i][(size_t)y * W_ + x0];
+            for (int x = 0; x < n; x++) {
+              if (weight && (i ? weight[x] != 0 : weight[x] < 1)) single = false;
+              const float place = axis(coc[x], low_, high_);
+              int k = start[(int)((place - low_) * scale)];
+              while (k + 1 < N_ && place >= layers_[k + 1].at) k++;
+              interval[x] = (uint16_t)k;
+              if (weight && weight[x] == 0) continue;
+              bits[k / 64] |= 1ull << k % 64;
+              if (place > layers_[k].at) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
+            }
+            if (i && !weight) single = false;
+          }
+        single_[cell] = single && !s_.independent;
+      }
+    });
+  }
+
+  // Layers in cells, and whether these show the first surface alone.
+  bool around(int r0, int r1, int c0, int c1, uint64_t *bits) const {
+    r0 = std::clamp(r0, 0, cell_rows_ - 1), r1 = std::clamp(r1, 0, cell_rows_ - 1);
+    c0 = std::clamp(c0, 0, cell_columns_ - 1), c1 = std::clamp(c1, 0, cell_columns_ - 1);
+    for (int w = 0; w < words_; w++) bits[w] = 0;
+    bool single = true;
+    for (int r = r0; r <= r1; r++)
+      for (int c = c0; c <= c1; c++) {
+        const size_t cell = (size_t)r * cell_columns_ + c;
+        for (int w = 0; w < words_; w++) bits[w] |= cells_[cell * words_ + w];
+        single &= (bool)single_[cell];
+      }
+    return single;
+  }
+  static bool has(const uint64_t *bits, int k) { return bits[k / 64] >> k % 64 & 1; }
+
+  static int floor_div(int a, int b) { return a >= 0 ? a / b : -((-a + b - 1) / b); }
+
+  // A coarse run in one of its tiles.
+  void coarse_tile(Run &run, int which, Scratch &b) {
+    const int s = run.scale, tile_y = which / run.tile_columns * TILE, tile_x = which % run.tile_columns * TILE;
+    const int half = run.half, n = TILE + 2 * half;
+    const int top = tile_y - 1 - half, left = tile_x - 1 - half;  // the first block of the window
+    around(floor_div(top * s, CELL), floor_div((top + n) * s - 1, CELL), floor_div(left * s, CELL),
+           floor_div((left + n) * s - 1, CELL), b.layers.data());
+    bool any = false;
+    for (int k = run.first; k <= run.last; k++) any |= has(b.layers.data(), k);
+    if (!any) return;
+    run.used[which] = 1;
+    const bool border = !extend_ && (top < 0 || left < 0 || (top + n) * s > H_ || (left + n) * s > W_);
+    for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
+    if (!s_.independent) {
+      if (C_ == 3) gather<3>(run, top, left, n, b); else gather<0>(run, top, left, n, b);
+    }
+    for (int k = run.last; k >= run.first; k--) {
+      const Layer &l = layers_[k];
+      const bool there = s_.independent ? has(b.layers.data(), k) : !(piece_start(b, k - run.first + 2) == piece_start(b, k - run.first));
+      if (!there) {
+        continue;
+      }
+      const int spare = half - l.half, side = TILE + 2 * l.half;
+      const size_t shift = (size_t)spare * pitch_ + spare;
+      if (s_.independent)
+        block_means(k, s, top + spare, left + spare, side, shift, b);
+      else
+        add_pieces(run, k, n, b);
+      lay(b, l, side, shift, border);
+    }
+    const int rows = std::min(TILE, run.rows - tile_y), columns = std::min(TILE, run.columns - tile_x);
+    for (int c = 0; c < C_ + E_; c++)
+      for (int y = 0; y < rows; y++)
+        memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE, columns * sizeof(float));
+  }
+
+  static int piece_start(const Scratch &b, int i) { return b.pieces.order[i]; }
+
+  // What the blocks of a window hold for a run, sorted by node. Pieces between node first - 1 + i and the next one are
+  // order[i] to order[i + 1].
+  template <int CHANNELS>
+  void gather(const Run &run, int top, int left, int n, Scratch &b) {
+    const int C = CHANNELS ? CHANNELS : C_, s = run.scale, stride = 2 * (C + 2), L = run.last - run.first + 2;
+    const float each = 1.0f / (s * s);
+    Pieces &p = b.pieces;
+    p.at.clear();
+    p.node.clear();
+    p.values.clear();
+    std::vector<float> sums(stride);
+    for (int by = 0; by < n; by++) memset(b.rest + (size_t)by * pitch_, 0, n * sizeof(float));
+    for (int by = 0; by < n; by++)
+      for (int bx = 0; bx < n; bx++) {
+        const int y0 = (top + by) * s, x0 = (left + bx) * s, place = by * pitch_ + bx;
+        const bool inside = y0 >= 0 && x0 >= 0 && y0 + s <= H_ && x0 + s <= W_;
+        int count = s_.count;
+        if (s <= CELL) {
+          const size_t cell = (size_t)(std::clamp(y0, 0, H_ - 1) / CELL) * cell_columns_ + std::clamp(x0, 0, W_ - 1) / CELL;
+          if (inside) {
+            bool before = false, behind = false, here = false;  // layers of the cell relative to the run
+            const uint64_t *bits = &cells_[cell * words_];
+            for (int w = 0; w < words_; w++) {
+              before |= (bits[w] & below(run.first, w)) != 0;
+              behind |= (bits[w] & ~below(run.last + 1, w)) != 0;
+              here |= (bits[w] & ~below(run.first, w) & below(run.last + 1, w)) != 0;
+            }
+            if (!here && !behind) continue;
+            if (single_[cell]) {
+              if (!here && !before) {
+                b.rest[place] = 1.0f;
+                continue;
+              }
+              count = 1;
+            }
+          }
+        }
+        for (int i = 0; i < count; i++) {
+          int node = -1;
+          auto flush = [&] {
+            if (node < 0) return;
+            p.at.push_back(place);
+            p.node.push_back(node - run.first + 1);
+            p.values.insert(p.values.end(), sums.begin(), sums.end());
+          };
+          for (int y = 0; y < s; y++) {
+            const float *light_row[CHANNELS ? CHANNELS : 1];
+            const float **light = CHANNELS ? light_row : b.pointers.data();
+            const float *coc, *weight;
+            const int at_y = std::clamp(y0 + y, 0, H_ - 1);
+            if (inside && !s_.row(i, at_y, x0, light, coc, weight)) break;
+            for (int x = 0; x < s; x++) {
+              int at = x, at_x = x0 + x;
+              bool known = true;
+              if (!inside) {
+                known = extend_ || (y0 + y == at_y && at_x >= 0 && at_x < W_);
+                at_x = std::clamp(at_x, 0, W_ - 1);
+                at = 0;
+                if (!s_.row(i, at_y, at_x, light, coc, weight)) continue;
+              }
+              const float w = weight ? weight[at] : 1.0f;
+              if (w == 0) continue;
+              const int k = intervals_[i][(size_t)at_y * W_ + at_x];
+              if (k + 1 < run.first) continue;
+              if (k > run.last) {
+                b.rest[place] += w * each;
+                continue;
+              }
+              if (k != node) {
+                flush();
+                node = k;
+                std::fill(sums.begin(), sums.end(), 0.0f);
+              }
+              const float part = (axis(coc[at], low_, high_) - layers_[k].at) * layers_[k].per_after;
+              float *one = sums.data(), *two = one + C + 2;
+              one[0] += w;
+              two[0] += w * part;
+              if (!known) continue;
+              one[1] += w;
+              two[1] += w * part;
+              for (int c = 0; c < C; c++) {
+                const float v = light[c][at] * w;
+                one[2 + c] += v;
+                two[2 + c] += v * part;
+              }
+            }
+          }
+          flush();
+        }
+      }
+    // sorted by node
+    const int pieces = (int)p.at.size();
+    p.order.assign(L + 2 + pieces, 0);
+    for (int node : p.node) p.order[node + 1]++;
+    for (int i = 0; i <= L; i++) p.order[i + 1] += p.order[i];
+    std::vector<int> next(p.order.begin(), p.order.begin() + L + 1);
+    for (int i = 0; i < pieces; i++) p.order[L + 2 + next[p.node[i]]++] = i;
+  }
+
+  static uint64_t below(int k, int word) {  // bits of layers before layer k
+    const int bit = k - 64 * word;
+    return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
+  }
+
+  // What layer k spreads of the pieces of its run; what lies behind it is added to the rest.
+  void add_pieces(const Run &run, int k, int n, Scratch &b) {
+    const int C = C_, stride = 2 * (C + 2), L = run.last - run.first + 2;
+    const float each = 1.0f / (run.scale * run.scale);
+    Pieces &p = b.pieces;
+    for (int c = 0; c < C + 3; c++)
+      if (c != C + 1) memset(b.term[c], 0, sizeof(float) * n * pitch_);
+    auto add = [&](int node, bool behind) {  // pieces before the layer's node, or behind it
+      for (int i = p.order[node]; i < p.order[node + 1]; i++) {
+        const int piece = p.order[L + 2 + i], at = p.at[piece];
+        const float *one = &p.values[(size_t)piece * stride], *two = one + C + 2;
+        auto part = [&](int v) { return (behind ? one[v] - two[v] : two[v]) * each; };
+        b.term[C][at] += part(0);
+        b.term[C + 2][at] += part(1);
+        for (int c = 0; c < C; c++) b.term[c][at] += part(2 + c);
+        if (behind)
+          b.rest[at] += one[0] * each;
+        else
+          b.term[C + 1][at] += part(0);
+      }
+    };
+    add(k - run.first + 1, true);
+    memcpy(b.term[C + 1], b.rest, sizeof(float) * n * pitch_);
+    add(k - run.first, false);
+  }
+
+  // The same of surfaces that cover each other: means of what the layer spreads at each pixel.
+  void block_means(int k, int s, int top, int left, int side, size_t shift, Scratch &b) {
+    const float each = 1.0f / (s * s);
+    const int n = side * s;
+    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + 1 + C_ + 3 + 2 * s_.count) * n);
+    float *m = memory.data();
+    auto take = [&] { return (m += n) - n; };
+    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 3), mine(2 * s_.count);
+    for (auto *v : {&light, &coc, &weight, &term, &mine})
+      for (float *&row : *v) row = take();
+    float *known = take();
+    for (int by = 0; by < side; by++) {
+      const size_t to = shift + (size_t)by * pitch_;
+      for (int c = 0; c < C_ + 3; c++) memset(b.term[c] + to, 0, side * sizeof(float));
+      for (int y = 0; y < s; y++) {
+        read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), known, b);
+        row_terms(layers_[k], n, false, light.data(), coc.data(), weight.data(), mine.data(), term.data());
+        for (int x = 0; x < n; x++) {
+          for (int c = 0; c < C_ + 2; c++) b.term[c][to + x / s] += term[c][x] * each;
+          b.term[C_ + 2][to + x / s] += term[C_][x] * known[x] * each;
+        }
+      }
+    }
+  }
+
+  // A row of all surfaces, continued beyond the frame: light [surfaces, channels], place on the blur axis and weight.
+  void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight, float *known, Scratch &b) {
+    const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1), last = std::clamp(x0 + n - 1, 0, W_ - 1);
+    const int before = std::max(0, std::min(n, -x0)), after = std::max(0, std::min(n, x0 + n - W_));
+    const bool row_known = extend_ || y == at_y;
+    for (int i = 0; i < (single ? 1 : s_.count); i++) {
+      const float *from_coc, *from_weight;
+      for (int x = first; x <= last;) {
+        const int end = s_.whole() ? last + 1 : std::min(last + 1, (x / BLOCK + 1) * BLOCK), count = end - x, to = std::max(x - x0, 0);
+        const int target = x0 > W_ - 1 ? 0 : x0 + n <= 0 ? n - 1 : to;  // a window beside the frame sees its nearest pixel
+        if (s_.row(i, at_y, x, b.pointers.data(), from_coc, from_weight)) {
+          for (int c = 0; c < C_; c++) memcpy(light[i * C_ + c] + target, b.pointers[c], count * sizeof(float));
+          memcpy(coc[i] + target, from_coc, count * sizeof(float));
+          if (from_weight) memcpy(weight[i] + target, from_weight, count * sizeof(float));
+          else std::fill(weight[i] + target, weight[i] + target + count, 1.0f);
+        } else {
+          for (int c = 0; c < C_; c++) memset(light[i * C_ + c] + target, 0, count * sizeof(float));
+          memset(coc[i] + target, 0, count * sizeof(float));
+          memset(weight[i] + target, 0, count * sizeof(float));
+        }
+        x = end;
+      }
+      auto go_on = [&](float *row, bool light_row) {
+        const int inner = std::min(before, n - 1), end = std::max(n - after, 1) - 1;
+        const float l = row[inner], r = row[end];
+        for (int x = 0; x < before; x++) row[x] = light_row && !extend_ ? 0.0f : l;
+        for (int x = n - after; x < n; x++) row[x] = light_row && !extend_ ? 0.0f : r;
+      };
+      for (int c = 0; c < C_; c++) {
+        go_on(light[i * C_ + c], true);
+        if (!row_known) memset(light[i * C_ + c], 0, n * sizeof(float));
+      }
+      go_on(coc[i], false);
+      go_on(weight[i], false);
+      for (int x = 0; x < n; x++) coc[i][x] = axis(coc[i][x], low_, high_);
+    }
+    for (int x = 0; x < n; x++) known[x] = row_known && (extend_ || (x >= before && x < n - after));
+  }
+
+  // What a layer spreads of a row: light, share, and the share at or behind it, its room.
+  void row_terms(const Layer &l, int n, bool single, const float *const *light, const float *const *x, const float *const *weight,
+                 float *const *mine, float *const *term) const {
+    const float before = l.before, per_before = l.per_before, at = l.at, per_after = l.per_after;
+    const float first = l.first ? 1.0f : 0.0f;
+    float *share = term[C_], *room = term[C_ + 1];
+    if (single) {
+      const float *p = x[0];
+      for (int i = 0; i < n; i++) {
+        const float h = clamp01((p[i] - before) * per_before + first);
+        room[i] = h;
+        share[i] = h - clamp01((p[i] - at) * per_after);
+      }
+      for (int c = 0; c < C_; c++) {
+        float *o = term[c];
+        const float *v = light[c];
+        for (int i = 0; i < n; i++) o[i] = v[i] * share[i];
+      }
+      return;
+    }
+    if (!s_.independent) {
+      for (int j = 0; j < s_.count; j++) {
+        const float *p = x[j], *w = weight[j];
+        float *m = mine[j];
+        for (int i = 0; i < n; i++) {
+          const float h = clamp01((p[i] - before) * per_before + first);
+          m[i] = (h - clamp01((p[i] - at) * per_after)) * w[i];
+          const float r = h * w[i];
+          share[i] = j ? share[i] + m[i] : m[i];
+          room[i] = j ? room[i] + r : r;
+        }
+      }
+    } else {
+      // a pixel is there for the layer as far as what is at or behind it is known, but for what that has in front
+      float *left = mine[s_.count], *unknown = mine[s_.count + 1 < 2 * s_.count ? s_.count + 1 : s_.count];
+      std::vector<float> spare;
+      if (s_.count == 1) {
+        spare.resize(n);
+        unknown = spare.data();
+      }
+      for (int i = 0; i < n; i++) room[i] = left[i] = unknown[i] = 1.0f;
+      for (int j = 0; j < s_.count; j++) {
+        const float *p = x[j], *w = weight[j];
+        float *m = mine[j];
+        for (int i = 0; i < n; i++) {
+          const float h = clamp01((p[i] - before) * per_before + first), cover = w[i];
+          const float g = h - clamp01((p[i] - at) * per_after);
+          const float there = h > 0 ? 1.0f - cover * (1.0f - h) : 1.0f;
+          const float stops = cover * g / std::max(there, LEAST);
+          m[i] = left[i] * stops;
+          left[i] *= 1.0f - stops;
+          room[i] *= there;
+          unknown[i] = h > 0 ? unknown[i] * (1.0f - cover) : unknown[i];
+        }
+      }
+      for (int i = 0; i < n; i++) share[i] = 0;
+      for (int j = 0; j < s_.count; j++)
+        for (int i = 0; i < n; i++) share[i] += mine[j][i] *= room[i];
+      for (int i = 0; i < n; i++) room[i] *= 1.0f - unknown[i];
+    }
+    for (int c = 0; c < C_; c++) {
+      float *o = term[c];
+      for (int j = 0; j < s_.count; j++) {
+        const float *v = light[j * C_ + c], *m = mine[j];
+        if (j == 0)
+          for (int i = 0; i < n; i++) o[i] = v[i] * m[i];
+        else
+          for (int i = 0; i < n; i++) o[i] += v[i] * m[i];
+      }
+    }
+  }
+
+  // Spreads the terms of a layer, which begin at an offset, and lays them on the tile's canvas.
+  void lay(Scratch &b, const Layer &l, int side, size_t shift, bool border) {
+    const int C = C_, E = E_;
+    bool any = false, closed = true, flat = true;
+    for (int y = 0; y < side; y++) {
+      const float *share = b.term[C] + shift + (size_t)y * pitch_, *room = b.term[C + 1] + shift + (size_t)y * pitch_;
+      uint32_t bits = 0;
+      for (int x = 0; x < side; x += 16) {
+        const int end = std::min(x + 16, side);
+        bool some = false;
+        for (int i = x; i < end; i++) some |= share[i] > 0;
+        bits |= (uint32_t)some << std::min(x / 16, 31);
+      }
+      b.rows[y] = bits;
+      any |= bits != 0;
+      if (over_)
+        for (int x = 0; x < side; x++) {
+          closed &= room[x] == share[x];
+          flat &= std::fabs(room[x] - 1.0f) <= 1e-6f;
+        }
+    }
+    if (!any) return;
+    auto spread = [&](int term, const uint32_t *rows, const Kernel &kernel, float *to) {
+      if (l.half)
+        convolve(b.term[term] + shift, pitch_, rows, kernel, TILE, TILE, to, TILE);
+      else
+        for (int y = 0; y < TILE; y++)
+          for (int x = 0; x < TILE; x++) to[y * TILE + x] = b.term[term][shift + (size_t)y * pitch_ + x] * kernel.sum;
+    };
+    for (int c = 0; c < C; c++) spread(c, b.rows.data(), l.kernels[E > 1 ? c : 0], b.spread[c]);
+    for (int e = 0; e < E; e++) {
+      const Kernel &kernel = l.kernels[e];
+      float *share = b.spread[C + e], *room = b.spread[C + E + e], *seen = b.spread[C + 2 * E + e];
+      if (!over_) {
+        spread(border ? C + 2 : C, b.rows.data(), kernel, share);
+        for (int c = 0; c < C; c++) {
+          if (E > 1 && c != e) continue;
+          for (int i = 0; i < TILE_PIXELS; i++) b.canvas[c][i] += b.spread[c][i];
+        }
+        for (int i = 0; i < TILE_PIXELS; i++) b.canvas[C + e][i] += share[i];
+        continue;
+      }
+      if (flat)
+        std::fill(room, room + TILE_PIXELS, kernel.sum);
+      else
+        spread(C + 1, b.every.data(), kernel, room);
+      if (closed)
+        memcpy(share, room, TILE_PIXELS * sizeof(float));
+      else
+        spread(C, b.rows.data(), kernel, share);
+      if (border) spread(C + 2, b.rows.data(), kernel, seen);
+      // colour = light / room, coverage = share / room; where not all light was seen, the colour of what was, fading
+      // out with the last of it
+      float *gain = room, *cover = share, *left = seen;
+      for (int i = 0; i < TILE_PIXELS; i++) {
+        const float r = 1.0f / std::max(room[i], LEAST);
+        float g = r, a = share[i];
+        if (border) {
+          const float floor = clamp(share[i], LEAST * LEAST, LEAST);
+          g *= share[i] / std::max(seen[i], floor);
+          a *= std::min(seen[i] / floor, 1.0f);
+        }
+        a *= r;
+        gain[i] = g;
+        cover[i] = a;
+        left[i] = std::max(1.0f - a, 0.0f);
+      }
+      for (int c = 0; c < C; c++) {
+        if (E > 1 && c != e) continue;
+        float *canvas = b.canvas[c];
+        const float *light = b.spread[c];
+        for (int i = 0; i < TILE_PIXELS; i++) canvas[i] = light[i] * gain[i] + left[i] * canvas[i];
+      }
+      float *covered = b.canvas[C + e];
+      for (int i = 0; i < TILE_PIXELS; i++) covered[i] = cover[i] + left[i] * covered[i];
+    }
+  }
+
+  // A coarser canvas, interpolated, over the tile's canvas.
+  void join_finer(const Run &run, int y0, int x0, Scratch &b) {
+    const int s = run.scale;
+    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / TILE, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / TILE;
+    bool any = false, all = true;
+    for (int r = y0 / s / TILE; r <= r1; r++)
+      for (int c = x0 / s / TILE; c <= c1; c++) {
+        any |= run.used[r * run.tile_columns + c];
+        all &= (bool)run.used[r * run.tile_columns + c];
+      }
+    if (!any) return;
+    const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s;
+    std::vector<float> lines((size_t)channels * (count + 1)), values((size_t)channels * TILE);
+    auto used = [&](int r, int c) { return all || run.used[r / TILE * run.tile_columns + c / TILE]; };
+    for (int y = 0; y < TILE; y++) {
+      const float at_y = (y0 + y + 0.5f) / s + 0.5f;
+      const int row = std::min((int)at_y, run.rows - 2);
+      const float down = at_y - row;
+      for (int c = 0; c < channels; c++) {
+        const float *plane = &run.canvas[(size_t)c * run.rows * run.columns];
+        float *line = &lines[(size_t)c * (count + 1)];
+        for (int i = 0; i <= count; i++) {
+          const int column = std::min(first + i, run.columns - 1);
+          const float a = used(row, column) ? plane[(size_t)row * run.columns + column] : 0.0f;
+          const float z = used(row + 1, column) ? plane[(size_t)(row + 1) * run.columns + column] : 0.0f;
+          line[i] = a + down * (z - a);
+        }
+        float *v = &values[(size_t)c * TILE];
+        for (int x = 0; x < TILE; x++) {
+          const float at_x = (x + 0.5f) / s + 0.5f;
+          const int column = (int)at_x;
+          v[x] = line[column] + (at_x - column) * (line[column + 1] - line[column]);
+        }
+      }
+      for (int e = 0; e < E_; e++) {
+        const float *cover = &values[(size_t)(C_ + e) * TILE];
+        float left[TILE];
+        for (int x = 0; x < TILE; x++) left[x] = over_ ? std::max(1.0f - cover[x], 0.0f) : 1.0f;
+        for (int c = 0; c < C_ + E_; c++) {
+          if (c < C_ ? E_ > 1 && c != e : c != C_ + e) continue;
+          float *canvas = b.canvas[c] + y * TILE;
+          const float *v = &values[(size_t)c * TILE];
+          for (int x = 0; x < TILE; x++) canvas[x] = v[x] + left[x] * canvas[x];
+        }
+      }
+    }
+  }
+
+  void tile(int tile_row, int tile_column, Scratch &b) {
+    const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0), columns = std::min(TILE, W_ - x0);
+    for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
+    // layers of full resolution whose light reaches the tile
+    std::vector<int> reaching;
+    int halo = 0, known_reach = -1;
+    for (int k = N_ - 1; k >= 0; k--) {
+      const Layer &l = layers_[k];
+      if (l.scale > 1) continue;
+      const int reach = ceil_div(l.half, CELL);
+      if (reach != known_reach) look_around(y0, x0, known_reach = reach, b);
+      if (!has(b.layers.data(), k)) continue;
+      reaching.push_back(k);
+      halo = std::max(halo, l.half);
+    }
+    const bool border = !extend_ && (y0 < halo || x0 < halo || y0 + TILE + halo > H_ || x0 + TILE + halo > W_);
+    bool single = false;
+    if (!reaching.empty()) {
+      single = look_around(y0, x0, ceil_div(halo, CELL), b);
+      std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
+      float *known = b.known;
+      for (int y = y0 - halo; y < y0 + TILE + halo; y++) {
+        read_row(y, x0 - halo, TILE + 2 * halo, single, light.data(), coc.data(), weight.data(), known, b);
+        for (auto *v : {&light, &coc, &weight})
+          for (float *&row : *v) row += pitch_;
+        known += pitch_;
+      }
+    }
+    size_t next = 0;
+    std::vector<const float *> light(s_.count * C_), coc(s_.count), weight(s_.count);
+    std::vector<float *> term(C_ + 3);
+    for (int r = (int)runs_.size() - 1; r >= 0; r--) {
+      const Run &run = runs_[r];
+      if (run.scale > 1) {
+        join_finer(run, y0, x0, b);
+        continue;
+      }
+      for (; next < reaching.size() && reaching[next] >= run.first; next++) {
+        const Layer &l = layers_[reaching[next]];
+        const int spare = halo - l.half, side = TILE + 2 * l.half;
+        for (int y = 0; y < side; y++) {
+          const size_t from = (size_t)(y + spare) * pitch_ + spare, to = (size_t)y * pitch_;
+          for (int i = 0; i < s_.count; i++) {
+            for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + from;
+            coc[i] = b.coc[i] + from;
+            weight[i] = b.weight[i] + from;
+          }
+          for (int c = 0; c < C_ + 3; c++) term[c] = b.term[c] + to;
+          row_terms(l, side, single, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
+          if (border)
+            for (int x = 0; x < side; x++) term[C_ + 2][x] = term[C_][x] * b.known[from + x];
+        }
+        lay(b, l, side, 0, border);
+      }
+    }
+    finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);
+  }
+
+  bool look_around(int y0, int x0, int reach, Scratch &b) const {
+    return around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
+  }
+
+  // The tile's canvas over what lies behind all layers, with the light of rays, to the picture.
+  void finish(int which, int y0, int x0, int rows, int columns, Scratch &b) {
+    const int C = C_, E = E_;
+    float *const traced = b.spread[0];  // [channels, TILE, TILE]: planes of spread lie side by side
+    const bool has_rays = !job_.rays.empty() && ray_start_[which] < ray_start_[which + 1];
+    if (has_rays) {
+      memset(traced, 0, sizeof(float) * C * TILE_PIXELS);
+      splat(job_, visibility_, y0, x0, &ray_list_[ray_start_[which]], ray_start_[which + 1] - ray_start_[which], ray_kernels_, ray_halves_, traced);
+    }
+    const bool normalize = over_ ? job_.behind.empty() : (bool)job_.scene.normalize;
+    if (has_rays && !over_)
+      for (int i = 0; i < C * TILE_PIXELS; i++) b.canvas[0][i] += traced[i];
+    if (normalize)
+      for (int c = 0; c < C; c++) {
+        const float *cover = b.canvas[C + (E > 1 ? c : 0)];
+        for (int i = 0; i < TILE_PIXELS; i++) b.canvas[c][i] = cover[i] > LEAST ? b.canvas[c][i] / cover[i] : 0.0f;
+      }
+    else if (over_)
+      lay_over_behind(y0, x0, rows, columns, b);
+    if (has_rays && over_)
+      for (int i = 0; i < C * TILE_PIXELS; i++) b.canvas[0][i] += traced[i];
+    for (int c = 0; c < C; c++)
+      for (int y = 0; y < rows; y++) {
+        const size_t at = ((size_t)c * H_ + y0 + y) * W_ + x0;
+        memcpy(out_ + at, b.canvas[c] + y * TILE, columns * sizeof(float));
+        if (!s_.valid) continue;
+        const float *valid = s_.valid + (size_t)(y0 + y) * W_ + x0;
+        for (int x = 0; x < columns; x++)
+          if (!(valid[x] > 0)) out_[at + x] = job_.scene.light[0][at + x];
+      }
+  }
+
+  void lay_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
+    float least = 1.0f;
+    for (int e = 0; e < E_; e++)
+      for (int y = 0; y < rows; y++)
+        for (int x = 0; x < columns; x++) least = std::min(least, b.canvas[C_ + e][y * TILE + x]);
+    if (!(least < 1.0f - COVERED)) return;
+    const int h = job_.behind_height, w = job_.behind_width;
+    for (int y = 0; y < rows; y++) {
+      const float at_y = std::max((y0 + y + 0.5f) / BEHIND_STEP - 0.5f, 0.0f);
+      const int top = std::min((int)at_y, h - 1), bottom = std::min(top + 1, h - 1);
+      for (int x = 0; x < columns; x++) {
+        const float at_x = std::max((x0 + x + 0.5f) / BEHIND_STEP - 0.5f, 0.0f);
+        const int left = std::min((int)at_x, w - 1), right = std::min(left + 1, w - 1);
+        const float down = at_y - top, across = at_x - left;
+        for (int c = 0; c < C_; c++) {
+          const float *p = &job_.behind[(size_t)c * h * w];
+          const float u = p[(size_t)top * w + left] + across * (p[(size_t)top * w + right] - p[(size_t)top * w + left]);
+          const float v = p[(size_t)bottom * w + left] + across * (p[(size_t)bottom * w + right] - p[(size_t)bottom * w + left]);
+          const float uncovered = std::max(1.0f - b.canvas[C_ + (E_ > 1 ? c : 0)][y * TILE + x], 0.0f);
+          b.canvas[c][y * TILE + x] += uncovered * (u + down * (v - u));
+        }
+      }
+    }
+  }
+
+  // For each tile the rays that land in it, in their order.
+  void sort_rays() {
+    visibility_ = look_at(job_);
+    const int tile_rows = ceil_div(H_, TILE), tile_columns = ceil_div(W_, TILE);
+    ray_start_.assign(tile_rows * tile_columns + 1, 0);
+    auto each_tile = [&](auto body) {
+      for (int i = 0; i < (int)job_.rays.size(); i++) {
+        const Ray &ray = job_.rays[i];
+        const int half = ray_halves_[ray.radius];
+        const int r0 = std::max(ray.row - half, 0) / TILE, r1 = std::min(ray.row + half, H_ - 1) / TILE;
+        const int c0 = std::max(ray.column - half, 0) / TILE, c1 = std::min(ray.column + half, W_ - 1) / TILE;
+        for (int r = r0; r <= r1; r++)
+          for (int c = c0; c <= c1; c++) body(i, r * tile_columns + c);
+      }
+    };
+    each_tile([&](int, int tile) { ray_start_[tile + 1]++; });
+    for (size_t t = 0; t + 1 < ray_start_.size(); t++) ray_start_[t + 1] += ray_start_[t];
+    ray_list_.resize(ray_start_.back());
+    std::vector<int> next(ray_start_.begin(), ray_start_.end() - 1);
+    each_tile([&](int i, int tile) { ray_list_[next[tile]++] = i; });
+  }
+
+  const Job &job_;
+  const Surfaces &s_;
+  const std::vector<Layer> &layers_;
+  const float *const *ray_kernels_;
+  const int32_t *ray_halves_;
+  float *out_;
+  int H_, W_, C_, E_, N_;
+  bool over_, extend_;
+  float low_, high_;  // the outermost nodes
+  std::vector<Run> runs_;
+  int window_, pitch_;
+  std::vector<std::unique_ptr<Scratch>> scratches_;
+  int words_, cell_rows_, cell_columns_;
+  std::vector<uint64_t> cells_;            // layers that occur in each cell, a bit each
+  std::vector<uint8_t> single_;            // cells that show the first surface alone, whole
+  std::vector<Buffer<uint16_t>> intervals_;
+  Visibility visibility_;
+  std::vector<int> ray_start_, ray_list_;
+};
+
+void composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out) {
+  Composite(job, ray_kernels, ray_halves, out).run();
+}
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof

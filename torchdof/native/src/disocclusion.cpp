@@ -1,0 +1,362 @@
+// Disocclusion: what a blurred foreground hides, filled in from the farthest surfaces around. The formulas are told in
+// render/disocclusion.py.
+#include "engine.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+namespace {
+
+constexpr float BEHIND_PX = 2.0f;  // a hidden surface lies at least so much farther, in coc
+constexpr float FALL = 0.7f;       // weight of a level of the pyramid against the finer one before
+constexpr int CELL_LEVEL = 3;      // of the pyramid, in whose pixels it is told which may hide something
+constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones are looked at from cells of STEP pixels
+constexpr int STEP = 1 << FINE_LEVELS;
+constexpr float MIXED = 0.05f;  // least share of a second surface that the pyramid takes
+
+// Farthest surfaces, at every step-th pixel: light of each channel, coc, weight, and what fills the stride.
+struct Level {
+  int height, width, step, stride, channels;
+  float vote;  // weight against other levels; 0: it is in the weights
+  float least_px;  // blur from which on a pixel looks so far
+  Buffer<float> values;
+  float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
+  float coc(int y, int x) const { return at(y, x)[channels]; }
+};
+
+// Of four children the mean of those that are farthest.
+void farthest(const float *const *child, int channels, int stride, float *out) {
+  float most = child[0][channels];
+  for (int i = 1; i < 4; i++) most = std::max(most, child[i][channels]);
+  most -= BEHIND_PX;
+  float total = 0, counts[4];
+  for (int i = 0; i < 4; i++) total += counts[i] = child[i][channels] > most ? child[i][channels + 1] : 0.0f;
+  total *= 0.25f;
+  const float each = 0.25f / std::max(total, 1e-9f);
+  for (int i = 0; i < 4; i++) counts[i] *= each;
+  for (int c = 0; c <= channels; c++)
+    out[c] = child[0][c] * counts[0] + child[1][c] * counts[1] + child[2][c] * counts[2] + child[3][c] * counts[3];
+  if (!(total > 0)) out[channels] = -NEVER;
+  out[channels + 1] = total;
+  for (int c = channels + 2; c < stride; c++) out[c] = 0;
+}
+
+typedef float f4 __attribute__((vector_size(16)));
+
+inline void between(float at, int size, int &before, float &part) {
+  at = clamp(at, 0.0f, (float)(size - 1));
+  before = std::min((int)at, std::max(0, size - 2));
+  part = at - before;
+}
+
+// Mean of the four samples of a level around a place, of those only that lie behind it; returns their weight.
+template <int F4>
+float behind(const Level &level, float row, float column, float here, f4 *seen) {
+  const int count = F4 ? F4 : level.stride / 4, C = level.channels;
+  int y, x;
+  float down, right;
+  const float per_step = 1.0f / level.step;
+  between((row + 0.5f) * per_step - 0.5f, level.height, y, down);
+  between((column + 0.5f) * per_step - 0.5f, level.width, x, right);
+  const float *first = level.at(y, x);
+  const size_t below = level.height > 1 ? (size_t)level.width * level.stride : 0, beside = level.width > 1 ? level.stride : 0;
+  const float *corner[4] = {first, first + beside, first + below, first + below + beside};
+  const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
+  float total = 0;
+  for (int i = 0; i < count; i++) seen[i] = f4{};
+  for (int k = 0; k < 4; k++) {
+    const float s = corner[k][C] > here + BEHIND_PX ? share[k] * corner[k][C + 1] : 0.0f;
+    total += s;
+    for (int i = 0; i < count; i++) seen[i] += load<f4>(corner[k] + 4 * i) * f4{s, s, s, s};
+  }
+  if (!(total > 1e-4f)) total = 0;
+  const float each = 1.0f / std::max(total, 1e-4f);
+  for (int i = 0; i < count; i++) seen[i] *= f4{each, each, each, each};
+  return total;
+}
+
+// What levels show behind a place: light, coc; returns the sum of their votes. With farthest, of two surfaces only the
+// farther one counts.
+template <int F4>
+float look(const Level *const *levels, int n, float row, float column, float here, bool farthest, float *out, f4 *b) {
+  const int count = F4 ? F4 : levels[0]->stride / 4, C = levels[0]->channels;
+  float total = 0;
+  for (int i = 0; i < 4 * count; i++) out[i] = 0;
+  for (int l = 0; l < n; l++) {
+    const Level &level = *levels[l];
+    if (level.least_px > std::fabs(here)) continue;
+    const float any = behind<F4>(level, row, column, here, b);
+    float vote = any > 0 ? (level.vote > 0 ? level.vote : any) : 0.0f;
+    if (farthest) {
+      const float apart = ((const float *)b)[C] - out[C];
+      if (total > 0 && apart < -BEHIND_PX) vote = 0;
+      if (vote > 0 && apart > BEHIND_PX) total = 0;
+    }
+    total += vote;
+    if (!(vote > 0)) continue;
+    const float part = vote / std::max(total, 1e-9f);
+    for (int i = 0; i < count; i++) {
+      const f4 o = load<f4>(out + 4 * i);
+      store(out + 4 * i, o + (b[i] - o) * f4{part, part, part, part});
+    }
+  }
+  return total;
+}
+
+class Filling {
+ public:
+  Filling(Job &job) : job_(job), s_(job.surfaces), C_(job.channels), stride_((job.channels + 2 + 3) / 4 * 4) {}
+
+  void run() {
+    const int levels = job_.levels, step = 1 << levels;
+    area_height_ = (job_.height + 2 * step - 1) / step * step;
+    area_width_ = (job_.width + 2 * step - 1) / step * step;
+    coarsest_ = std::min(levels, CELL_LEVEL);
+    cell_ = 1 << coarsest_;
+    cell_rows_ = area_height_ / cell_;
+    cell_columns_ = area_width_ / cell_;
+    pyramid_.resize(levels);
+    for (int i = 0; i < levels; i++) {
+      Level &l = pyramid_[i];
+      l.height = area_height_ >> (i + 1);
+      l.width = area_width_ >> (i + 1);
+      l.step = 2 << i;
+      l.stride = stride_;
+      l.channels = C_;
+      l.vote = (float)std::pow((double)FALL, i + 1);
+      l.least_px = (float)std::pow(2.0, i - 1);
+      l.values = Buffer<float>((size_t)l.height * l.width * stride_);
+    }
+    near_.resize(cell_rows_ * cell_columns_);
+    blur_.resize(near_.size());
+    found_.resize(near_.size());
+    fine_.resize(near_.size());
+    job_.parallel(area_height_ / BLOCK + (area_height_ % BLOCK != 0), [&](int band, int) { finest(band); });
+    for (int i = 1; i < levels; i++)
+      job_.parallel(ceil_div(pyramid_[i].height, 8), [&](int band, int) { coarser(i, band); });
+    job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
+    if (stride_ == 8) fill<2>(); else fill<0>();
+  }
+
+ private:
+  // First level of the pyramid: one band of rows of the image, and its cells.
+  void finest(int band) {
+    const int H = job_.height, W = job_.width, C = C_, y_end = std::min(area_height_, (band + 1) * BLOCK);
+    const Level &level = pyramid_[0];
+    const size_t area = s_.area();
+    for (int y = band * BLOCK; y < y_end; y++)
+      if (y % cell_ == 0)
+        for (int x = 0; x < cell_columns_; x++) {
+          near_[y / cell_ * cell_columns_ + x] = NEVER;
+          blur_[y / cell_ * cell_columns_ + x] = 0;
+        }
+    std::vector<float> children(4 * stride_);
+    const float *child[4];
+    for (int i = 0; i < 4; i++) child[i] = children.data() + i * stride_;
+    for (int bx = 0; bx * BLOCK < area_width_; bx++) {
+      const int x_end = std::min(area_width_, (bx + 1) * BLOCK);
+      const bool inside = y_end <= H && x_end <= W && y_end == (band + 1) * BLOCK && x_end == (bx + 1) * BLOCK;
+      const int which = inside ? band * s_.block_columns + bx : 0;
+      const bool plain = inside && !s_.has_block(which) && job_.block_high[which] - job_.block_low[which] < BEHIND_PX &&
+                         !has_highlight(band * BLOCK, bx * BLOCK);
+      for (int y = band * BLOCK; y < y_end; y += 2)
+        for (int x = bx * BLOCK; x < x_end; x += 2) {
+          float *out = level.at(y / 2, x / 2);
+          float &near = near_[y / cell_ * cell_columns_ + x / cell_], &blur = blur_[y / cell_ * cell_columns_ + x / cell_];
+          if (plain) {  // all four count
+            const size_t at = (size_t)y * W + x;
+            for (int c = 0; c <= C; c++) {
+              const float *p = (c < C ? s_.light + c * area : s_.coc) + at;
+              out[c] = 0.25f * p[0] + 0.25f * p[1] + (0.25f * p[W] + 0.25f * p[W + 1]);
+            }
+            const float *p = s_.coc + at;
+            near = std::min(near, std::min(std::min(p[0], p[1]), std::min(p[W], p[W + 1])));
+            blur = std::max(blur, std::max(std::max(std::fabs(p[0]), std::fabs(p[1])), std::max(std::fabs(p[W]), std::fabs(p[W + 1]))));
+            out[C + 1] = 1.0f;
+            for (int c = C + 2; c < stride_; c++) out[c] = 0;
+            continue;
+          }
+          for (int i = 0; i < 4; i++) {
+            const int py = std::min(y + i / 2, H - 1), px = std::min(x + i % 2, W - 1);
+            float *v = children.data() + i * stride_;
+            pixel(py, px, v);
+            const float coc = s_.coc[(size_t)py * W + px];
+            near = std::min(near, coc);
+            blur = std::max(blur, std::fabs(coc));
+          }
+          farthest(child, C, stride_, out);
+        }
+    }
+  }
+
+  bool has_highlight(int y0, int x0) const {
+    const size_t area = s_.area();
+    for (int y = y0; y < y0 + BLOCK; y++) {
+      float first, step;
+      threshold_row(job_, y, x0, first, step);
+      bool bright = false;
+      for (int c = 0; c < C_; c++) {
+        const float *p = s_.light + c * area + (size_t)y * job_.width + x0;
+        for (int x = 0; x < BLOCK; x++) bright |= p[x] > first + step * x;
+      }
+      if (bright) return true;
+    }
+    return false;
+  }
+
+  // Light, coc and weight of the surface that a pixel gives to the pyramid: of two the farther one.
+  void pixel(int y, int x, float *out) const {
+    const size_t at = (size_t)y * job_.width + x, area = s_.area();
+    const int which = y / BLOCK * s_.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK, C = C_;
+    out[C] = s_.coc[at];
+    out[C + 1] = 1.0f;
+    if (s_.has_block(which)) {
+      const Block b = s_.block(which);
+      const float valid = s_.valid ? s_.valid[at] : 1.0f;
+      const bool mixed = b.weight[within] > MIXED && b.coc[within] > out[C];
+      for (int c = 0; c < C; c++) out[c] = (mixed ? b.other : b.own)[c * BLOCK_PIXELS + within];
+      if (mixed) out[C] = b.coc[within];
+      out[C + 1] = mixed ? b.weight[within] : b.seen[within];
+      if (!(valid > 0)) out[C] = -NEVER;
+    } else {
+      for (int c = 0; c < C; c++) out[c] = s_.light[c * area + at];
+    }
+    float most = out[0];
+    for (int c = 1; c < C; c++) most = std::max(most, out[c]);
+    float limit, step;
+    threshold_row(job_, y, x, limit, step);
+    if (most > limit)  // what is hidden beside a highlight is none
+      for (int c = 0; c < C; c++) out[c] *= limit / most;
+  }
+
+  void coarser(int i, int band) {
+    const Level &fine = pyramid_[i - 1], &level = pyramid_[i];
+    for (int y = band * 8; y < std::min(level.height, band * 8 + 8); y++)
+      for (int x = 0; x < level.width; x++) {
+        const float *child[4] = {fine.at(2 * y, 2 * x), fine.at(2 * y, 2 * x + 1), fine.at(2 * y + 1, 2 * x), fine.at(2 * y + 1, 2 * x + 1)};
+        farthest(child, C_, stride_, level.at(y, x));
+      }
+  }
+
+  // Cells for which a level that their pixels look at shows something farther; and a fine level.
+  void find_cells(int row) {
+    for (int column = 0; column < cell_columns_; column++) {
+      const size_t cell = (size_t)row * cell_columns_ + column;
+      found_[cell] = fine_[cell] = 0;
+      for (int i = 0; i < job_.levels; i++) {
+        const Level &l = pyramid_[i];
+        if (blur_[cell] < l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
+        const int size = i + 1 <= coarsest_ ? 1 << (coarsest_ - i - 1) : 1;
+        const int y0 = i + 1 <= coarsest_ ? row * size : row >> (i + 1 - coarsest_);
+        const int x0 = i + 1 <= coarsest_ ? column * size : column >> (i + 1 - coarsest_);
+        float most = -NEVER;
+        for (int y = std::max(0, y0 - 1); y <= std::min(l.height - 1, y0 + size); y++)
+          for (int x = std::max(0, x0 - 1); x <= std::min(l.width - 1, x0 + size); x++) most = std::max(most, l.coc(y, x));
+        if (most > near_[cell] + BEHIND_PX) {
+          found_[cell] = 1;
+          if (i < FINE_LEVELS) fine_[cell] = 1;
+        }
+      }
+    }
+  }
+
+  bool wanted(int y, int x) const {
+    const int which = y / BLOCK * s_.block_columns + x / BLOCK;
+    if (!(std::fabs(s_.coc[(size_t)y * job_.width + x]) > 0.5f)) return false;
+    return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < HIDDEN_WEIGHT;
+  }
+
+  template <int F4>
+  void fill() {
+    const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
+    const int rows = area_height_ / STEP, columns = area_width_ / STEP;
+    job_.behind_height = rows;
+    job_.behind_width = columns;
+    job_.behind.resize((size_t)C * rows * columns);
+    Level together;  // what coarse levels show behind cells of STEP pixels
+    together.height = rows;
+    together.width = columns;
+    together.step = STEP;
+    together.stride = stride_;
+    together.channels = C;
+    together.vote = 0;
+    together.least_px = levels > FINE_LEVELS ? pyramid_[FINE_LEVELS].least_px : 0;
+    if (levels > FINE_LEVELS) together.values = Buffer<float>((size_t)rows * columns * stride_);
+    std::vector<const Level *> every;
+    for (const Level &l : pyramid_) every.push_back(&l);
+    const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
+    job_.parallel(rows, [&](int row, int) {
+      std::vector<float> seen(stride_);
+      std::vector<f4> sample(stride_ / 4);
+      for (int column = 0; column < columns; column++) {
+        const size_t at = (size_t)row * columns + column;
+        const float *shown = base.at(row, column);
+        if (levels > FINE_LEVELS) memset(together.values.data() + at * stride_, 0, stride_ * sizeof(float));
+        if (found_[(size_t)(row * STEP / cell_) * cell_columns_ + column * STEP / cell_]) {
+          bool any = false;
+          float near = NEVER;
+          for (int y = row * STEP; y < std::min(H, row * STEP + STEP); y++)
+            for (int x = column * STEP; x < std::min(W, column * STEP + STEP); x++) {
+              near = std::min(near, s_.coc[(size_t)y * W + x]);
+              any = any || wanted(y, x);
+            }
+          if (any) {
+            const float y = row * STEP + 0.5f * (STEP - 1), x = column * STEP + 0.5f * (STEP - 1);
+            if (levels > FINE_LEVELS) {
+              float *to = together.at(row, column);
+              const float total = look<F4>(every.data() + FINE_LEVELS, levels - FINE_LEVELS, y, x, near, false, to, sample.data());
+              to[C + 1] = total;
+            }
+            if (look<F4>(every.data(), levels, y, x, near, true, seen.data(), sample.data()) > 0) shown = seen.data();
+          }
+        }
+        for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = shown[c];
+      }
+    });
+    const Level *looks[FINE_LEVELS + 1];
+    for (int i = 0; i < FINE_LEVELS; i++) looks[i] = &pyramid_[i];
+    looks[FINE_LEVELS] = &together;
+    job_.parallel(s_.block_rows, [&](int by, int) {
+      std::vector<float> seen(stride_);
+      std::vector<f4> sample(stride_ / 4);
+      for (int bx = 0; bx < s_.block_columns; bx++)
+        for (int y = by * BLOCK; y < std::min(H, (by + 1) * BLOCK); y++)
+          for (int x = bx * BLOCK; x < std::min(W, (bx + 1) * BLOCK); x++) {
+            const size_t cell = (size_t)(y / cell_) * cell_columns_ + x / cell_;
+            if (!found_[cell]) {
+              x = x / cell_ * cell_ + cell_ - 1;
+              continue;
+            }
+            if (!wanted(y, x)) continue;
+            const float here = s_.coc[(size_t)y * W + x];
+            float total;
+            if (fine_[cell])
+              total = look<F4>(looks, levels > FINE_LEVELS ? FINE_LEVELS + 1 : FINE_LEVELS, y, x, here, false, seen.data(), sample.data());
+            else if (levels > FINE_LEVELS)
+              total = look<F4>(looks + FINE_LEVELS, 1, y, x, here, false, seen.data(), sample.data());
+            else
+              continue;
+            if (!(total > 0)) continue;
+            const Block b = s_.make_block(by * s_.block_columns + bx);
+            const int within = y % BLOCK * BLOCK + x % BLOCK;
+            for (int c = 0; c < C; c++) b.other[c * BLOCK_PIXELS + within] = seen[c];
+            b.coc[within] = seen[C];
+            b.weight[within] = s_.valid ? HIDDEN_WEIGHT * s_.valid[(size_t)y * W + x] : HIDDEN_WEIGHT;
+          }
+    });
+  }
+
+  Job &job_;
+  Surfaces &s_;
+  const int C_, stride_;
+  int area_height_, area_width_, coarsest_, cell_, cell_rows_, cell_columns_;
+  std::vector<Level> pyramid_;
+  std::vector<float> near_, blur_;     // of each cell the nearest coc and the largest blur
+  std::vector<uint8_t> found_, fine_;  // of each cell whether something lies behind, and is shown by a fine level
+};
+
+}  // namespace
+
+void Job::fill_hidden() { Filling(*this).run(); }
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof

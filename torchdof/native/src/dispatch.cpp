@@ -1,0 +1,84 @@
+// The C interface, and which instructions it uses.
+#include <atomic>
+#include <cstring>
+#include <memory>
+#include <new>
+#include <stdexcept>
+
+#include "api.h"
+#include "threads.h"
+#include "variants.h"
+
+struct torchdof_job {
+  std::unique_ptr<torchdof::AnyJob> job;
+};
+
+namespace torchdof {
+namespace {
+
+bool has_avx2() {
+#if defined(TORCHDOF_HAS_AVX2)
+  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+#else
+  return false;
+#endif
+}
+
+std::atomic<bool> use_avx2{has_avx2()};
+
+const Variant &chosen() {
+#if defined(TORCHDOF_HAS_AVX2)
+  if (use_avx2) return avx2::variant;
+#endif
+  return baseline::variant;
+}
+
+template <typename Body>
+int32_t guarded(const Body &body) {
+  try {
+    body();
+    return TORCHDOF_OK;
+  } catch (const Cancelled &) {
+    return TORCHDOF_CANCELLED;
+  } catch (const std::bad_alloc &) {
+    return TORCHDOF_NO_MEMORY;
+  } catch (const std::length_error &) {
+    return TORCHDOF_NO_MEMORY;
+  }
+}
+
+}  // namespace
+}  // namespace torchdof
+
+int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **job) {
+  *job = nullptr;
+  return torchdof::guarded([&] {
+    std::unique_ptr<torchdof_job> made(new torchdof_job());
+    made->job.reset(torchdof::chosen().begin(*scene));
+    *job = made.release();
+  });
+}
+
+int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps) {
+  *steps = job->job->radii().data();
+  return (int64_t)job->job->radii().size();
+}
+
+int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves, float *out) {
+  return torchdof::guarded([&] { job->job->finish(kernels, halves, out); });
+}
+
+void torchdof_free(torchdof_job *job) { delete job; }
+
+void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half, float *out) {
+  torchdof::chosen().convolve(in, height, width, kernel, half, out);
+}
+
+const char *torchdof_instructions(void) { return torchdof::use_avx2 ? "avx2" : "baseline"; }
+
+int32_t torchdof_use(const char *instructions) {
+  const bool avx2 = !strcmp(instructions, "avx2");
+  if ((avx2 && !torchdof::has_avx2()) || (!avx2 && strcmp(instructions, "baseline"))) return 0;
+  torchdof::use_avx2 = avx2;
+  return 1;
+}

@@ -1,0 +1,183 @@
+// A job from its scene to the picture.
+#include "engine.h"
+
+#include "variants.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+
+static float coc_at(double node) { return (float)(node == 0 ? 0 : node > 0 ? node + 0.5 : node - 0.5); }
+
+Job::Job(const torchdof_scene &scene)
+    : scene(scene), height(scene.height), width(scene.width), channels(scene.channels), colours(scene.kernel_colours) {
+  const float *values = scene.kernels;
+  for (int k = 0; k < scene.layers; k++) {
+    Layer l;
+    l.scale = scene.scales[k];
+    l.half = scene.halves[k];
+    l.node = scene.nodes[k];
+    l.first = k == 0;
+    l.last = k == scene.layers - 1;
+    l.before = (float)(l.first ? l.node : scene.nodes[k - 1]);
+    l.per_before = l.first ? 0.0f : (float)(1.0 / (l.node - scene.nodes[k - 1]));
+    l.at = (float)l.node;
+    l.per_after = l.last ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
+    const int side = 2 * l.half + 1;
+    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half));
+    layers.push_back(std::move(l));
+  }
+}
+
+// What is given, without what is not finite, and within reach of the layers.
+void Job::take_scene() {
+  surfaces.height = height;
+  surfaces.width = width;
+  surfaces.channels = channels;
+  surfaces.count = 1;
+  surfaces.block_rows = ceil_div(height, BLOCK);
+  surfaces.block_columns = ceil_div(width, BLOCK);
+  surfaces.blocks.resize((size_t)surfaces.block_rows * surfaces.block_columns);
+  surfaces.light = scene.light[0];
+  surfaces.coc = scene.coc[0];
+  const size_t area = surfaces.area();
+  const float low = coc_at(layers.front().node), high = coc_at(layers.back().node);
+  if (scene.kind == TORCHDOF_STACK) {
+    surfaces.count = scene.surfaces;
+    surfaces.independent = true;
+    for (int i = 0; i < scene.surfaces; i++) {
+      surfaces.lights.push_back(scene.light[i]);
+      surfaces.cocs.push_back(scene.coc[i]);
+      surfaces.weights.push_back(scene.weight[i]);
+    }
+    return;
+  }
+  block_low = Buffer<float>(surfaces.blocks.size());
+  block_high = Buffer<float>(surfaces.blocks.size());
+  std::vector<uint8_t> bad(surfaces.block_rows, 0), beyond(surfaces.block_rows, 0);
+  if (scene.masked) {
+    validity = Buffer<float>(area);
+    parallel(surfaces.block_rows, [&](int by, int) {
+      for (size_t i = (size_t)by * BLOCK * width; i < std::min(area, (size_t)(by + 1) * BLOCK * width); i++) {
+        bool finite = std::isfinite(surfaces.coc[i]);
+        for (int c = 0; c < channels; c++) finite &= std::isfinite(surfaces.light[c * area + i]);
+        validity[i] = finite;
+        if (!finite) bad[by] = 1;
+      }
+    });
+  }
+  if (std::count(bad.begin(), bad.end(), 1)) {
+    clean_light = Buffer<float>(area * channels);
+    clean_coc = Buffer<float>(area);
+    parallel(height, [&](int y, int) {
+      for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) {
+        const bool valid = validity[i] > 0;
+        clean_coc[i] = valid ? surfaces.coc[i] : 0.0f;
+        for (int c = 0; c < channels; c++) clean_light[c * area + i] = valid ? surfaces.light[c * area + i] : 0.0f;
+      }
+    });
+    surfaces.valid = validity.data();
+    surfaces.light = clean_light.data();
+    surfaces.coc = clean_coc.data();
+  }
+  auto find_ends = [&] {
+    parallel(surfaces.block_rows, [&](int by, int) {
+      for (int bx = 0; bx < surfaces.block_columns; bx++) {
+        float least = NEVER, most = -NEVER;
+        for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++)
+          for (int x = bx * BLOCK; x < std::min(width, (bx + 1) * BLOCK); x++) {
+            const float v = surfaces.coc[(size_t)y * width + x];
+            least = v < least ? v : least;
+            most = v > most ? v : most;
+          }
+        block_low[by * surfaces.block_columns + bx] = least;
+        block_high[by * surfaces.block_columns + bx] = most;
+        if (least < low || most > high) beyond[by] = 1;
+      }
+    });
+  };
+  find_ends();
+  if (std::count(beyond.begin(), beyond.end(), 1)) {
+    const float *given = surfaces.coc;
+    Buffer<float> within(area);
+    parallel(height, [&](int y, int) {
+      for (size_t i = (size_t)y * width; i < (size_t)(y + 1) * width; i++) within[i] = clamp(given[i], low, high);
+    });
+    clean_coc = std::move(within);
+    surfaces.coc = clean_coc.data();
+    find_ends();
+  }
+  if (surfaces.valid)
+    for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
+      bool whole = true;
+      const int y0 = i / surfaces.block_columns * BLOCK, x0 = i % surfaces.block_columns * BLOCK;
+      for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
+        for (int x = x0; x < std::min(width, x0 + BLOCK); x++) whole &= surfaces.valid[(size_t)y * width + x] > 0;
+      if (!whole) surfaces.make_block(i);
+    }
+}
+
+void Job::begin() {
+  take_scene();
+  if (scene.kind == TORCHDOF_STACK) return;
+  const bool several = layers.size() > 1, background = scene.kind == TORCHDOF_BACKGROUND;
+  bool bright = scene.occlusion;
+  if (several && !scene.occlusion && scene.highlights) {  // coarse layers soften what is brighter than a display shows
+    float reach = 0;
+    for (const Layer &l : layers) reach = std::max(reach, std::fabs(coc_at(l.node)));
+    if (scene.crisp_px < reach) {
+      std::vector<uint8_t> found(surfaces.block_rows, 0);
+      parallel(surfaces.block_rows, [&](int by, int) {
+        const size_t from = (size_t)by * BLOCK * width, to = std::min(surfaces.area(), from + (size_t)BLOCK * width);
+        for (int c = 0; c < channels && !found[by]; c++)
+          for (size_t i = from; i < to; i++) found[by] |= surfaces.light[c * surfaces.area() + i] > 1.0f;
+      });
+      bright = std::count(found.begin(), found.end(), 1) > 0;
+    }
+  }
+  const bool limited = several && bright;
+  if (limited) find_threshold();
+  if (background) {
+    surfaces.count = 2;
+    split_mixed();
+    put_before_background();
+  } else if (limited && scene.occlusion) {
+    surfaces.count = 2;
+    split_mixed();
+    float reach = 2.0f;
+    for (const Layer &l : layers) reach = std::max(reach, std::fabs(coc_at(l.node)));
+    levels = std::min((int)std::ceil(std::log2((double)reach)) + 1, 7);
+    fill_hidden();
+  }
+  if (limited && scene.highlights) extract_highlights();
+}
+
+void Job::finish(const float *const *kernels, const int32_t *halves, float *out) { composite(*this, kernels, halves, out); }
+
+}  // namespace TORCHDOF_SIMD
+
+template <typename Job>
+class JobOf : public AnyJob {
+ public:
+  explicit JobOf(const torchdof_scene &scene) : job_(scene) { job_.begin(); }
+  const std::vector<int32_t> &radii() const override { return job_.radii; }
+  void finish(const float *const *kernels, const int32_t *halves, float *out) override { job_.finish(kernels, halves, out); }
+
+ private:
+  Job job_;
+};
+
+namespace TORCHDOF_SIMD {
+static AnyJob *begin(const torchdof_scene &scene) { return new JobOf<Job>(scene); }
+static void convolve_all(const float *in, int height, int width, const float *values, int half, float *out) {
+  const Kernel kernel = make_kernel(values, half);
+  const int rows = (height + 15) / 16 * 16, columns = (width + 15) / 16 * 16, pitch = columns + 2 * half + 16;
+  std::vector<float> window((size_t)(rows + 2 * half) * pitch), spread((size_t)rows * columns);
+  const std::vector<uint32_t> every(rows + 2 * half, ~0u);
+  for (int y = 0; y < height; y++) memcpy(&window[(size_t)(y + half) * pitch + half], in + (size_t)y * width, width * sizeof(float));
+  convolve(window.data(), pitch, every.data(), kernel, rows, columns, spread.data(), columns);
+  for (int y = 0; y < height; y++) memcpy(out + (size_t)y * width, &spread[(size_t)y * columns], width * sizeof(float));
+}
+extern const Variant variant;
+const Variant variant = {begin, convolve_all};
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof

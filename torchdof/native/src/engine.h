@@ -1,0 +1,182 @@
+// What the parts of the engine share. Each is compiled once for every set of instructions, in a namespace of its own.
+#pragma once
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#include "api.h"
+#include "threads.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+
+#if defined(__AVX2__)
+constexpr int LANES = 8;
+#else
+constexpr int LANES = 4;
+#endif
+typedef float vec __attribute__((vector_size(LANES * 4)));
+
+template <typename V>
+inline V load(const float *p) {
+  typedef V unaligned __attribute__((aligned(4)));
+  return *(const unaligned *)p;
+}
+template <typename V>
+inline void store(float *p, V v) {
+  typedef V unaligned __attribute__((aligned(4)));
+  *(unaligned *)p = v;
+}
+inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
+inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
+inline int ceil_div(int a, int b) { return (a + b - 1) / b; }
+
+// Memory that starts as it is found.
+template <typename T>
+class Buffer {
+ public:
+  Buffer() = default;
+  explicit Buffer(size_t size) : data_(new T[size]) {}
+  T *data() const { return data_.get(); }
+  T &operator[](size_t i) const { return data_[i]; }
+
+ private:
+  std::unique_ptr<T[]> data_;
+};
+
+constexpr int BLOCK = 16;  // pixels a side in which second surfaces are kept
+constexpr int BLOCK_PIXELS = BLOCK * BLOCK;
+constexpr int CELL = 8;              // pixels a side in which layers and nearest surfaces are told apart
+constexpr int TILE = 64;             // pixels a side that are composited together
+constexpr float NEVER = 1e9f;        // a coc that no pixel has
+constexpr float HIDDEN_WEIGHT = 0.003f;  // of a hidden surface against 1 of a visible one
+
+// The surfaces of BLOCK x BLOCK pixels in which there are two, or one that differs from the image.
+struct Block {
+  float *own;     // [channels, BLOCK_PIXELS]
+  float *other;   // the same of the second surface
+  float *coc;     // of the second surface
+  float *weight;  // of the second surface
+  float *seen;    // weight of the first
+};
+
+// Surfaces of a scene: an image with a few second surfaces, or any number of whole ones.
+class Surfaces {
+ public:
+  int height, width, channels, count;
+  bool independent = false;  // they cover their pixels whatever the others do; else their weights are shares
+  const float *light = nullptr, *coc = nullptr, *valid = nullptr;  // of the image
+  std::vector<const float *> lights, cocs, weights;                // of whole surfaces
+  int block_rows, block_columns;
+  std::vector<std::unique_ptr<float[]>> blocks;  // null where the image says all
+
+  bool whole() const { return !lights.empty(); }
+  size_t area() const { return (size_t)height * width; }
+  bool has_block(int i) const { return (bool)blocks[i]; }
+  Block block(int i) const {
+    float *p = blocks[i].get();
+    return {p, p + channels * BLOCK_PIXELS, p + 2 * channels * BLOCK_PIXELS, p + (2 * channels + 1) * BLOCK_PIXELS,
+            p + (2 * channels + 2) * BLOCK_PIXELS};
+  }
+  // The block, filled from the image if it is new.
+  Block make_block(int i);
+  // Surface i in a row, from column x on, n pixels within one block column: pointers to light of each channel, coc and
+  // weight (null: 1, and for a second surface 0).
+  bool row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const;
+};
+
+struct Ray {
+  int surface, row, column;
+  int radius;  // index of its kernel
+  float coc;
+};
+
+// One layer, and how it is spread.
+struct Kernel {
+  int half = 0;
+  bool symmetric = true;       // left on right
+  float sum = 0;
+  std::vector<float> taps;     // see convolution.cpp
+  std::vector<int> reach;      // of each input row, to the sides
+};
+struct Layer {
+  int scale = 1, half = 0;
+  double node = 0;
+  float before = 0, per_before = 0, at = 0, per_after = 0;  // ramps to the layer and beyond it
+  bool first = false, last = false;
+  std::vector<Kernel> kernels;  // one, or one a colour
+};
+
+struct Job {
+  explicit Job(const torchdof_scene &scene);
+  void begin();
+  void finish(const float *const *kernels, const int32_t *halves, float *out);
+
+  const torchdof_scene &scene;
+  int height, width, channels, colours;  // colours: kernels a layer, 1 or channels
+  std::vector<Layer> layers;
+  Surfaces surfaces;
+  std::vector<int32_t> radii;  // of highlights, in steps of 1/32 px
+  std::vector<Ray> rays;       // sorted by surface and place
+  std::vector<float> ray_light;  // [rays, channels]
+
+  // light behind all surfaces, at every fourth pixel [channels, behind_height, behind_width]; empty: nothing is known
+  std::vector<float> behind;
+  int behind_height = 0, behind_width = 0;
+  int levels = 0;  // of the pyramid that fills hidden surfaces
+
+  // Highlight threshold: at every THRESHOLD_CELL-th pixel
+  std::vector<float> threshold;
+  int threshold_rows = 0, threshold_columns = 0;
+
+  Buffer<float> clean_light, clean_coc, validity;  // copies of what is given, where it may not be taken as it is
+  std::vector<Buffer<float>> copies;
+  Buffer<float> block_low, block_high;  // least and largest coc of each block
+
+  template <typename Body>
+  void parallel(int count, const Body &body) const {
+    torchdof::parallel(scene.threads, count, scene.cancelled, body);
+  }
+
+ private:
+  void take_scene();
+  void find_threshold();                  // highlights.cpp
+  void split_mixed();                     // matting.cpp
+  void fill_hidden();                     // disocclusion.cpp
+  void put_before_background();           // matting.cpp
+  void extract_highlights();              // highlights.cpp
+  void trace(int y0, int x0, const std::vector<int> &tile_rays, const struct Visibility &visibility,
+             const float *const *kernels, const int32_t *halves, float *out) const;
+  friend class Composite;
+};
+
+// Largest light of a row of pixels within one block that still is no highlight's: first, and how it grows by pixel.
+void threshold_row(const Job &job, int y, int x, float &first, float &step);
+
+// What the image shows, as rays of highlights meet it; highlights.cpp
+struct Visibility {
+  float low = 0, class_width = 1;
+  std::vector<uint8_t> present;  // bins of 1 px of coc in which there is something, or in the one before
+  int cell_rows = 0, cell_columns = 0;
+  std::vector<uint64_t> cells;  // classes of coc that occur in each cell, a bit each
+};
+Visibility look_at(const Job &job);
+// Adds the light of rays to a tile [channels, TILE, TILE].
+void splat(const Job &job, const Visibility &visibility, int y0, int x0, const int *rays, int count,
+           const float *const *kernels, const int32_t *halves, float *tile);
+
+// Spreads n x n values (n a multiple of 16; of rows with a gap `pitch`) with a kernel; the input has its half more on
+// each side and begins there. Bit b of rows[y]: something is in columns 16 b to 16 b + 15 of input row y.
+Kernel make_kernel(const float *values, int half);
+void convolve(const float *in, int pitch, const uint32_t *rows, const Kernel &kernel, int height, int width, float *out,
+              int out_pitch);
+
+void composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out);
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof

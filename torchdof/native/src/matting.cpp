@@ -1,0 +1,306 @@
+// Matting: pixels at depth edges carry the light of two surfaces and the depth of one. The formulas are told in
+// render/matting.py.
+#include "engine.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+namespace {
+
+constexpr float EDGE_PX = 1.0f;  // difference in coc of neighbours from which on they may be two surfaces
+constexpr int REACH = 2;         // pixels around a mixed pixel that tell what its two surfaces look like
+constexpr int AROUND = 2 * REACH + 1;
+constexpr float UNCLEAN = 1e-3f;  // weight of a pixel that may be mixed itself
+constexpr float TRUST = 4.0f;     // how much local contrast discredits a split
+constexpr float DOUBT = 4.0f / 3.0f;
+constexpr float LEAST_SHARE = 0.1f;
+constexpr float SAME_PX = 0.5f;  // a background whose coc differs by less is the surface that the image shows
+
+constexpr int MARGIN = REACH + 1;              // an edge is told by its neighbours
+constexpr int SIDE = BLOCK + 2 * MARGIN;       // of the window of coc
+constexpr int EDGES = BLOCK + 2 * REACH;       // of the windows of edges and light
+constexpr int PITCH = 24;                      // of both; eight values may be read from any pixel's window
+typedef float f8 __attribute__((vector_size(32)));
+
+inline float sum(f8 v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
+inline f8 all(float v) { return f8{v, v, v, v, v, v, v, v}; }
+inline f8 clamp_lanes(f8 v) {
+  f8 zero = all(0.0f), one = all(1.0f);
+  v = v > zero ? v : zero;
+  return v < one ? v : one;
+}
+
+struct Window {
+  float coc[SIDE * PITCH], valid[SIDE * PITCH], edge[EDGES * PITCH];
+  std::vector<float> light;  // [channels, EDGES, PITCH]
+  std::vector<float> front, behind, colour;
+};
+
+// How surely the pixels of a block, and those around it, lie beside another surface; false if none of the block does.
+bool find_edges(const Job &job, int y0, int x0, Window &w) {
+  const int H = job.height, W = job.width;
+  const float *coc = job.surfaces.coc, *valid = job.surfaces.valid;
+  for (int i = 0; i < SIDE; i++) {
+    const size_t row = (size_t)std::clamp(y0 - MARGIN + i, 0, H - 1) * W;
+    for (int j = 0; j < SIDE; j++) {
+      const size_t at = row + std::clamp(x0 - MARGIN + j, 0, W - 1);
+      w.coc[i * PITCH + j] = coc[at];
+      if (valid) w.valid[i * PITCH + j] = valid[at];
+    }
+  }
+  bool any = false;
+  for (int i = 0; i < EDGES; i++)
+    for (int j = 0; j < EDGES; j++) {
+      // a pixel outside the frame is the nearest one inside
+      const int y = std::clamp(y0 - REACH + i, 0, H - 1) - y0 + MARGIN, x = std::clamp(x0 - REACH + j, 0, W - 1) - x0 + MARGIN;
+      float low = NEVER, high = -NEVER;
+      for (int v = y - 1; v <= y + 1; v++)
+        for (int u = x - 1; u <= x + 1; u++) {
+          if (valid && !w.valid[v * PITCH + u]) continue;
+          low = std::min(low, w.coc[v * PITCH + u]);
+          high = std::max(high, w.coc[v * PITCH + u]);
+        }
+      float edge = clamp01((high - low) / EDGE_PX - 1.0f);
+      if (valid) edge *= w.valid[y * PITCH + x];
+      w.edge[i * PITCH + j] = edge;
+      any |= edge > 0 && i >= REACH && i < REACH + BLOCK && j >= REACH && j < REACH + BLOCK;
+    }
+  return any;
+}
+
+// Weighted mean of the light around a pixel, and its variance, summed over colours.
+float mean(const Window &w, int channels, size_t first, const f8 *weight, float *mean) {
+  f8 whole = {};
+  for (int r = 0; r < AROUND; r++) whole += weight[r];
+  const float total = std::max(sum(whole), 1e-12f);
+  float variance = 0;
+  for (int c = 0; c < channels; c++) {
+    const float *light = w.light.data() + (size_t)c * EDGES * PITCH + first;
+    f8 one = {}, two = {};
+    for (int r = 0; r < AROUND; r++) {
+      const f8 v = load<f8>(light + r * PITCH), weighted = v * weight[r];
+      one += weighted;
+      two += v * weighted;
+    }
+    mean[c] = sum(one) / total;
+    variance += std::max(sum(two) / total - mean[c] * mean[c], 0.0f);
+  }
+  return variance;
+}
+
+void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Block &block) {
+  const int channels = job.channels;
+  const bool masked = job.surfaces.valid;
+  float near = NEVER, far = -NEVER;
+  for (int v = y + MARGIN - 1; v <= y + MARGIN + 1; v++)
+    for (int u = x + MARGIN - 1; u <= x + MARGIN + 1; u++) {
+      if (masked && !w.valid[v * PITCH + u]) continue;
+      near = std::min(near, w.coc[v * PITCH + u]);
+      far = std::max(far, w.coc[v * PITCH + u]);
+    }
+  const float here = w.coc[(y + MARGIN) * PITCH + x + MARGIN], gap = std::max(far - near, 1e-6f);
+  const size_t first = (size_t)y * PITCH + x;
+  f8 nearer[AROUND], farther[AROUND], inside = {1, 1, 1, 1, 1, 0, 0, 0};
+  for (int r = 0; r < AROUND; r++) {
+    const size_t in_coc = (size_t)(y + 1 + r) * PITCH + x + 1;
+    f8 weight = (all(1.0f + UNCLEAN) - load<f8>(w.edge + first + r * PITCH)) * falloff[r];
+    if (masked) weight *= load<f8>(w.valid + in_coc);
+    const f8 nearness = (all(far) - load<f8>(w.coc + in_coc)) / all(gap);
+    nearer[r] = weight * clamp_lanes(all(4.0f) * nearness - all(2.8f));
+    farther[r] = weight * clamp_lanes(all(1.2f) - all(4.0f) * nearness);
+  }
+  float *front = w.front.data(), *behind = w.behind.data(), *colour = w.colour.data();
+  const float behind_spread = mean(w, channels, first, farther, behind);
+  f8 clean = {};
+  for (int r = 0; r < AROUND; r++) clean += nearer[r];
+  if (!(sum(clean) > 20 * UNCLEAN))  // a thin foreground: trust the pixel that differs most from what is behind
+    for (int r = 0; r < AROUND; r++) {
+      f8 squares = {};
+      for (int c = 0; c < channels; c++) {
+        const f8 d = load<f8>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH) - all(behind[c]);
+        squares += d * d;
+      }
+      nearer[r] = nearer[r] * squares + inside * all(1e-12f);
+    }
+  const float front_spread = mean(w, channels, first, nearer, front);
+
+  float strength = 0, along = 0, brightness = 0, misfit = 0;
+  for (int c = 0; c < channels; c++) {
+    const float contrast = front[c] - behind[c];
+    colour[c] = w.light[(size_t)c * EDGES * PITCH + first + REACH * PITCH + REACH];
+    strength += contrast * contrast;
+    along += (colour[c] - behind[c]) * contrast;
+    brightness += colour[c] * colour[c];
+  }
+  const bool is_near = here - near < far - here;
+  const float fitted = clamp01(along / std::max(strength, 1e-12f));
+  for (int c = 0; c < channels; c++) {
+    const float left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
+    misfit += left * left;
+  }
+  const float trust = strength / (strength + 4e-4f + TRUST * (behind_spread + front_spread + misfit));
+  const float raw = is_near ? 1.0f - fitted : fitted, own_spread = is_near ? front_spread : behind_spread;
+  float doubt = 0;
+  if (std::fabs(far) < std::fabs(near)) doubt = std::sqrt(std::max(DOUBT * own_spread / std::max(strength, 1e-12f), 1e-12f));
+  float sure = raw - doubt;
+  sure *= clamp01(2.0f * sure / LEAST_SHARE - 1.0f);
+  const float moved = raw * std::sqrt(std::max(strength / std::max(brightness, 1e-18f), 1e-12f));
+  sure += (raw - sure) * clamp01(4.0f * moved - 1.0f);
+  const float sided = std::fabs((here - near) - (far - here)) / gap;
+  const float share = clamp(sure, 0.0f, 0.5f) * trust * clamp01(4.0f * sided - 2.0f) *
+                      w.edge[first + REACH * PITCH + REACH];
+  const float norm = share * share + (1.0f - share) * (1.0f - share);
+  const int at = y * BLOCK + x;
+  for (int c = 0; c < channels; c++) {
+    const float mine = is_near ? front[c] : behind[c], its = is_near ? behind[c] : front[c];
+    const float rest = colour[c] - (1.0f - share) * mine - share * its;
+    const float other = std::max(its + rest * share / norm, 0.0f);
+    block.other[c * BLOCK_PIXELS + at] = other;
+    block.own[c * BLOCK_PIXELS + at] = (colour[c] - share * other) / (1.0f - share);
+  }
+  block.coc[at] = is_near ? far : near;
+  block.weight[at] = share;
+  block.seen[at] = 1.0f - share;
+  if (masked) {
+    const float valid = w.valid[(y + MARGIN) * PITCH + x + MARGIN];
+    block.weight[at] *= valid;
+    block.seen[at] *= valid;
+  }
+}
+
+}  // namespace
+
+Block Surfaces::make_block(int i) {
+  if (blocks[i]) return block(i);
+  blocks[i].reset(new float[(2 * channels + 3) * BLOCK_PIXELS]());
+  const Block made = block(i);
+  const int y0 = i / block_columns * BLOCK, x0 = i % block_columns * BLOCK;
+  const int rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
+  for (int y = 0; y < rows; y++) {
+    const size_t from = (size_t)(y0 + y) * width + x0;
+    for (int c = 0; c < channels; c++)
+      memcpy(made.own + c * BLOCK_PIXELS + y * BLOCK, light + c * area() + from, columns * sizeof(float));
+    memcpy(made.coc + y * BLOCK, coc + from, columns * sizeof(float));
+    for (int x = 0; x < columns; x++) made.seen[y * BLOCK + x] = valid ? valid[from + x] : 1.0f;
+  }
+  return made;
+}
+
+bool Surfaces::row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const {
+  const size_t at = (size_t)y * width + x;
+  if (whole()) {
+    for (int c = 0; c < channels; c++) light_of[c] = lights[i] + c * area() + at;
+    coc_of = cocs[i] + at;
+    weight_of = weights[i] ? weights[i] + at : nullptr;
+    return true;
+  }
+  const int which = y / BLOCK * block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
+  if (!has_block(which)) {
+    if (i) return false;
+    for (int c = 0; c < channels; c++) light_of[c] = light + c * area() + at;
+    coc_of = coc + at;
+    weight_of = nullptr;
+    return true;
+  }
+  const Block b = block(which);
+  for (int c = 0; c < channels; c++) light_of[c] = (i ? b.other : b.own) + c * BLOCK_PIXELS + within;
+  coc_of = i ? b.coc + within : coc + at;
+  weight_of = (i ? b.weight : b.seen) + within;
+  return true;
+}
+
+void Job::split_mixed() {
+  f8 falloff[AROUND] = {};
+  for (int r = 0; r < AROUND; r++)
+    for (int d = 0; d < AROUND; d++)
+      falloff[r][d] = (float)std::exp(-((r - REACH) * (r - REACH) + (d - REACH) * (d - REACH)) / 4.5);
+  const int rows = surfaces.block_rows, columns = surfaces.block_columns;
+  std::vector<std::unique_ptr<Window>> windows(std::max(1, scene.threads));
+  parallel(rows, [&](int by, int worker) {
+    if (!windows[worker]) {
+      windows[worker].reset(new Window());
+      windows[worker]->light.assign((size_t)channels * EDGES * PITCH, 0.0f);
+      for (auto *v : {&windows[worker]->front, &windows[worker]->behind, &windows[worker]->colour}) v->resize(channels);
+    }
+    Window &w = *windows[worker];
+    for (int bx = 0; bx < columns; bx++) {
+      float low = NEVER, high = -NEVER;
+      for (int v = std::max(by - 1, 0); v <= std::min(by + 1, rows - 1); v++)
+        for (int u = std::max(bx - 1, 0); u <= std::min(bx + 1, columns - 1); u++) {
+          low = std::min(low, block_low[v * columns + u]);
+          high = std::max(high, block_high[v * columns + u]);
+        }
+      if (!(high - low > EDGE_PX)) continue;
+      const int y0 = by * BLOCK, x0 = bx * BLOCK;
+      if (!find_edges(*this, y0, x0, w)) continue;
+      for (int c = 0; c < channels; c++)
+        for (int i = 0; i < EDGES; i++) {
+          const float *from = surfaces.light + c * surfaces.area() + (size_t)std::clamp(y0 - REACH + i, 0, height - 1) * width;
+          float *to = w.light.data() + ((size_t)c * EDGES + i) * PITCH;
+          for (int j = 0; j < EDGES; j++) to[j] = from[std::clamp(x0 - REACH + j, 0, width - 1)];
+        }
+      const Block block = surfaces.make_block(by * columns + bx);
+      for (int y = 0; y < std::min(BLOCK, height - y0); y++)
+        for (int x = 0; x < std::min(BLOCK, width - x0); x++)
+          if (w.edge[(y + REACH) * PITCH + x + REACH] > 0) split(*this, w, y, x, falloff, block);
+    }
+  });
+}
+
+void Job::put_before_background() {
+  const size_t area = surfaces.area();
+  const float *coc = surfaces.coc, *valid = surfaces.valid;
+  for (int i = 0; i < 3; i++) copies.emplace_back(area * (channels + 2));
+  float *planes[3];
+  for (int i = 0; i < 3; i++) planes[i] = copies[copies.size() - 3 + i].data();
+  const float low = (float)(layers.front().node + (layers.front().node > 0 ? 0.5 : layers.front().node < 0 ? -0.5 : 0));
+  const float high = (float)(layers.back().node + (layers.back().node > 0 ? 0.5 : layers.back().node < 0 ? -0.5 : 0));
+  const float *behind_light = scene.light[1], *behind_coc = scene.coc[1];
+  parallel(height, [&](int y, int) {
+    std::vector<const float *> own(channels), other(channels);
+    for (int x = 0; x < width; x++) {
+      const size_t at = (size_t)y * width + x;
+      const float *own_coc, *other_coc = nullptr, *seen, *weight = nullptr;
+      surfaces.row(0, y, x, own.data(), own_coc, seen);
+      const bool mixed = surfaces.row(1, y, x, other.data(), other_coc, weight);
+      const float valid_here = valid ? valid[at] : 1.0f, here = coc[at];
+      // what shows past a nearer surface of a mixed pixel is the background's to tell
+      const float share = mixed && *other_coc < here ? *weight : 0.0f;
+      bool known = true;
+      for (int c = 0; c < channels; c++) {
+        planes[0][c * area + at] = mixed ? *other[c] : 0.0f;
+        planes[1][c * area + at] = *own[c];
+        const float light = behind_light[c * area + at];
+        known &= std::isfinite(light);
+        planes[2][c * area + at] = light;
+      }
+      known &= std::isfinite(behind_coc[at]);
+      const float there = clamp(behind_coc[at], low, high), apart = clamp01(there - here - SAME_PX);
+      float behind_weight = apart + (1.0f - apart) * share;  // else the image itself shows it
+      if (!known) {
+        behind_weight = 0;
+        for (int c = 0; c < channels; c++) planes[2][c * area + at] = 0.0f;
+      }
+      float *coc_of[3], *weight_of[3];
+      for (int i = 0; i < 3; i++) {
+        coc_of[i] = planes[i] + channels * area + at;
+        weight_of[i] = coc_of[i] + area;
+      }
+      *coc_of[0] = mixed ? *other_coc : here;
+      *coc_of[1] = here;
+      *coc_of[2] = std::max(known ? there : 0.0f, here);
+      *weight_of[0] = share;
+      *weight_of[1] = seen ? *seen : valid_here;
+      *weight_of[2] = behind_weight;
+    }
+  });
+  for (int i = 0; i < 3; i++) {
+    surfaces.lights.push_back(planes[i]);
+    surfaces.cocs.push_back(planes[i] + channels * area);
+    surfaces.weights.push_back(planes[i] + (channels + 1) * area);
+  }
+  surfaces.count = 3;
+  surfaces.independent = true;
+}
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof

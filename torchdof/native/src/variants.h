@@ -1,0 +1,28 @@
+// The engine is compiled once for every set of instructions; the processor decides which one runs.
+#pragma once
+#include <vector>
+
+#include "api.h"
+
+namespace torchdof {
+
+class AnyJob {
+ public:
+  virtual ~AnyJob() = default;
+  virtual const std::vector<int32_t> &radii() const = 0;
+  virtual void finish(const float *const *kernels, const int32_t *halves, float *out) = 0;
+};
+
+struct Variant {
+  AnyJob *(*begin)(const torchdof_scene &scene);
+  void (*convolve)(const float *in, int height, int width, const float *kernel, int half, float *out);
+};
+
+namespace baseline {
+extern const Variant variant;
+}
+namespace avx2 {
+extern const Variant variant;
+}
+
+}  // namespace torchdof
