@@ -13,6 +13,16 @@ constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind 
 constexpr int TILE_PIXELS = TILE * TILE;
 
 inline float axis(float coc, float low, float high) { return clamp(coc - clamp(coc, -0.5f, 0.5f), low, high); }
+inline vec axis(vec coc, float low, float high) {
+  return least(most(coc - least(most(coc, all(-0.5f)), all(0.5f)), all(low)), all(high));
+}
+inline bool any_positive(vec v) {
+  typedef long long wide __attribute__((vector_size(LANES * 4)));
+  const wide bits = (wide)(v > vec{});
+  long long any = 0;
+  for (int i = 0; i < LANES / 2; i++) any |= bits[i];
+  return any != 0;
+}
 
 // Neighbouring layers of one resolution and, if it is a coarser one, one side of the focus.
 struct Run {
@@ -134,31 +144,56 @@ class Composite {
       start[i] = k;
     }
     const float scale = reach > 0 ? (float)(STEPS / reach) : 0.0f;
-    job_.parallel(cell_rows_, [&](int row, int) {
+    auto node_before = [&](float place) {
+      int k = start[(int)((place - low_) * scale)];
+      while (k + 1 < N_ && place >= layers_[k + 1].at) k++;
+      return k;
+    };
+    auto mark = [&](uint64_t *bits, float place, int k) {
+      bits[k / 64] |= 1ull << k % 64;
+      if (place > layers_[k].at) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
+    };
+    constexpr int CELLS = BLOCK / CELL;
+    job_.parallel(s_.block_rows, [&](int by, int) {
       std::vector<const float *> light(C_);
       const float *coc, *weight;
-      for (int column = 0; column < cell_columns_; column++) {
-        const size_t cell = (size_t)row * cell_columns_ + column;
-        uint64_t *bits = &cells_[cell * words_];
-        const int x0 = column * CELL, n = std::min(CELL, W_ - x0);
-        bool single = true;
-        for (int i = 0; i < s_.count; i++)
-          for (int y = row * CELL; y < std::min(H_, (row + 1) * CELL); y++) {
-            if (!s_.row(i, y, x0, light.data(), coc, weight)) break;
-            uint16_t *interval = &intervals_[i][(size_t)y * W_ + x0];
-            for (int x = 0; x < n; x++) {
-              if (weight && (i ? weight[x] != 0 : weight[x] < 1)) single = false;
-              const float place = axis(coc[x], low_, high_);
-              int k = start[(int)((place - low_) * scale)];
-              while (k + 1 < N_ && place >= layers_[k + 1].at) k++;
-              interval[x] = (uint16_t)k;
-              if (weight && weight[x] == 0) continue;
-              bits[k / 64] |= 1ull << k % 64;
-              if (place > layers_[k].at) bits[(k + 1) / 64] |= 1ull << (k + 1) % 64;
-            }
-            if (i && !weight) single = false;
+      for (int bx = 0; bx < s_.block_columns; bx++) {
+        const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK), x_end = std::min(W_, (bx + 1) * BLOCK);
+        if (!s_.whole() && !s_.has_block(block)) {  // one surface; mostly between the same two nodes
+          const float low = axis(job_.block_low[block], low_, high_), high = axis(job_.block_high[block], low_, high_);
+          const int k = node_before(low);
+          if (k == node_before(high)) {
+            for (int y = by * BLOCK; y < y_end; y++) std::fill(&intervals_[0][(size_t)y * W_ + bx * BLOCK], &intervals_[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
+            for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
+              for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
+                const size_t cell = (size_t)row * cell_columns_ + column;
+                mark(&cells_[cell * words_], low, k);
+                mark(&cells_[cell * words_], high, k);
+                single_[cell] = !s_.independent;
+              }
+            continue;
           }
-        single_[cell] = single && !s_.independent;
+        }
+        for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
+          for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
+            const size_t cell = (size_t)row * cell_columns_ + column;
+            uint64_t *bits = &cells_[cell * words_];
+            const int x0 = column * CELL, n = std::min(CELL, W_ - x0);
+            bool single = true;
+            for (int i = 0; i < s_.count; i++)
+              for (int y = row * CELL; y < std::min(H_, (row + 1) * CELL); y++) {
+                if (!s_.row(i, y, x0, light.data(), coc, weight)) break;
+                if (i && !weight) single = false;
+                uint16_t *interval = &intervals_[i][(size_t)y * W_ + x0];
+                for (int x = 0; x < n; x++) {
+                  if (weight && (i ? weight[x] != 0 : weight[x] < 1)) single = false;
+                  if (weight && weight[x] == 0) continue;
+                  const float place = axis(coc[x], low_, high_);
+                  mark(bits, place, interval[x] = (uint16_t)node_before(place));
+                }
+              }
+            single_[cell] = single && !s_.independent;
+          }
       }
     });
   }
@@ -190,7 +225,13 @@ class Composite {
            floor_div((left + n) * s - 1, CELL), b.layers.data());
     bool any = false;
     for (int k = run.first; k <= run.last; k++) any |= has(b.layers.data(), k);
-    if (!any) return;
+    const int rows = std::min(TILE, run.rows - tile_y), columns = std::min(TILE, run.columns - tile_x);
+    if (!any) {
+      for (int c = 0; c < C_ + E_; c++)
+        for (int y = 0; y < rows; y++)
+          memset(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], 0, columns * sizeof(float));
+      return;
+    }
     run.used[which] = 1;
     const bool border = !extend_ && (top < 0 || left < 0 || (top + n) * s > H_ || (left + n) * s > W_);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
@@ -211,7 +252,6 @@ class Composite {
         add_pieces(run, k, n, b);
       lay(b, l, side, shift, border);
     }
-    const int rows = std::min(TILE, run.rows - tile_y), columns = std::min(TILE, run.columns - tile_x);
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
         memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE, columns * sizeof(float));
@@ -382,18 +422,32 @@ class Composite {
     for (int i = 0; i < (single ? 1 : s_.count); i++) {
       const float *from_coc, *from_weight;
       for (int x = first; x <= last;) {
-        const int end = s_.whole() ? last + 1 : std::min(last + 1, (x / BLOCK + 1) * BLOCK), count = end - x, to = std::max(x - x0, 0);
-        const int target = x0 > W_ - 1 ? 0 : x0 + n <= 0 ? n - 1 : to;  // a window beside the frame sees its nearest pixel
-        if (s_.row(i, at_y, x, b.pointers.data(), from_coc, from_weight)) {
-          for (int c = 0; c < C_; c++) memcpy(light[i * C_ + c] + target, b.pointers[c], count * sizeof(float));
-          memcpy(coc[i] + target, from_coc, count * sizeof(float));
-          if (from_weight) memcpy(weight[i] + target, from_weight, count * sizeof(float));
-          else std::fill(weight[i] + target, weight[i] + target + count, 1.0f);
-        } else {
-          for (int c = 0; c < C_; c++) memset(light[i * C_ + c] + target, 0, count * sizeof(float));
-          memset(coc[i] + target, 0, count * sizeof(float));
-          memset(weight[i] + target, 0, count * sizeof(float));
+        int end = last + 1;
+        if (!s_.whole()) {  // as far as the image says all, or block by block
+          const int blocks = at_y / BLOCK * s_.block_columns;
+          const bool own = s_.has_block(blocks + x / BLOCK);
+          end = (x / BLOCK + 1) * BLOCK;
+          while (end <= last && !own && !s_.has_block(blocks + end / BLOCK)) end += BLOCK;
+          end = std::min(end, last + 1);
         }
+        const int count = end - x;
+        // a window beside the frame sees its nearest pixel
+        const int to = x0 > W_ - 1 ? 0 : x0 + n <= 0 ? n - 1 : std::max(x - x0, 0);
+        const bool there = s_.row(i, at_y, x, b.pointers.data(), from_coc, from_weight);
+        auto copy = [&](float *row, const float *from) {
+          if (there && count == BLOCK)
+            memcpy(row + to, from, BLOCK * sizeof(float));
+          else if (there)
+            memcpy(row + to, from, count * sizeof(float));
+          else
+            memset(row + to, 0, count * sizeof(float));
+        };
+        for (int c = 0; c < C_; c++) copy(light[i * C_ + c], b.pointers[c]);
+        copy(coc[i], from_coc);
+        if (there && !from_weight)
+          std::fill(weight[i] + to, weight[i] + to + count, 1.0f);
+        else
+          copy(weight[i], from_weight);
         x = end;
       }
       auto go_on = [&](float *row, bool light_row) {
@@ -408,7 +462,7 @@ class Composite {
       }
       go_on(coc[i], false);
       go_on(weight[i], false);
-      for (int x = 0; x < n; x++) coc[i][x] = axis(coc[i][x], low_, high_);
+      for (int x = 0; x < n; x += LANES) store(coc[i] + x, axis(load<vec>(coc[i] + x), low_, high_));
     }
     for (int x = 0; x < n; x++) known[x] = row_known && (extend_ || (x >= before && x < n - after));
   }
@@ -420,30 +474,26 @@ class Composite {
     const float first = l.first ? 1.0f : 0.0f;
     float *share = term[C_], *room = term[C_ + 1];
     if (single) {
-      const float *p = x[0];
-      for (int i = 0; i < n; i++) {
-        const float h = clamp01((p[i] - before) * per_before + first);
-        room[i] = h;
-        share[i] = h - clamp01((p[i] - at) * per_after);
-      }
-      for (int c = 0; c < C_; c++) {
-        float *o = term[c];
-        const float *v = light[c];
-        for (int i = 0; i < n; i++) o[i] = v[i] * share[i];
+      for (int i = 0; i < n; i += LANES) {
+        const vec p = load<vec>(x[0] + i), h = clamp01((p - before) * per_before + first), g = h - clamp01((p - at) * per_after);
+        store(room + i, h);
+        store(share + i, g);
+        for (int c = 0; c < C_; c++) store(term[c] + i, load<vec>(light[c] + i) * g);
       }
       return;
     }
     if (!s_.independent) {
-      for (int j = 0; j < s_.count; j++) {
-        const float *p = x[j], *w = weight[j];
-        float *m = mine[j];
-        for (int i = 0; i < n; i++) {
-          const float h = clamp01((p[i] - before) * per_before + first);
-          m[i] = (h - clamp01((p[i] - at) * per_after)) * w[i];
-          const float r = h * w[i];
-          share[i] = j ? share[i] + m[i] : m[i];
-          room[i] = j ? room[i] + r : r;
+      for (int i = 0; i < n; i += LANES) {
+        vec shares = {}, rooms = {};
+        for (int j = 0; j < s_.count; j++) {
+          const vec p = load<vec>(x[j] + i), w = load<vec>(weight[j] + i), h = clamp01((p - before) * per_before + first);
+          const vec m = (h - clamp01((p - at) * per_after)) * w;
+          store(mine[j] + i, m);
+          shares += m;
+          rooms += h * w;
         }
+        store(share + i, shares);
+        store(room + i, rooms);
       }
     } else {
       // a pixel is there for the layer as far as what is at or behind it is known, but for what that has in front
@@ -473,39 +523,46 @@ class Composite {
         for (int i = 0; i < n; i++) share[i] += mine[j][i] *= room[i];
       for (int i = 0; i < n; i++) room[i] *= 1.0f - unknown[i];
     }
-    for (int c = 0; c < C_; c++) {
-      float *o = term[c];
-      for (int j = 0; j < s_.count; j++) {
-        const float *v = light[j * C_ + c], *m = mine[j];
-        if (j == 0)
-          for (int i = 0; i < n; i++) o[i] = v[i] * m[i];
-        else
-          for (int i = 0; i < n; i++) o[i] += v[i] * m[i];
+    for (int c = 0; c < C_; c++)
+      for (int i = 0; i < n; i += LANES) {
+        vec sum = load<vec>(light[c] + i) * load<vec>(mine[0] + i);
+        for (int j = 1; j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + i) * load<vec>(mine[j] + i);
+        store(term[c] + i, sum);
       }
-    }
   }
 
   // Spreads the terms of a layer, which begin at an offset, and lays them on the tile's canvas.
   void lay(Scratch &b, const Layer &l, int side, size_t shift, bool border) {
     const int C = C_, E = E_;
-    bool any = false, closed = true, flat = true;
+    // where there is anything; whether nothing lies behind the layer, or before it
+    bool any = false;
+    vec open = {}, uneven = {};
     for (int y = 0; y < side; y++) {
       const float *share = b.term[C] + shift + (size_t)y * pitch_, *room = b.term[C + 1] + shift + (size_t)y * pitch_;
       uint32_t bits = 0;
       for (int x = 0; x < side; x += 16) {
-        const int end = std::min(x + 16, side);
-        bool some = false;
-        for (int i = x; i < end; i++) some |= share[i] > 0;
-        bits |= (uint32_t)some << std::min(x / 16, 31);
+        vec some = {};
+        int i = x;
+        for (; i + LANES <= std::min(x + 16, side); i += LANES) {
+          const vec s = load<vec>(share + i);
+          some = most(some, s);
+          if (!over_) continue;
+          const vec r = load<vec>(room + i), d = r - all(1.0f);
+          open = most(open, r - s);
+          uneven = most(uneven, d * d);
+        }
+        for (; i < std::min(x + 16, side); i++) {
+          some[0] = std::max(some[0], share[i]);
+          if (!over_) continue;
+          open[0] = std::max(open[0], room[i] - share[i]);
+          uneven[0] = std::max(uneven[0], (room[i] - 1.0f) * (room[i] - 1.0f));
+        }
+        bits |= (uint32_t)any_positive(some) << std::min(x / 16, 31);
       }
       b.rows[y] = bits;
       any |= bits != 0;
-      if (over_)
-        for (int x = 0; x < side; x++) {
-          closed &= room[x] == share[x];
-          flat &= std::fabs(room[x] - 1.0f) <= 1e-6f;
-        }
     }
+    const bool closed = !any_positive(open), flat = largest(uneven) <= 1e-12f;
     if (!any) return;
     auto spread = [&](int term, const uint32_t *rows, const Kernel &kernel, float *to) {
       if (l.half)
@@ -520,11 +577,9 @@ class Composite {
       float *share = b.spread[C + e], *room = b.spread[C + E + e], *seen = b.spread[C + 2 * E + e];
       if (!over_) {
         spread(border ? C + 2 : C, b.rows.data(), kernel, share);
-        for (int c = 0; c < C; c++) {
-          if (E > 1 && c != e) continue;
-          for (int i = 0; i < TILE_PIXELS; i++) b.canvas[c][i] += b.spread[c][i];
-        }
-        for (int i = 0; i < TILE_PIXELS; i++) b.canvas[C + e][i] += share[i];
+        for (int c = 0; c < C; c++)
+          if (E == 1 || c == e) add_to(b.canvas[c], b.spread[c]);
+        add_to(b.canvas[C + e], share);
         continue;
       }
       if (flat)
@@ -538,74 +593,64 @@ class Composite {
       if (border) spread(C + 2, b.rows.data(), kernel, seen);
       // colour = light / room, coverage = share / room; where not all light was seen, the colour of what was, fading
       // out with the last of it
-      float *gain = room, *cover = share, *left = seen;
-      for (int i = 0; i < TILE_PIXELS; i++) {
-        const float r = 1.0f / std::max(room[i], LEAST);
-        float g = r, a = share[i];
+      for (int i = 0; i < TILE_PIXELS; i += LANES) {
+        const vec all_room = load<vec>(room + i), its_share = load<vec>(share + i), one = all(1.0f);
+        const vec per_room = one / most(all_room, all(LEAST));
+        vec gain = per_room, cover = its_share;
         if (border) {
-          const float floor = clamp(share[i], LEAST * LEAST, LEAST);
-          g *= share[i] / std::max(seen[i], floor);
-          a *= std::min(seen[i] / floor, 1.0f);
+          const vec floor = least(most(its_share, all(LEAST * LEAST)), all(LEAST)), was_seen = load<vec>(seen + i);
+          gain *= its_share / most(was_seen, floor);
+          cover *= least(was_seen / floor, one);
         }
-        a *= r;
-        gain[i] = g;
-        cover[i] = a;
-        left[i] = std::max(1.0f - a, 0.0f);
+        cover *= per_room;
+        const vec left = most(one - cover, vec{});
+        for (int c = 0; c < C; c++)
+          if (E == 1 || c == e) store(b.canvas[c] + i, load<vec>(b.spread[c] + i) * gain + left * load<vec>(b.canvas[c] + i));
+        store(b.canvas[C + e] + i, cover + left * load<vec>(b.canvas[C + e] + i));
       }
-      for (int c = 0; c < C; c++) {
-        if (E > 1 && c != e) continue;
-        float *canvas = b.canvas[c];
-        const float *light = b.spread[c];
-        for (int i = 0; i < TILE_PIXELS; i++) canvas[i] = light[i] * gain[i] + left[i] * canvas[i];
-      }
-      float *covered = b.canvas[C + e];
-      for (int i = 0; i < TILE_PIXELS; i++) covered[i] = cover[i] + left[i] * covered[i];
     }
+  }
+
+  static void add_to(float *to, const float *more) {
+    for (int i = 0; i < TILE_PIXELS; i += LANES) store(to + i, load<vec>(to + i) + load<vec>(more + i));
   }
 
   // A coarser canvas, interpolated, over the tile's canvas.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
     const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / TILE, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / TILE;
-    bool any = false, all = true;
+    bool any = false;
     for (int r = y0 / s / TILE; r <= r1; r++)
-      for (int c = x0 / s / TILE; c <= c1; c++) {
-        any |= run.used[r * run.tile_columns + c];
-        all &= (bool)run.used[r * run.tile_columns + c];
-      }
+      for (int c = x0 / s / TILE; c <= c1; c++) any |= run.used[r * run.tile_columns + c];
     if (!any) return;
     const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s;
-    std::vector<float> lines((size_t)channels * (count + 1)), values((size_t)channels * TILE);
-    auto used = [&](int r, int c) { return all || run.used[r / TILE * run.tile_columns + c / TILE]; };
+    std::vector<float> lines(count), values((size_t)channels * TILE);
     for (int y = 0; y < TILE; y++) {
       const float at_y = (y0 + y + 0.5f) / s + 0.5f;
       const int row = std::min((int)at_y, run.rows - 2);
       const float down = at_y - row;
       for (int c = 0; c < channels; c++) {
-        const float *plane = &run.canvas[(size_t)c * run.rows * run.columns];
-        float *line = &lines[(size_t)c * (count + 1)];
-        for (int i = 0; i <= count; i++) {
-          const int column = std::min(first + i, run.columns - 1);
-          const float a = used(row, column) ? plane[(size_t)row * run.columns + column] : 0.0f;
-          const float z = used(row + 1, column) ? plane[(size_t)(row + 1) * run.columns + column] : 0.0f;
-          line[i] = a + down * (z - a);
-        }
-        float *v = &values[(size_t)c * TILE];
-        for (int x = 0; x < TILE; x++) {
-          const float at_x = (x + 0.5f) / s + 0.5f;
-          const int column = (int)at_x;
-          v[x] = line[column] + (at_x - column) * (line[column + 1] - line[column]);
+        const float *upper = &run.canvas[((size_t)c * run.rows + row) * run.columns], *lower = upper + run.columns;
+        float *line = lines.data(), *v = &values[(size_t)c * TILE];
+        const int inside = std::min(count, run.columns - first);
+        for (int i = 0; i < inside; i++) line[i] = upper[first + i] + down * (lower[first + i] - upper[first + i]);
+        for (int i = std::max(inside, 0); i < count; i++) line[i] = 0;
+        for (int phase = 0; phase < s; phase++) {
+          const float at_x = (phase + 0.5f) / s + 0.5f;
+          const float *from = line + (int)at_x;
+          const float across = at_x - (int)at_x;
+          for (int i = 0; i < TILE / s; i++) v[i * s + phase] = from[i] + across * (from[i + 1] - from[i]);
         }
       }
       for (int e = 0; e < E_; e++) {
         const float *cover = &values[(size_t)(C_ + e) * TILE];
-        float left[TILE];
-        for (int x = 0; x < TILE; x++) left[x] = over_ ? std::max(1.0f - cover[x], 0.0f) : 1.0f;
-        for (int c = 0; c < C_ + E_; c++) {
-          if (c < C_ ? E_ > 1 && c != e : c != C_ + e) continue;
-          float *canvas = b.canvas[c] + y * TILE;
-          const float *v = &values[(size_t)c * TILE];
-          for (int x = 0; x < TILE; x++) canvas[x] = v[x] + left[x] * canvas[x];
+        for (int x = 0; x < TILE; x += LANES) {
+          const vec left = over_ ? most(all(1.0f) - load<vec>(cover + x), vec{}) : all(1.0f);
+          for (int c = 0; c < channels; c++) {
+            if (c < C_ ? E_ > 1 && c != e : c != C_ + e) continue;
+            float *canvas = b.canvas[c] + y * TILE + x;
+            store(canvas, load<vec>(&values[(size_t)c * TILE + x]) + left * load<vec>(canvas));
+          }
         }
       }
     }

@@ -157,24 +157,21 @@ class Filling {
       const bool inside = y_end <= H && x_end <= W && y_end == (band + 1) * BLOCK && x_end == (bx + 1) * BLOCK;
       const int which = inside ? band * s_.block_columns + bx : 0;
       const bool plain = inside && !s_.has_block(which) && job_.block_high[which] - job_.block_low[which] < BEHIND_PX &&
-                         !has_highlight(band * BLOCK, bx * BLOCK);
+                         !(job_.block_peak[which] > least_threshold(job_, band * BLOCK, bx * BLOCK));
+      if (plain) {
+        means(band * BLOCK, bx * BLOCK);
+        for (int y = band * BLOCK; y < y_end; y += cell_)
+          for (int x = bx * BLOCK; x < x_end; x += cell_) {
+            const size_t cell = (size_t)(y / cell_) * cell_columns_ + x / cell_;
+            near_[cell] = job_.block_low[which];
+            blur_[cell] = std::max(std::fabs(job_.block_low[which]), std::fabs(job_.block_high[which]));
+          }
+        continue;
+      }
       for (int y = band * BLOCK; y < y_end; y += 2)
         for (int x = bx * BLOCK; x < x_end; x += 2) {
           float *out = level.at(y / 2, x / 2);
           float &near = near_[y / cell_ * cell_columns_ + x / cell_], &blur = blur_[y / cell_ * cell_columns_ + x / cell_];
-          if (plain) {  // all four count
-            const size_t at = (size_t)y * W + x;
-            for (int c = 0; c <= C; c++) {
-              const float *p = (c < C ? s_.light + c * area : s_.coc) + at;
-              out[c] = 0.25f * p[0] + 0.25f * p[1] + (0.25f * p[W] + 0.25f * p[W + 1]);
-            }
-            const float *p = s_.coc + at;
-            near = std::min(near, std::min(std::min(p[0], p[1]), std::min(p[W], p[W + 1])));
-            blur = std::max(blur, std::max(std::max(std::fabs(p[0]), std::fabs(p[1])), std::max(std::fabs(p[W]), std::fabs(p[W + 1]))));
-            out[C + 1] = 1.0f;
-            for (int c = C + 2; c < stride_; c++) out[c] = 0;
-            continue;
-          }
           for (int i = 0; i < 4; i++) {
             const int py = std::min(y + i / 2, H - 1), px = std::min(x + i % 2, W - 1);
             float *v = children.data() + i * stride_;
@@ -188,19 +185,26 @@ class Filling {
     }
   }
 
-  bool has_highlight(int y0, int x0) const {
-    const size_t area = s_.area();
-    for (int y = y0; y < y0 + BLOCK; y++) {
-      float first, step;
-      threshold_row(job_, y, x0, first, step);
-      bool bright = false;
-      for (int c = 0; c < C_; c++) {
-        const float *p = s_.light + c * area + (size_t)y * job_.width + x0;
-        for (int x = 0; x < BLOCK; x++) bright |= p[x] > first + step * x;
+  // A block of the first level where all four children count.
+  void means(int y0, int x0) {
+    constexpr int HALF = BLOCK / 2;
+    const int W = job_.width;
+    std::vector<const float *> planes(C_ + 1);
+    for (int c = 0; c <= C_; c++) planes[c] = (c < C_ ? s_.light + c * s_.area() : s_.coc) + (size_t)y0 * W + x0;
+    for (int y = 0; y < BLOCK; y += 2) {
+      float *out = pyramid_[0].at((y0 + y) / 2, x0 / 2);
+      for (int c = 0; c <= C_; c++) {
+        const float *upper = planes[c] + (size_t)y * W, *lower = upper + W;
+        float sums[BLOCK];
+        for (int x = 0; x < BLOCK; x += LANES)
+          store(sums + x, all(0.25f) * load<vec>(upper + x) + all(0.25f) * load<vec>(lower + x));
+        for (int x = 0; x < HALF; x++) out[x * stride_ + c] = sums[2 * x] + sums[2 * x + 1];
       }
-      if (bright) return true;
+      for (int x = 0; x < HALF; x++) {
+        out[x * stride_ + C_ + 1] = 1.0f;
+        for (int c = C_ + 2; c < stride_; c++) out[x * stride_ + c] = 0;
+      }
     }
-    return false;
   }
 
   // Light, coc and weight of the surface that a pixel gives to the pyramid: of two the farther one.

@@ -82,16 +82,26 @@ void Job::take_scene() {
   auto find_ends = [&] {
     parallel(surfaces.block_rows, [&](int by, int) {
       for (int bx = 0; bx < surfaces.block_columns; bx++) {
-        float least = NEVER, most = -NEVER;
-        for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++)
-          for (int x = bx * BLOCK; x < std::min(width, (bx + 1) * BLOCK); x++) {
-            const float v = surfaces.coc[(size_t)y * width + x];
-            least = v < least ? v : least;
-            most = v > most ? v : most;
-          }
-        block_low[by * surfaces.block_columns + bx] = least;
-        block_high[by * surfaces.block_columns + bx] = most;
-        if (least < low || most > high) beyond[by] = 1;
+        const int y0 = by * BLOCK, x0 = bx * BLOCK, columns = std::min(BLOCK, width - x0);
+        vec low_lanes = all(NEVER), high_lanes = all(-NEVER);
+        float block_least = NEVER, block_most = -NEVER;
+        for (int y = y0; y < std::min(height, y0 + BLOCK); y++) {
+          const float *coc = surfaces.coc + (size_t)y * width + x0;
+          if (columns == BLOCK)
+            for (int x = 0; x < BLOCK; x += LANES) {
+              low_lanes = least(load<vec>(coc + x), low_lanes);
+              high_lanes = most(load<vec>(coc + x), high_lanes);
+            }
+          else
+            for (int x = 0; x < columns; x++) {
+              block_least = std::min(block_least, coc[x]);
+              block_most = std::max(block_most, coc[x]);
+            }
+        }
+        const int block = by * surfaces.block_columns + bx;
+        block_low[block] = block_least = std::min(block_least, smallest(low_lanes));
+        block_high[block] = block_most = std::max(block_most, largest(high_lanes));
+        if (block_least < low || block_most > high) beyond[by] = 1;
       }
     });
   };
@@ -116,23 +126,37 @@ void Job::take_scene() {
     }
 }
 
+void Job::find_peaks() {
+  block_peak = Buffer<float>(surfaces.blocks.size());
+  parallel(surfaces.block_rows, [&](int by, int) {
+    for (int bx = 0; bx < surfaces.block_columns; bx++) {
+      const int y0 = by * BLOCK, x0 = bx * BLOCK, columns = std::min(BLOCK, width - x0);
+      vec peak_lanes = all(-INFINITY);
+      float peak = -INFINITY;
+      for (int c = 0; c < channels; c++)
+        for (int y = y0; y < std::min(height, y0 + BLOCK); y++) {
+          const float *light = surfaces.light + c * surfaces.area() + (size_t)y * width + x0;
+          if (columns == BLOCK)
+            for (int x = 0; x < BLOCK; x += LANES) peak_lanes = most(load<vec>(light + x), peak_lanes);
+          else
+            for (int x = 0; x < columns; x++) peak = std::max(peak, light[x]);
+        }
+      block_peak[by * surfaces.block_columns + bx] = std::max(peak, largest(peak_lanes));
+    }
+  });
+}
+
 void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
   const bool several = layers.size() > 1, background = scene.kind == TORCHDOF_BACKGROUND;
   bool bright = scene.occlusion;
+  if (several) find_peaks();
   if (several && !scene.occlusion && scene.highlights) {  // coarse layers soften what is brighter than a display shows
     float reach = 0;
     for (const Layer &l : layers) reach = std::max(reach, std::fabs(coc_at(l.node)));
-    if (scene.crisp_px < reach) {
-      std::vector<uint8_t> found(surfaces.block_rows, 0);
-      parallel(surfaces.block_rows, [&](int by, int) {
-        const size_t from = (size_t)by * BLOCK * width, to = std::min(surfaces.area(), from + (size_t)BLOCK * width);
-        for (int c = 0; c < channels && !found[by]; c++)
-          for (size_t i = from; i < to; i++) found[by] |= surfaces.light[c * surfaces.area() + i] > 1.0f;
-      });
-      bright = std::count(found.begin(), found.end(), 1) > 0;
-    }
+    if (scene.crisp_px < reach)
+      for (size_t i = 0; i < surfaces.blocks.size(); i++) bright |= block_peak[i] > 1.0f;
   }
   const bool limited = several && bright;
   if (limited) find_threshold();

@@ -32,6 +32,16 @@ inline void store(float *p, V v) {
   typedef V unaligned __attribute__((aligned(4)));
   *(unaligned *)p = v;
 }
+inline vec all(float v) { return v - vec{}; }
+inline vec most(vec a, vec b) { return a > b ? a : b; }
+inline vec least(vec a, vec b) { return a < b ? a : b; }
+inline vec clamp01(vec v) { return least(most(v, vec{}), all(1.0f)); }
+inline float largest(vec v) {
+  float m = v[0];
+  for (int i = 1; i < LANES; i++) m = v[i] > m ? v[i] : m;
+  return m;
+}
+inline float smallest(vec v) { return -largest(-v); }
 inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
 inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
 inline int ceil_div(int a, int b) { return (a + b - 1) / b; }
@@ -136,7 +146,7 @@ struct Job {
 
   Buffer<float> clean_light, clean_coc, validity;  // copies of what is given, where it may not be taken as it is
   std::vector<Buffer<float>> copies;
-  Buffer<float> block_low, block_high;  // least and largest coc of each block
+  Buffer<float> block_low, block_high, block_peak;  // of each block the least and largest coc, and the largest light
 
   template <typename Body>
   void parallel(int count, const Body &body) const {
@@ -145,17 +155,17 @@ struct Job {
 
  private:
   void take_scene();
+  void find_peaks();
   void find_threshold();                  // highlights.cpp
   void split_mixed();                     // matting.cpp
   void fill_hidden();                     // disocclusion.cpp
   void put_before_background();           // matting.cpp
   void extract_highlights();              // highlights.cpp
-  void trace(int y0, int x0, const std::vector<int> &tile_rays, const struct Visibility &visibility,
-             const float *const *kernels, const int32_t *halves, float *out) const;
-  friend class Composite;
 };
 
-// Largest light of a row of pixels within one block that still is no highlight's: first, and how it grows by pixel.
+// Least highlight threshold of a block.
+float least_threshold(const Job &job, int y0, int x0);
+// Highlight threshold of a row of pixels within one block: the first, and how it grows by pixel.
 void threshold_row(const Job &job, int y, int x, float &first, float &step);
 
 // What the image shows, as rays of highlights meet it; highlights.cpp

@@ -17,7 +17,6 @@ constexpr int PATCH = 16;               // rays a side that are looked at togeth
 struct Candidate {
   int row, column;
   float peak, coc, limit;
-  bool in_block;
 };
 
 // Least of the values around each, so many to each side.
@@ -50,6 +49,16 @@ void threshold_row(const Job &job, int y, int x, float &first, float &step) {
   const float a = level(left), slope = at_x < 0 ? 0.0f : level(right) - a;
   step = slope / THRESHOLD_CELL;
   first = a + slope * (at_x < 0 ? 0.0f : at_x - left);
+}
+
+float least_threshold(const Job &job, int y0, int x0) {
+  float least = INFINITY;  // it is linear in between
+  for (int y : {y0, y0 + BLOCK - 1}) {
+    float first, step;
+    threshold_row(job, y, x0, first, step);
+    least = std::min(least, std::min(first, first + step * (BLOCK - 1)));
+  }
+  return least;
 }
 
 void Job::find_threshold() {
@@ -96,9 +105,10 @@ void Job::extract_highlights() {
     parallel(surfaces.block_rows, [&](int by, int) {
       std::vector<const float *> light(channels);
       const float *coc, *weight;
-      for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++)
-        for (int bx = 0; bx < surfaces.block_columns; bx++) {
-          const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0);
+      for (int bx = 0; bx < surfaces.block_columns; bx++) {
+        const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
+        if (!surfaces.whole() && !surfaces.has_block(block) && !(block_peak[block] > least_threshold(*this, by * BLOCK, x0))) continue;
+        for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
           if (!surfaces.row(i, y, x0, light.data(), coc, weight)) continue;
           float first, step, most[BLOCK];
           threshold_row(*this, y, x0, first, step);
@@ -111,9 +121,10 @@ void Job::extract_highlights() {
           for (int x = 0; x < n; x++) {
             const float limit = first + step * x;
             if (!(most[x] > limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > 1.0f)) continue;
-            bands[by].push_back({y, x0 + x, most[x], coc[x], limit, false});
+            bands[by].push_back({y, x0 + x, most[x], coc[x], limit});
           }
         }
+      }
     });
     std::vector<Candidate> all;
     for (const auto &band : bands) all.insert(all.end(), band.begin(), band.end());

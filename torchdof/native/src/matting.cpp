@@ -22,9 +22,9 @@ constexpr int PITCH = 24;                      // of both; eight values may be r
 typedef float f8 __attribute__((vector_size(32)));
 
 inline float sum(f8 v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
-inline f8 all(float v) { return f8{v, v, v, v, v, v, v, v}; }
+inline f8 all8(float v) { return f8{v, v, v, v, v, v, v, v}; }
 inline f8 clamp_lanes(f8 v) {
-  f8 zero = all(0.0f), one = all(1.0f);
+  f8 zero = all8(0.0f), one = all8(1.0f);
   v = v > zero ? v : zero;
   return v < one ? v : one;
 }
@@ -39,31 +39,40 @@ struct Window {
 bool find_edges(const Job &job, int y0, int x0, Window &w) {
   const int H = job.height, W = job.width;
   const float *coc = job.surfaces.coc, *valid = job.surfaces.valid;
+  float low[SIDE * PITCH], high[SIDE * PITCH];  // of valid pixels
   for (int i = 0; i < SIDE; i++) {
     const size_t row = (size_t)std::clamp(y0 - MARGIN + i, 0, H - 1) * W;
     for (int j = 0; j < SIDE; j++) {
       const size_t at = row + std::clamp(x0 - MARGIN + j, 0, W - 1);
-      w.coc[i * PITCH + j] = coc[at];
-      if (valid) w.valid[i * PITCH + j] = valid[at];
+      w.coc[i * PITCH + j] = low[i * PITCH + j] = high[i * PITCH + j] = coc[at];
+      if (!valid) continue;
+      w.valid[i * PITCH + j] = valid[at];
+      if (valid[at] > 0) continue;
+      low[i * PITCH + j] = NEVER;
+      high[i * PITCH + j] = -NEVER;
     }
+    for (int j = SIDE; j < PITCH; j++) low[i * PITCH + j] = high[i * PITCH + j] = 0;
   }
   bool any = false;
-  for (int i = 0; i < EDGES; i++)
+  for (int i = 0; i < EDGES; i++) {
+    // a pixel outside the frame is the nearest one inside
+    const int y = std::clamp(y0 - REACH + i, 0, H - 1) - y0 + MARGIN;
+    float least_of[PITCH], most_of[PITCH];
+    for (int j = 0; j < PITCH; j++) {
+      const float *l = low + (y - 1) * PITCH + j, *h = high + (y - 1) * PITCH + j;
+      least_of[j] = std::min(std::min(l[0], l[PITCH]), l[2 * PITCH]);
+      most_of[j] = std::max(std::max(h[0], h[PITCH]), h[2 * PITCH]);
+    }
     for (int j = 0; j < EDGES; j++) {
-      // a pixel outside the frame is the nearest one inside
-      const int y = std::clamp(y0 - REACH + i, 0, H - 1) - y0 + MARGIN, x = std::clamp(x0 - REACH + j, 0, W - 1) - x0 + MARGIN;
-      float low = NEVER, high = -NEVER;
-      for (int v = y - 1; v <= y + 1; v++)
-        for (int u = x - 1; u <= x + 1; u++) {
-          if (valid && !w.valid[v * PITCH + u]) continue;
-          low = std::min(low, w.coc[v * PITCH + u]);
-          high = std::max(high, w.coc[v * PITCH + u]);
-        }
-      float edge = clamp01((high - low) / EDGE_PX - 1.0f);
+      const int x = std::clamp(x0 - REACH + j, 0, W - 1) - x0 + MARGIN;
+      const float gap = std::max(std::max(most_of[x - 1], most_of[x]), most_of[x + 1]) -
+                        std::min(std::min(least_of[x - 1], least_of[x]), least_of[x + 1]);
+      float edge = clamp01(gap / EDGE_PX - 1.0f);
       if (valid) edge *= w.valid[y * PITCH + x];
       w.edge[i * PITCH + j] = edge;
       any |= edge > 0 && i >= REACH && i < REACH + BLOCK && j >= REACH && j < REACH + BLOCK;
     }
+  }
   return any;
 }
 
@@ -102,11 +111,11 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
   f8 nearer[AROUND], farther[AROUND], inside = {1, 1, 1, 1, 1, 0, 0, 0};
   for (int r = 0; r < AROUND; r++) {
     const size_t in_coc = (size_t)(y + 1 + r) * PITCH + x + 1;
-    f8 weight = (all(1.0f + UNCLEAN) - load<f8>(w.edge + first + r * PITCH)) * falloff[r];
+    f8 weight = (all8(1.0f + UNCLEAN) - load<f8>(w.edge + first + r * PITCH)) * falloff[r];
     if (masked) weight *= load<f8>(w.valid + in_coc);
-    const f8 nearness = (all(far) - load<f8>(w.coc + in_coc)) / all(gap);
-    nearer[r] = weight * clamp_lanes(all(4.0f) * nearness - all(2.8f));
-    farther[r] = weight * clamp_lanes(all(1.2f) - all(4.0f) * nearness);
+    const f8 nearness = (all8(far) - load<f8>(w.coc + in_coc)) / all8(gap);
+    nearer[r] = weight * clamp_lanes(all8(4.0f) * nearness - all8(2.8f));
+    farther[r] = weight * clamp_lanes(all8(1.2f) - all8(4.0f) * nearness);
   }
   float *front = w.front.data(), *behind = w.behind.data(), *colour = w.colour.data();
   const float behind_spread = mean(w, channels, first, farther, behind);
@@ -116,10 +125,10 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
     for (int r = 0; r < AROUND; r++) {
       f8 squares = {};
       for (int c = 0; c < channels; c++) {
-        const f8 d = load<f8>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH) - all(behind[c]);
+        const f8 d = load<f8>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH) - all8(behind[c]);
         squares += d * d;
       }
-      nearer[r] = nearer[r] * squares + inside * all(1e-12f);
+      nearer[r] = nearer[r] * squares + inside * all8(1e-12f);
     }
   const float front_spread = mean(w, channels, first, nearer, front);
 
