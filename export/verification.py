@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import time
+from typing import Any
 
 import numpy as np
 import onnx
@@ -175,9 +176,9 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
 
 
 def _check_origin(facts: dict, dof: DepthOfField) -> None:
-    if facts["table"]["sha256"] != table_hash(dof.table):
-        raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.table!r}")
-    options = dof._options(table=False)
+    if facts["table"]["sha256"] != table_hash(dof.options.table):
+        raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.options.table!r}")
+    options: dict[str, Any] = {**dof.options.arguments()}
     for name, value in facts["options"].items():
         if options[name] != value:
             raise ValueError(f"the file was made with {name}={value!r}, the module has {options[name]!r}")
