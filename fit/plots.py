@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchdof import BlurTable
+from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import LENGTHS
 
 from .photo.profile_fit import evaluate

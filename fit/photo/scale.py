@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from torchdof import BlurTable, Camera
+from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.camera import Camera
 from torchdof.validation import show
 
 from ..problems import FitError, OutsideMeasuredWarning, warn

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchdof import BlurTable, Camera
+from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.camera import Camera
 from torchdof.optics.psf import FAMILIES, LENGTHS, profile, support
 from torchdof.validation import show
 

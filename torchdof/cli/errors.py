@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator
 
 import typer
-from rich.console import Console
 
 __all__ = ["advice", "told_in_one_sentence"]
 
@@ -36,7 +35,7 @@ def told_in_one_sentence() -> Iterator[None]:
         if torch is None or not isinstance(error, torch.OutOfMemoryError):
             raise
         message = "the device has too little memory for this image; try --device cpu"
-    Console(stderr=True).print(f"error: {message}", markup=False, highlight=False, soft_wrap=True)
+    typer.echo(f"error: {message}", err=True)
     raise typer.Exit(2)
 
 
