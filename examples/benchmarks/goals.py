@@ -12,23 +12,21 @@ import dataclasses
 import functools
 import itertools
 import math
-import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import torch
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
 from torchdof.bench import memory
 from torchdof.bench.inputs import Subject, shipped
-from torchdof.bench.report import csv_of, existing_folder, machine, markdown, write
-from torchdof.bench.speed import Setting, exact, median_and_spread, render, unit_work
+from torchdof.bench.report import Report, ReportTable, csv_of, existing_folder, machine
+from torchdof.bench.speed import Setting, exact, render_subject, unit_work
+from torchdof.bench.timer import in_turns, median_and_spread, timed
 from torchdof.cli.errors import told_in_one_sentence
 from torchdof.module import blur_by_coc
 from torchdof.reference import metrics
@@ -80,15 +78,15 @@ def subjects(scenes: Path) -> list[Subject]:
         OSError: If there is no scene.
         ValueError: If one is not as :func:`torchdof.reference.scenes.read_scenes` takes it.
     """
-    found = [shipped(*_FRAME)]
+    measured = [shipped(*_FRAME)]
     for _, settings in itertools.groupby(read_scenes(scenes), lambda scene: scene.name.rpartition("/")[0]):
         cases = list(settings)
         middle = cases[len(cases) // 2]
         subject = Subject(middle.name, middle.image, middle.coc_px).resized(*_FRAME)
         if not subject.radius_px > 0:
             raise ValueError(f"{subject.name}: is all in focus; goals are for scenes with blur, leave it out")
-        found.append(subject)
-    return found
+        measured.append(subject)
+    return measured
 
 
 def compare(scenes: Path, out: Path | None, repeat: int) -> None:
@@ -110,11 +108,11 @@ def compare(scenes: Path, out: Path | None, repeat: int) -> None:
         functools.partial(_quad, repeat),
     ]
     for work in track(works, "scenes", console=progress, transient=True, disable=not progress.is_terminal):
-        found = work()
-        _show(found)  # the next one takes a minute
-        figures += found
+        of_scene = work()
+        _show(of_scene)  # the next one takes a minute
+        figures += of_scene
     if out is not None:
-        write(out, "goals", {"csv": csv_of(figures), "md": _markdown(figures, repeat)})
+        _report(figures, repeat).write(out)
     Console().print(f"{machine()}. {_remark(figures, repeat)}", markup=False, highlight=False)
 
 
@@ -135,7 +133,7 @@ def _errors(subject: Subject) -> Iterator[Figure]:
     for occlusion in (True, False):
         shown, wanted = (
             metrics.display(image)
-            for image in (render(subject, Setting("layered", occlusion, _FINE)), exact(subject, occlusion))
+            for image in (render_subject(subject, Setting("layered", occlusion, _FINE)), exact(subject, occlusion))
         )
         error = (shown.double() - wanted.double()).abs()
         rms, rare = math.sqrt(float(error.square().mean())), float(torch.quantile(error, 0.999))
@@ -147,30 +145,30 @@ def _errors(subject: Subject) -> Iterator[Figure]:
 def _frames(subject: Subject, repeat: int) -> Iterator[Figure]:
     """A frame by its radius, in Y and beside other tolerances, radii and methods."""
     works: dict[Hashable, Callable[[], object]] = {"Y": unit_work()}
-    works["in focus"] = functools.partial(render, subject.blurred(0.0), Setting("layered", True, _FINE))
+    works["in focus"] = functools.partial(render_subject, subject.blurred(0.0), Setting("layered", True, _FINE))
     usual = subject.blurred(_USUAL_PX)
     part = usual.crop(_FOLD_PX, widest=True)  # its kernels are as large as the frame's
     for occlusion in (True, False):
         setting = Setting("layered", occlusion, _FINE)
         for radius in _GOALS:
-            works[radius, occlusion] = functools.partial(render, subject.blurred(radius), setting)
-        works["loose", occlusion] = functools.partial(render, usual, Setting("layered", occlusion, _LOOSE))
-        works["fold", occlusion] = functools.partial(render, part, Setting("fold", occlusion, _FINE))
-    found = _in_turns(works, repeat)
+            works[radius, occlusion] = functools.partial(render_subject, subject.blurred(radius), setting)
+        works["loose", occlusion] = functools.partial(render_subject, usual, Setting("layered", occlusion, _LOOSE))
+        works["fold", occlusion] = functools.partial(render_subject, part, Setting("fold", occlusion, _FINE))
+    timings = in_turns(works, repeat)
     frame = _size(_FRAME)
-    yield _figure("Y", "ms", [1e3 * seconds for seconds in found["Y"]])
-    yield _figure(f"{frame}, all in focus", "Y", _ratios(found, "in focus", "Y"), 0.5)
+    yield _figure("Y", "ms", [1e3 * seconds for seconds in timings["Y"]])
+    yield _figure(f"{frame}, all in focus", "Y", _ratios(timings, "in focus", "Y"), 0.5)
     for number, occlusion in enumerate((True, False)):
         for radius, goals in _GOALS.items():
             what = f"{frame}, {radius:g} px{_without(occlusion)}"
-            yield _figure(what, "Y", _ratios(found, (radius, occlusion), "Y"), goals[number])
+            yield _figure(what, "Y", _ratios(timings, (radius, occlusion), "Y"), goals[number])
     for occlusion in (True, False):
-        wide = _ratios(found, (_WIDE_PX, occlusion), (_USUAL_PX, occlusion))
+        wide = _ratios(timings, (_WIDE_PX, occlusion), (_USUAL_PX, occlusion))
         yield _figure(f"radius {_WIDE_PX:g} over {_USUAL_PX:g} px{_without(occlusion)}", "times", wide, 1.3)
-        loose = _ratios(found, (_USUAL_PX, occlusion), ("loose", occlusion))
+        loose = _ratios(timings, (_USUAL_PX, occlusion), ("loose", occlusion))
         yield _figure(f"4/255 faster than 1/255{_without(occlusion)}", "times", loose, 1.5, at_least=True)
         share = usual.coc_px.numel() / part.coc_px.numel()
-        fold = [share * ratio for ratio in _ratios(found, ("fold", occlusion), (_USUAL_PX, occlusion))]
+        fold = [share * ratio for ratio in _ratios(timings, ("fold", occlusion), (_USUAL_PX, occlusion))]
         yield _figure(f"layered faster than fold, by pixel{_without(occlusion)}", "times", fold, 50.0, at_least=True)
 
 
@@ -183,9 +181,11 @@ def _crops(subject: Subject, repeat: int) -> Iterator[Figure]:
     def forward() -> Tensor:
         return blur_by_coc(image, coc_px, tolerance=_FINE)
 
-    found = _in_turns(
+    timings = in_turns(
         {
-            **{seen: functools.partial(render, part, Setting("layered", seen, _FINE)) for seen in (True, False)},
+            **{
+                seen: functools.partial(render_subject, part, Setting("layered", seen, _FINE)) for seen in (True, False)
+            },
             "forward": forward,
             "both": lambda: torch.autograd.grad(forward().square().mean(), (image, coc_px)),
         },
@@ -193,9 +193,9 @@ def _crops(subject: Subject, repeat: int) -> Iterator[Figure]:
     )
     crop = f"{part.image.shape[-1]} x {part.image.shape[-2]} crop"
     for seen in (True, False):
-        milliseconds = [1e3 * seconds for seconds in found[seen]]
+        milliseconds = [1e3 * seconds for seconds in timings[seen]]
         yield _figure(f"{crop}, {_CROP_RADIUS_PX:g} px{_without(seen)}", "ms", milliseconds, 60.0)
-    both = _ratios(found, "both", "forward")
+    both = _ratios(timings, "both", "forward")
     yield _figure(f"{crop}, {_USUAL_PX:g} px: forward and backward over forward", "times", both, 4.0)
 
 
@@ -212,22 +212,21 @@ def _sizes(subject: Subject, repeat: int) -> Iterator[Figure]:
             return blur_by_coc(*(torch.cat([getattr(i, x) for i in items]) for x in ("image", "coc_px")))
 
     works: dict[Hashable, Callable[[], object]] = {
-        "frame": functools.partial(render, usual, setting),
-        "double": functools.partial(render, usual.resized(*_DOUBLE), setting),
+        "frame": functools.partial(render_subject, usual, setting),
+        "double": functools.partial(render_subject, usual.resized(*_DOUBLE), setting),
         "batch": batch,
-        "alone": lambda: [render(item, setting) for item in items],
+        "alone": lambda: [render_subject(item, setting) for item in items],
     }
-    found = _in_turns(works, repeat)
+    timings = in_turns(works, repeat)
     yield _figure(
-        f"{_size(_DOUBLE)} over {_size(_FRAME)}, twice the radius", "times", _ratios(found, "double", "frame"), 4.4
+        f"{_size(_DOUBLE)} over {_size(_FRAME)}, twice the radius", "times", _ratios(timings, "double", "frame"), 4.4
     )
-    yield _figure(f"{len(items)} x {_size(_HALF)} over one by one", "times", _ratios(found, "batch", "alone"), 1.0)
+    yield _figure(f"{len(items)} x {_size(_HALF)} over one by one", "times", _ratios(timings, "batch", "alone"), 1.0)
     largest = subject.resized(*_LARGEST).blurred(_WIDE_PX)
     peaks, seconds = [], []
     for _ in range(2):
-        held, start = memory.reset_peak(), time.perf_counter()
-        render(largest, setting)
-        seconds.append(time.perf_counter() - start)
+        held = memory.reset_peak()
+        seconds.append(timed(functools.partial(render_subject, largest, setting))[1])
         peaks.append((memory.peak_mb() - held) / 1024)
     what = f"{_size(_LARGEST)}, {_WIDE_PX:g} px"
     yield _figure(f"{what}: memory on top of the frame", "GiB", peaks, 6e9 / 2**30)
@@ -240,26 +239,14 @@ def _quad(repeat: int) -> list[Figure]:
     image = torch.zeros(1, 3, n, n)
     image[..., 2 * n // 5 : 3 * n // 5, 2 * n // 5 : 3 * n // 5] = 1.0
     subject = Subject("quad on black", image, torch.full((1, 1, n, n), _CROP_RADIUS_PX))
-    found = _in_turns({"": functools.partial(render, subject, Setting("layered", True, _FINE))}, repeat)
-    milliseconds = [1e3 * seconds for seconds in found[""]]
+    timings = in_turns({"": functools.partial(render_subject, subject, Setting("layered", True, _FINE))}, repeat)
+    milliseconds = [1e3 * seconds for seconds in timings[""]]
     what = f"{_size((n, n))}, {_CROP_RADIUS_PX:g} px everywhere"
     return [dataclasses.replace(_figure(what, "ms", milliseconds, 26.4), scene=subject.name)]
 
 
-def _in_turns(works: Mapping[Hashable, Callable[[], object]], repeat: int) -> dict[Hashable, list[float]]:
-    """Seconds of each, turn by turn, after one turn more to warm up."""
-    found: dict[Hashable, list[float]] = {name: [] for name in works}
-    for turn in range(repeat + 1):
-        for name, work in works.items():
-            start = time.perf_counter()
-            work()
-            if turn:
-                found[name].append(time.perf_counter() - start)
-    return found
-
-
-def _ratios(found: Mapping[Hashable, Sequence[float]], over: Hashable, under: Hashable) -> list[float]:
-    return [a / b for a, b in zip(found[over], found[under], strict=True)]
+def _ratios(timings: Mapping[Hashable, Sequence[float]], over: Hashable, under: Hashable) -> list[float]:
+    return [a / b for a, b in zip(timings[over], timings[under], strict=True)]
 
 
 def _figure(what: str, unit: str, values: Sequence[float], goal: float = math.nan, at_least: bool = False) -> Figure:
@@ -303,20 +290,19 @@ def _remark(figures: Sequence[Figure], repeat: int) -> str:
     )
 
 
-def _markdown(figures: Sequence[Figure], repeat: int) -> str:
+def _report(figures: Sequence[Figure], repeat: int) -> Report:
     remark = f"{_remark(figures, repeat)} They are bold."
-    return "\n\n".join(["# Cost beside the goals", f"{machine()}.", remark, markdown(_lines(figures)), ""])
+    table = ReportTable("Figures", _lines(figures))
+    return Report("goals", "Cost beside the goals", [f"{machine()}.", remark, table], csv_of(figures))
 
 
 def _show(figures: Sequence[Figure]) -> None:
     """Prints the figures of one scene."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=figures[0].scene, title_justify="left")
-    for name in ("figure", "measured", "in", "goal", ""):
-        table.add_column(name, justify="right" if name == "measured" else "left")
+    lines = [["figure", "measured", "in", "goal", ""]]
     for figure in figures:
         missed = "missed" if figure.missed else ""
-        table.add_row(figure.what, _measured(figure), figure.unit, _goal(figure), missed)
-    Console().print(table)
+        lines.append([figure.what, _measured(figure), figure.unit, _goal(figure), missed])
+    ReportTable(figures[0].scene, lines, words=("figure", "in", "goal", "")).show()
 
 
 def main(

@@ -8,7 +8,7 @@ A peer is a Python file in a folder (``peers`` beside this file)::
     NOTE = "float32. Time: the whole call."
     def available() -> str | None: ...               # None, or what to install
     def version() -> str: ...
-    def render(image, coc_px) -> Tensor: ...         # or (Tensor, seconds), where the tool times itself
+    def blur(image, coc_px) -> Tensor: ...         # or (Tensor, seconds), where the tool times itself
 
 ``image`` is ``[1, 3, H, W]``, linear light, float32; ``coc_px`` ``[1, 1, H, W]``, signed radius of the disc in pixels.
 Files that start with an underscore are left alone.
@@ -19,7 +19,6 @@ import functools
 import importlib.util
 import math
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -27,21 +26,19 @@ from typing import Annotated
 
 import torch
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
-from torchdof.bench.report import csv_of, existing_folder, machine, markdown, write
-from torchdof.bench.speed import median_and_spread
+from torchdof.bench.report import Report, ReportTable, csv_of, existing_folder, machine
+from torchdof.bench.timer import in_turns, median_and_spread, timed
 from torchdof.cli.errors import told_in_one_sentence
 from torchdof.module import blur_by_coc
 from torchdof.reference import metrics
 from torchdof.reference.scenes import Scene, read_scenes
 from torchdof.validation import whole
 
-__all__ = ["Peer", "Row", "check", "compare", "measure", "ours", "read_peers", "ratios"]
+__all__ = ["Peer", "CaseTiming", "check", "compare", "measure_case", "ours", "read_peers", "ratios"]
 
 _LEVELS = (8.0, 4.0, 1.0)  # of 255
 _STRIP_PX = 65
@@ -55,7 +52,7 @@ class Peer:
 
     Args:
         name: For the tables.
-        render: The rendering of ``image`` ``[1, 3, H, W]`` by ``coc_px`` ``[1, 1, H, W]``; and, where the tool timed
+        blur: The rendering of ``image`` ``[1, 3, H, W]`` by ``coc_px`` ``[1, 1, H, W]``; and, where the tool timed
             itself, seconds.
         note: What it was given, and what its time holds.
         missing: What to install; None: nothing is missing.
@@ -63,14 +60,14 @@ class Peer:
     """
 
     name: str
-    render: Callable[[Tensor, Tensor], Tensor | tuple[Tensor, float]]
+    blur: Callable[[Tensor, Tensor], Tensor | tuple[Tensor, float]]
     note: str = ""
     missing: str | None = None
     version: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class CaseTiming:
     """What one renderer took on one case, in seconds (spread: interquartile range), and reached, display-encoded."""
 
     case: str
@@ -98,7 +95,7 @@ def read_peers(folder: Path) -> list[Peer]:
 
     Raises:
         FileNotFoundError: If there is no such folder, or no peer in it.
-        ValueError: If a file has no ``render`` or ``available``.
+        ValueError: If a file has no ``blur`` or ``available``.
     """
     files = sorted(path for path in folder.glob("*.py") if not path.name.startswith("_"))
     if not files:
@@ -118,12 +115,12 @@ def _read_peer(path: Path) -> Peer:
         spec.loader.exec_module(module)
     except ModuleNotFoundError as error:
         return Peer(name, lambda image, coc_px: image, missing=f"pip install {error.name}")
-    if not callable(getattr(module, "render", None)) or not callable(getattr(module, "available", None)):
-        raise ValueError(f"{path}: a peer defines available() and render(image, coc_px)")
+    if not callable(getattr(module, "blur", None)) or not callable(getattr(module, "available", None)):
+        raise ValueError(f"{path}: a peer defines available() and blur(image, coc_px)")
     name, note, missing = getattr(module, "NAME", name), getattr(module, "NOTE", note), module.available()
     if missing is None and hasattr(module, "version"):
         version = module.version()
-    return Peer(name, module.render, note, missing, version)
+    return Peer(name, module.blur, note, missing, version)
 
 
 def check(peer: Peer, radius_px: float = 6.0) -> str | None:
@@ -154,31 +151,32 @@ def check(peer: Peer, radius_px: float = 6.0) -> str | None:
         if max(abs(x), abs(y)) > 0.75:
             return f"a dot at {radius:g} px moves by {x:.2f}, {y:.2f} px"
         square = float((dot * ((place[:, None] - y) ** 2 + (place - x) ** 2)).sum()) / light
-        found = math.sqrt(max(2.0 * (square - 1.0 / 6.0), 0.0))  # a pixel itself has 1 / 6
-        if abs(found - abs(radius)) > (0.05 * abs(radius) or 1.0):
-            return f"a dot at {radius:g} px is blurred as by a disc of {found:.2f} px"
+        disc_radius = math.sqrt(max(2.0 * (square - 1.0 / 6.0), 0.0))  # a pixel itself has 1 / 6
+        if abs(disc_radius - abs(radius)) > (0.05 * abs(radius) or 1.0):
+            return f"a dot at {radius:g} px is blurred as by a disc of {disc_radius:.2f} px"
     return None
 
 
-def measure(scene: Scene, compared: Sequence[Peer], repeat: int) -> list[Row]:
+def measure_case(scene: Scene, compared: Sequence[Peer], repeat: int) -> list[CaseTiming]:
     """Each renderer on one case: once for the error and to warm up, then ``repeat`` times, in turns."""
-    truth, errors = metrics.display(scene.truth), {}
-    times: dict[str, list[float]] = {peer.name: [] for peer in compared}
-    for peer in compared:
-        errors[peer.name] = metrics.psnr(metrics.display(_timed(peer, scene.image, scene.coc_px)[0]), truth)
-    for _ in range(repeat):
-        for peer in compared:  # in turns: what else the machine does meets all alike
-            times[peer.name].append(_timed(peer, scene.image, scene.coc_px)[1])
-    rows = []
-    for name, seconds in times.items():
-        rows.append(Row(scene.name, name, *median_and_spread(seconds), errors[name]))
-    return rows
+    truth = metrics.display(scene.truth)
+    errors: dict[str, float] = {}
+
+    def seconds_of(peer: Peer) -> float:
+        image, seconds = _timed(peer, scene.image, scene.coc_px)
+        if peer.name not in errors:
+            errors[peer.name] = metrics.psnr(metrics.display(image), truth)
+        return seconds
+
+    works = {peer.name: functools.partial(seconds_of, peer) for peer in compared}
+    seconds = in_turns(works, repeat, seconds_of=lambda work: work())
+    return [CaseTiming(scene.name, name, *median_and_spread(taken), errors[name]) for name, taken in seconds.items()]
 
 
-def ratios(rows: Sequence[Row], name: str, base: str) -> tuple[list[float], list[float]]:
+def ratios(rows: Sequence[CaseTiming], name: str, base: str) -> tuple[list[float], list[float]]:
     """Of each case, the time of ``name`` over that of ``base``, and by how many dB ``base`` is nearer the truth."""
-    found = {(row.case, row.name): row for row in rows}
-    pairs = [(found[case, name], found[case, base]) for case in dict.fromkeys(row.case for row in rows)]
+    timings = {(row.case, row.name): row for row in rows}
+    pairs = [(timings[case, name], timings[case, base]) for case in dict.fromkeys(row.case for row in rows)]
     return [a.median_s / b.median_s for a, b in pairs], [b.psnr_db - a.psnr_db for a, b in pairs]
 
 
@@ -196,21 +194,29 @@ def compare(scenes: Path, folder: Path, out: Path | None, repeat: int) -> None:
         OSError: If there are no scenes or peers, or a tool fails.
     """
     whole("--repeat", repeat, 1, 10000)
-    progress, found = Console(stderr=True), read_peers(folder)
+    progress, others = Console(stderr=True), read_peers(folder)
     cases = list(read_scenes(scenes))
-    wrong = {peer.name: _wrong(peer) for peer in found}
+    wrong = {peer.name: _wrong(peer) for peer in others}
     mine = ours()
     for peer in mine:
         if (failed := check(peer)) is not None:
             raise ValueError(f"{peer.name}: {failed}")
-    compared = [*mine, *(peer for peer in found if wrong[peer.name] is None)]
-    rows: list[Row] = []
+    compared = [*mine, *(peer for peer in others if wrong[peer.name] is None)]
+    rows: list[CaseTiming] = []
     for scene in track(cases, "cases", console=progress, transient=True, disable=not progress.is_terminal):
-        rows += measure(scene, compared, repeat)
+        rows += measure_case(scene, compared, repeat)
     absent = {name: reason for name, reason in wrong.items() if reason is not None}
+    tables = _tables(rows)
+    for table in (tables[1], tables[2], tables[0]):  # the summary is what remains on the screen
+        table.show()
+    told = [f"{_machine()}. Timed renderings of each, in turns, after one more: {repeat}."]
+    told += [f"{peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared]
+    told += [f"{name}: {reason}" for name, reason in absent.items()]
+    for line in told:
+        Console().print(line, markup=False, highlight=False)
     if out is not None:
-        write(out, "peers", {"csv": csv_of(rows), "md": _markdown(rows, compared, absent, repeat)})
-    _show(rows, compared, absent, repeat)
+        notes = "\n".join(f"- {line}" for line in told[1:])
+        Report("peers", "Beside other tools", [told[0], notes, *tables], csv_of(rows)).write(out)
 
 
 def _wrong(peer: Peer) -> str | None:
@@ -222,18 +228,17 @@ def _wrong(peer: Peer) -> str | None:
 
 
 def _timed(peer: Peer, image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
+    """A peer's picture and its seconds: its own, where the tool times itself."""
     with torch.inference_mode():
-        start = time.perf_counter()
-        result = peer.render(image, coc_px)
-        seconds = time.perf_counter() - start
+        result, seconds = timed(functools.partial(peer.blur, image, coc_px))
     return result if isinstance(result, tuple) else (result, seconds)
 
 
-def _names(rows: Sequence[Row]) -> list[str]:
+def _names(rows: Sequence[CaseTiming]) -> list[str]:
     return list(dict.fromkeys(row.name for row in rows))
 
 
-def _times(rows: Sequence[Row]) -> list[list[str]]:
+def _times(rows: Sequence[CaseTiming]) -> list[list[str]]:
     """Lines of the table of times: a case each."""
     lines: dict[str, list[str]] = {}
     for row in rows:
@@ -241,12 +246,12 @@ def _times(rows: Sequence[Row]) -> list[list[str]]:
     return list(lines.values())
 
 
-def _milliseconds(row: Row) -> str:
+def _milliseconds(row: CaseTiming) -> str:
     digits = 0 if row.median_s >= 0.1 else 1
     return f"{1e3 * row.median_s:.{digits}f} ± {1e3 * row.spread_s:.{digits}f}"
 
 
-def _errors(rows: Sequence[Row]) -> list[list[str]]:
+def _errors(rows: Sequence[CaseTiming]) -> list[list[str]]:
     """Lines of the table of errors: a case each, and their mean."""
     lines: dict[str, list[str]] = {}
     for row in rows:
@@ -255,7 +260,7 @@ def _errors(rows: Sequence[Row]) -> list[list[str]]:
     return [*lines.values(), ["mean", *(f"{mean:.2f}" for mean in means)]]
 
 
-def _summary(rows: Sequence[Row]) -> list[list[str]]:
+def _summary(rows: Sequence[CaseTiming]) -> list[list[str]]:
     """Lines of the summary: for each peer its time over ours, and how much nearer we are."""
     base, lines = f"ours {_LEVELS[-1]:g}/255", []
     for name in _names(rows):
@@ -280,36 +285,14 @@ def _machine() -> str:
     return machine(f"threads for each renderer: {torch.get_num_threads()}")
 
 
-def _markdown(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, str], repeat: int) -> str:
+def _tables(rows: Sequence[CaseTiming]) -> list[ReportTable]:
+    """Summary, times and errors."""
     head = ["case", *_names(rows)]
-    parts = [
-        "# Beside other tools\n",
-        f"{_machine()}. Timed renderings of each, in turns, after one more: {repeat}.\n",
-        *(f"- {peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared),
-        *(f"- {name}: {reason}" for name, reason in absent.items()),
+    return [
+        ReportTable(_RATIOS, [_SUMMARY, *_summary(rows)], words=("",)),
+        ReportTable(_TIMES, [head, *_times(rows)], words=("case",)),
+        ReportTable(_ERRORS, [head, *_errors(rows)], words=("case",)),
     ]
-    tables = ((_RATIOS, list(_SUMMARY), _summary(rows)), (_TIMES, head, _times(rows)), (_ERRORS, head, _errors(rows)))
-    for title, columns, lines in tables:
-        parts += [f"\n## {title}\n", markdown([columns, *lines])]
-    return "\n".join(parts) + "\n"
-
-
-def _show(rows: Sequence[Row], compared: Sequence[Peer], absent: dict[str, str], repeat: int) -> None:
-    console = Console()
-    head = ["case", *_names(rows)]
-    tables = ((_TIMES, head, _times(rows)), (_ERRORS, head, _errors(rows)), (_RATIOS, list(_SUMMARY), _summary(rows)))
-    for title, columns, lines in tables:
-        table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title_justify="left")
-        for column in columns:
-            table.add_column(column, justify="left" if column in ("case", "") else "right")
-        for line in lines:
-            table.add_row(*line)
-        console.print(table)
-    console.print(f"{_machine()}; timed renderings of each: {repeat}.", markup=False, highlight=False)
-    for peer in compared[len(_LEVELS) :]:
-        console.print(f"{peer.name} {peer.version}: {peer.note}", markup=False, highlight=False)
-    for name, reason in absent.items():
-        console.print(f"{name}: {reason}", markup=False, highlight=False, style="yellow")
 
 
 def main(

@@ -13,15 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchdof.validation import show
 
+from ..result import Array
 from . import prescription
 
 __all__ = ["RGB_UM", "Lens", "Paraxial"]
 
-Array = NDArray[np.float64]
 
 D_UM, F_UM, C_UM = 0.58756, 0.48613, 0.65627
 RGB_UM = (C_UM, 0.54607, F_UM)

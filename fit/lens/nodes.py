@@ -22,11 +22,11 @@ from scipy.special import j0
 
 from torchdof.optics.psf import FAMILIES, LENGTHS
 
-from .lens import Array
+from ..result import Array
 from .shape import fit_shape
 from .spot import Spot
 
-__all__ = ["Sample", "Tracer", "fit_radial", "fit_shapes", "place_nodes"]
+__all__ = ["NodeEquations", "Tracer", "fit_radial", "fit_shapes", "place_nodes"]
 
 _FINEST = 3.0  # cycles a pixel; kernels are sampled on the pixel grid, so frequencies beyond it fold back
 _BETWEEN = (0.25, 0.5, 0.75)  # where between two nodes spots are traced for the joint fit
@@ -36,7 +36,7 @@ _NARROW = 0.01  # pixels of coc; an interval that narrow is not divided
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class NodeEquations:
     """A traced spot as a quadratic form: profile values v miss it by ``v @ gram @ v - 2 pull @ v + own`` (squared)."""
 
     radius: float
@@ -52,7 +52,7 @@ class Sample:
 
 
 class Tracer:
-    """Traces spots by coc and keeps them as samples; a sample between nodes is given the radius interpolated there."""
+    """Traces spots by coc and keeps their equations; between nodes these are for the radius interpolated there."""
 
     def __init__(self, spot: Callable[[float], Spot], points: int, pixel: float) -> None:
         self.spot, self.points, self.pixel = spot, points, pixel
@@ -60,7 +60,7 @@ class Tracer:
         # amplitude of natural images times the area of a ring of frequencies; flat beyond Nyquist, where it folds back
         spectrum = np.minimum(self.frequency, 0.5) ** -0.5
         self.weight = spectrum / np.sqrt(1.0 + (np.pi * self.frequency) ** 2)
-        self._nodes: dict[float, Sample] = {}
+        self._nodes: dict[float, NodeEquations] = {}
         self._spots: dict[float, tuple[Array, Array, Array]] = {}
 
     def traced(self, coc: float) -> tuple[Array, Array, Array]:
@@ -71,14 +71,14 @@ class Tracer:
             self._spots[coc] = r, spot.weight, transfer(self.frequency, r, spot.weight)
         return self._spots[coc]
 
-    def node(self, coc: float) -> Sample:
-        """The sample at a node: its radius is that of the outermost ray."""
+    def node(self, coc: float) -> NodeEquations:
+        """The equations of the spot at a node, whose radius is that of the outermost ray."""
         if coc not in self._nodes:
-            self._nodes[coc] = self.sample(coc, float(self.traced(coc)[0].max()))
+            self._nodes[coc] = self.equations(coc, float(self.traced(coc)[0].max()))
         return self._nodes[coc]
 
-    def sample(self, coc: float, radius: float) -> Sample:
-        """The spot at a coc as a sample for profiles that end at ``radius`` pixels."""
+    def equations(self, coc: float, radius: float) -> NodeEquations:
+        """The equations of the spot at a coc, for profiles that end at ``radius`` pixels."""
         r, light, seen = self.traced(coc)
         basis, area = _hats(self.frequency, radius, self.points)
         basis = basis * self.weight[:, None]
@@ -91,7 +91,7 @@ class Tracer:
         part = place - low
         ring = np.bincount(low, light * (1 - part), self.points) + np.bincount(low + 1, light * part, self.points)
         own = float(((seen * self.weight) ** 2).sum() + heavy)
-        return Sample(radius, gram, pull, own, ring / area, area)
+        return NodeEquations(radius, gram, pull, own, ring / area, area)
 
     def relative(self, error: float) -> float:
         """Root of a squared error over that of a kernel that passes no light."""
@@ -132,15 +132,15 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int) -> list[flo
 
     def values(coc: float) -> Array:
         if coc not in alone:
-            sample = tracer.node(coc)
-            alone[coc] = _non_negative(sample, sample.gram, sample.pull, sample.histogram)
+            node = tracer.node(coc)
+            alone[coc] = _non_negative(node, node.gram, node.pull, node.histogram)
         return alone[coc]
 
     def gap(left: float, right: float) -> float:
         radii = tracer.node(left).radius, tracer.node(right).radius
         if max(radii) <= 0.5 or right - left < _NARROW * tracer.pixel:
             return 0.0
-        between = tracer.sample((left + right) / 2, sum(radii) / 2)
+        between = tracer.equations((left + right) / 2, sum(radii) / 2)
         return between.error((values(left) + values(right)) / 2)
 
     gaps = [gap(*pair) for pair in zip(places, places[1:], strict=False)]
@@ -162,25 +162,25 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
     """Values of all nodes at once, by sweeps from both ends to the focus and back."""
     nodes = [tracer.node(coc) for coc in places]
     values = [_non_negative(node, node.gram, node.pull, node.histogram) for node in nodes]
-    # every sample: the node to its left, its share of the way to the next one, the spot there
-    samples = [(i, 0.0, node) for i, node in enumerate(nodes)]
+    # every spot: the node to its left, its share of the way to the next one, its equations
+    spots = [(i, 0.0, node) for i, node in enumerate(nodes)]
     for i in range(len(places) - 1):
         for share in _BETWEEN:
             radius = (1 - share) * nodes[i].radius + share * nodes[i + 1].radius
-            samples.append((i, share, tracer.sample((1 - share) * places[i] + share * places[i + 1], radius)))
+            spots.append((i, share, tracer.equations((1 - share) * places[i] + share * places[i + 1], radius)))
     focus = int(np.argmin(np.abs(places)))
     order = [*range(focus), *range(len(places) - 1, focus - 1, -1)]
     for sweep in range(_SWEEPS):
         for i in order if sweep % 2 == 0 else order[::-1]:
             gram, pull = np.zeros_like(nodes[i].gram), np.zeros_like(nodes[i].pull)
-            for left, share, sample in samples:
+            for left, share, spot in spots:
                 mine = 1 - share if left == i else share if left + 1 == i else 0.0
                 if mine > 0.0:
-                    gram += mine * mine * sample.gram
-                    pull += mine * sample.pull
+                    gram += mine * mine * spot.gram
+                    pull += mine * spot.pull
                     if mine < 1.0:
                         neighbour = values[left + 1 if left == i else left]
-                        pull -= mine * (1 - mine) * (sample.gram @ neighbour)
+                        pull -= mine * (1 - mine) * (spot.gram @ neighbour)
             values[i] = _non_negative(nodes[i], gram, pull, nodes[i].histogram)
     radii = np.array([node.radius for node in nodes]) * tracer.pixel
     residual = np.array([tracer.relative(n.error(v)) for n, v in zip(nodes, values, strict=True)])
@@ -204,7 +204,7 @@ def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[di
     return columns, np.array([fitted[i][1] for i in range(len(places))])
 
 
-def _non_negative(node: Sample, gram: Array, pull: Array, prior: Array) -> Array:
+def _non_negative(node: NodeEquations, gram: Array, pull: Array, prior: Array) -> Array:
     """Non-negative least squares of a quadratic form, towards the histogram where it is flat; light sums to 1."""
     scale = _PULL**2 * np.trace(gram) / np.sum(node.area)
     factor = cholesky(gram + np.diag(scale * node.area), lower=True)

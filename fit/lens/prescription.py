@@ -18,11 +18,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..result import Array
 
 __all__ = ["COLUMNS", "lines", "parse", "wrong"]
-
-Array = NDArray[np.float64]
 
 COLUMNS = ("radius", "thickness", "index", "diameter")
 """The columns of a line."""

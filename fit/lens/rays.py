@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .lens import Array, Lens
+from ..result import Array
+from .lens import Lens
 
 __all__ = ["Rays", "trace_rays"]
 

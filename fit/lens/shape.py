@@ -11,7 +11,7 @@ from scipy.special import j0, j1
 
 from torchdof.optics.psf import FAMILIES, LENGTHS, profile
 
-from .lens import Array
+from ..result import Array
 
 __all__ = ["fit_shape"]
 

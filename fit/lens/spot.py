@@ -20,7 +20,8 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from .lens import Array, Lens
+from ..result import Array
+from .lens import Lens
 from .rays import Rays, trace_rays
 
 __all__ = ["Focus", "Reference", "Spot", "focus_sensor", "point_spread"]

@@ -14,7 +14,8 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES
 from torchdof.validation import number, show, whole
 
-from .lens import Array, Lens
+from ..result import Array
+from .lens import Lens
 from .nodes import Tracer, fit_radial, fit_shapes, place_nodes
 from .spot import Focus, Reference, Spot, focus_sensor, point_spread
 

@@ -78,8 +78,8 @@ def _own_noise(pair: Forward, solution: Solution, near: Mask) -> float:
     rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
     both = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
     inside = near[1:-1, 1:-1]
-    here = float(np.sqrt(np.mean(both[inside] ** 2))) if inside.any() else 0.0
-    return max(here, noise_of(pair.data))
+    noise = float(np.sqrt(np.mean(both[inside] ** 2))) if inside.any() else 0.0
+    return max(noise, noise_of(pair.data))
 
 
 def _samples(pair: Forward, solution: Solution, modelled: bool = False) -> Array:

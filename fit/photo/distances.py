@@ -130,11 +130,11 @@ def _aligned(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, 
         # near focus a profile may have any end: the outer nodes set the line, which is lifted to hold theirs
         slope, start = np.polyfit(x, ends, 1, w=x)
         lift = max(float(np.max((ends - slope * x - start)[x > 0.25 * x.max()])), 0.0)
-        for i, at, end in zip(side, x, ends, strict=True):
+        for i, defocus, end in zip(side, x, ends, strict=True):
             with warnings.catch_warnings():
                 # the first fit of this pair has said it
                 warnings.simplefilter("ignore", FitWarning)
-                reach = max(float(slope * at + start + lift), float(end), 1.0)
+                reach = max(float(slope * defocus + start + lift), float(end), 1.0)
                 fits[i] = fit_one(pairs[i], focus_m, family, fits[i], reach=reach)
     return fits
 

@@ -93,10 +93,10 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         return np.minimum(level * (share ** p[5] if fit_exponent else share), top)
 
     def jacobian(_: Array, *p: float) -> Array:
-        at: Array = np.array(p, dtype=np.float64)
+        params: Array = np.array(p, dtype=np.float64)
         columns_: list[Array] = []
         for i, h in enumerate((1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-4)[: len(p)]):
-            up, down = at.copy(), at.copy()
+            up, down = params.copy(), params.copy()
             up[i], down[i] = up[i] + h, max(down[i] - h, 0.0) if i > 1 else down[i] - h
             columns_.append((model(_, *up) - model(_, *down)) / (up[i] - down[i]))
         return np.stack(columns_, axis=1)
@@ -106,23 +106,23 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     if fit_exponent:
         bounds = [*bounds[0], 0.2], [*bounds[1], 3.0]
         starts = [[0, 0, dot.radius - 0.4, s, 1.0, 0.45] for s in (0.1, 0.6, 1.5)]
-    found = best_of(model, levels, starts, bounds, jacobian=jacobian, tolerance=1e-7)
-    residual = levels - model(levels, *found)
-    slope = jacobian(levels, *found)
+    solution = best_of(model, levels, starts, bounds, jacobian=jacobian, tolerance=1e-7)
+    residual = levels - model(levels, *solution)
+    slope = jacobian(levels, *solution)
     # a soft edge shows by its variance: a step that is finite has a slope even where the softness is 0
     for i, h in ((2, STEPS["radius"]), (3, STEPS["softness"])):
-        moved = found.copy()
+        moved = solution.copy()
         moved[i] += h
-        slope[:, i] = (model(levels, *moved) - model(levels, *found)) / h
-    variance = float(residual @ residual) / max(levels.size - len(found), 1)
+        slope[:, i] = (model(levels, *moved) - model(levels, *solution)) / h
+    variance = float(residual @ residual) / max(levels.size - len(solution), 1)
     expected = float(np.sqrt(np.mean(_variance(picture, dot)[near]))) / dot.peak
     return Edge(
-        x=dot.x + float(found[0]),
-        y=dot.y + float(found[1]),
-        radius=float(found[2]),
-        softness=float(found[3]),
-        level=float(found[4]) * dot.peak,
-        exponent=float(found[5]) if fit_exponent else 1.0,
+        x=dot.x + float(solution[0]),
+        y=dot.y + float(solution[1]),
+        radius=float(solution[2]),
+        softness=float(solution[3]),
+        level=float(solution[4]) * dot.peak,
+        exponent=float(solution[5]) if fit_exponent else 1.0,
         covariance=inverse(slope.T @ slope)[2:4, 2:4] * variance,
         rms=float(np.sqrt(variance)),
         misfit=float(np.sqrt(variance)) / expected if expected > 0 else np.inf,

@@ -142,7 +142,7 @@ class Forward:
         def jacobian(_: Array, *p: float) -> Array:
             return np.concatenate([self._jacobian(family, names, np.asarray(p)) / self.unit, pull])
 
-        found = best_of(
+        numbers = best_of(
             model,
             np.concatenate([self.values / self.unit, expected]),
             starts,
@@ -152,10 +152,10 @@ class Forward:
             # a neighbour's branch is left only for one that chi squared prefers by 12
             loyalty=12 / self.values.size if family in self.start else 0.0,
         )
-        fitted, gain, background = self._project(self._shaped(family, names, found))
+        fitted, gain, background = self._project(self._shaped(family, names, numbers))
         residual = self.values - fitted
-        params = {n: float(v) for n, v in zip(names, found, strict=True)}
-        slopes = self._jacobian(family, names, found)
+        params = {n: float(v) for n, v in zip(names, numbers, strict=True)}
+        slopes = self._jacobian(family, names, numbers)
         full = np.full(self.flat.shape, np.nan)
         full[self.flat] = fitted
         kernel = self.kernels(family, {n: np.array([params[n]]) for n in shape})[0]
@@ -271,12 +271,12 @@ class Forward:
 
     def move_columns(self, params: dict[str, float], names: tuple[str, ...], kernel: Array) -> list[Array]:
         """Derivatives of the blurred source with respect to displacement and magnification."""
-        here = self._sample(self.moves(params))
+        unmoved = self._sample(self.moves(params))
         columns = []
         for n in names:
             moved = self.moves(params)
             moved[n] += _STEP[n]
-            columns.append(self.convolve(self._transform((self._sample(moved) - here) / _STEP[n]), kernel)[0])
+            columns.append(self.convolve(self._transform((self._sample(moved) - unmoved) / _STEP[n]), kernel)[0])
         return columns
 
     def bounds(self, names: tuple[str, ...]) -> tuple[list[float], list[float]]:

@@ -257,13 +257,13 @@ def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: fl
     """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`."""
     soft = pair.solve("softm")
     reach = _reach(pair, soft) if reach is None else min(reach, pair.half - 1.0)
-    found = solve_radial(pair, soft, reach, knots)
+    solution = solve_radial(pair, soft, reach, knots)
     if held is None:
-        free = solve_radial(_with_magnification(pair), found, reach, knots)
-        if _improves(pair, found, free):
-            pair.fit_moves, found = ALL_MOVES, free
-    pair.held_magnification = found.moves["magnification"]
-    return found
+        free = solve_radial(_with_magnification(pair), solution, reach, knots)
+        if _improves(pair, solution, free):
+            pair.fit_moves, solution = ALL_MOVES, free
+    pair.held_magnification = solution.moves["magnification"]
+    return solution
 
 
 def _choose(pair: Forward, solutions: dict[str, Solution], accuracy_db: float) -> tuple[str, str, dict[str, float]]:

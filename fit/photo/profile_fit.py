@@ -198,17 +198,17 @@ def _fit_smooth(x: Array, y: Array, family: str, clusters: Array | None) -> tupl
     starts = [*_STARTS[family]]
     if family == "ring":
         starts.append([1.0, float(x[np.argmax(y)]), 0.3])
-    found = best_of(model, y, starts, bounds)
-    residual = y - model(x, *found)
-    jacobian = _jacobian(model, x, found)
-    return found, _covariance(jacobian, residual, clusters), names, y - residual
+    params = best_of(model, y, starts, bounds)
+    residual = y - model(x, *params)
+    jacobian = _jacobian(model, x, params)
+    return params, _covariance(jacobian, residual, clusters), names, y - residual
 
 
-def _jacobian(model: object, x: Array, at: Array) -> Array:
+def _jacobian(model: object, x: Array, params: Array) -> Array:
     columns = []
-    for i, value in enumerate(at):
+    for i, value in enumerate(params):
         step = 1e-5 * max(abs(float(value)), 1e-2)
-        up, down = at.copy(), at.copy()
+        up, down = params.copy(), params.copy()
         up[i] += step
         down[i] = max(down[i] - step, 0.0) if value >= 0 else down[i] - step
         columns.append((model(x, *up) - model(x, *down)) / (up[i] - down[i]))  # type: ignore[operator]

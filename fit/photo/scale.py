@@ -106,30 +106,30 @@ def check_reach(
     if not plain or not 0 < near_m <= far_m or near_m > 1e300:
         raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
     near_m, far_m = float(near_m), math.inf if far_m > 1e300 else float(far_m)
-    found = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
+    factors = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
     if table.unit != "relative":
         scale = width_px if table.sensor_width_mm is None else width_px / table.sensor_width_mm
         for distance in (near_m, far_m):
             coc = signed_coc(camera, distance, width_px) / scale
             measured = [abs(c) for c in table.coc.tolist() if c * coc > 0]
-            found["coc"] = max(found["coc"], abs(coc) / max(measured) if measured else math.inf if coc else 0.0)
-    if found["coc"] > 1.0001:
-        largest = "the other side of focus" if math.isinf(found["coc"]) else f"{found['coc']:.2g} times the largest"
+            factors["coc"] = max(factors["coc"], abs(coc) / max(measured) if measured else math.inf if coc else 0.0)
+    if factors["coc"] > 1.0001:
+        largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
         text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
-        warn(OutsideMeasuredWarning(text, number=found["coc"]))
+        warn(OutsideMeasuredWarning(text, number=factors["coc"]))
     for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
         measured_at = _known(table.provenance.get(name))
         asked = float(getattr(camera, name))
         if measured_at is None or math.isinf(asked):
             continue
-        found[name] = asked / measured_at
-        if max(found[name], 1 / found[name]) > most:
+        factors[name] = asked / measured_at
+        if max(factors[name], 1 / factors[name]) > most:
             text = (
                 f"the table was measured at {name} {measured_at:g} and is used at {asked:g}; the size of the blur is "
                 "right, its shape is that of the measured one"
             )
-            warn(OutsideMeasuredWarning(text, number=found[name]))
-    return found
+            warn(OutsideMeasuredWarning(text, number=factors[name]))
+    return factors
 
 
 def _known(value: Any) -> float | None:

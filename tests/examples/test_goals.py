@@ -61,13 +61,6 @@ def test_large_figures_are_written_out() -> None:
     assert written == ["1716 ± 472", "3.14 ± 0.12"]
 
 
-def test_turns_go_through_all_works_and_the_first_only_warms_up() -> None:
-    calls: list[str] = []
-    found = goals._in_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 2)
-    assert calls == ["a", "b"] * 3
-    assert {name: len(seconds) for name, seconds in found.items()} == {"a": 2, "b": 2}
-
-
 def test_ratios_are_taken_within_a_turn() -> None:
     found: Mapping[Hashable, list[float]] = {"a": [2.0, 40.0, 6.0], "Y": [1.0, 10.0, 2.0]}
     assert goals._ratios(found, "a", "Y") == [2.0, 4.0, 3.0]
@@ -108,8 +101,8 @@ def test_each_work_renders_what_its_figure_says(small: None, monkeypatch: pytest
                 work()
         return {name: [float(k + 1)] for k, name in enumerate(works)}
 
-    monkeypatch.setattr(goals, "render", noted)
-    monkeypatch.setattr(goals, "_in_turns", times)
+    monkeypatch.setattr(goals, "render_subject", noted)
+    monkeypatch.setattr(goals, "in_turns", times)
     figures = {figure.what: figure for figure in goals._frames(subject, 1)}
     frame, fine = (72, 128), speed.Setting("layered", True, 1 / 255)
     off = dataclasses.replace(fine, occlusion=False)
@@ -142,7 +135,7 @@ def test_errors_are_those_of_what_is_timed(small: None, monkeypatch: pytest.Monk
     right = list(goals._errors(subject))
     assert [figure.missed for figure in right] == [False] * 4
     assert 0 < right[0].value < right[1].value
-    monkeypatch.setattr(goals, "render", lambda scene, setting: speed.exact(scene, setting.occlusion) + 0.1)
+    monkeypatch.setattr(goals, "render_subject", lambda scene, setting: speed.exact(scene, setting.occlusion) + 0.1)
     assert [figure.missed for figure in goals._errors(subject)] == [True] * 4
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from typer.testing import CliRunner, Result
 
 from examples.benchmarks import peers
-from examples.benchmarks.peers import Peer, Row
+from examples.benchmarks.peers import CaseTiming, Peer
 from torchdof.bench.accuracy import layered_fft
 from torchdof.optics.camera import Camera
 from torchdof.reference import metrics
@@ -25,7 +25,7 @@ NAME = "toy"
 NOTE = "a note"
 def available(): return None
 def version(): return "7"
-def render(image, coc_px):
+def blur(image, coc_px):
     from torchdof.bench.accuracy import layered_fft
     return layered_fft(image, coc_px), 1000.0
 """
@@ -63,7 +63,7 @@ def test_a_shipped_peer_blurs_by_the_circle_of_confusion_that_it_is_given(name: 
 
 
 @pytest.mark.parametrize(
-    "render, wrong",
+    "blur, wrong",
     [
         (lambda image, coc: image, "a dot at 6 px is blurred as by a disc of 0.00 px"),
         (lambda image, coc: layered_fft(image, 1.3 * coc), "a dot at 6 px is blurred as by a disc of 7.8"),
@@ -76,10 +76,10 @@ def test_a_shipped_peer_blurs_by_the_circle_of_confusion_that_it_is_given(name: 
         (lambda image, coc: image * math.nan, "not finite"),
     ],
 )
-def test_a_peer_that_does_something_else_fails_its_check(render: object, wrong: str) -> None:
+def test_a_peer_that_does_something_else_fails_its_check(blur: object, wrong: str) -> None:
     assert peers.check(Peer("peer", layered_fft)) is None
     with pytest.raises(AssertionError, match=wrong):
-        assert not (found := peers.check(Peer("peer", render))), found  # type: ignore[arg-type]
+        assert not (found := peers.check(Peer("peer", blur))), found  # type: ignore[arg-type]
 
 
 def test_times_are_medians_and_errors_are_display_encoded() -> None:
@@ -89,27 +89,27 @@ def test_times_are_medians_and_errors_are_display_encoded() -> None:
     scene = Scene("flat/0", truth, torch.ones(1, 1, 20, 30), camera, truth)
     seen = []
 
-    def render(image: Tensor, coc_px: Tensor, error: float) -> tuple[Tensor, float]:
+    def blur(image: Tensor, coc_px: Tensor, error: float) -> tuple[Tensor, float]:
         seen.append((error, coc_px))
         return image * error, next(taken)
 
-    both = [Peer(str(e), lambda image, coc, e=e: render(image, coc, e)) for e in (1.0, 0.5)]  # type: ignore[misc]
-    rows = peers.measure(scene, both, repeat=3)
+    both = [Peer(str(e), lambda image, coc, e=e: blur(image, coc, e)) for e in (1.0, 0.5)]  # type: ignore[misc]
+    rows = peers.measure_case(scene, both, repeat=3)
     assert [error for error, _ in seen] == 4 * [1.0, 0.5]  # in turns
     assert all(torch.equal(coc, scene.coc_px) for _, coc in seen)
     wanted = metrics.psnr(metrics.display(0.5 * truth), metrics.display(truth))
-    assert rows == [Row("flat/0", "1.0", 3.0, 14.0, math.inf), Row("flat/0", "0.5", 10.0, 9.5, wanted)]
+    assert rows == [CaseTiming("flat/0", "1.0", 3.0, 14.0, math.inf), CaseTiming("flat/0", "0.5", 10.0, 9.5, wanted)]
 
 
 def test_ratios_are_of_the_same_case() -> None:
-    rows = [Row("a", "x", 1.0, 0.0, 30.0), Row("b", "y", 6.0, 0.0, 20.0)]
-    rows += [Row("a", "y", 4.0, 0.0, 33.0), Row("b", "x", 3.0, 0.0, 25.0)]
+    rows = [CaseTiming("a", "x", 1.0, 0.0, 30.0), CaseTiming("b", "y", 6.0, 0.0, 20.0)]
+    rows += [CaseTiming("a", "y", 4.0, 0.0, 33.0), CaseTiming("b", "x", 3.0, 0.0, 25.0)]
     assert peers.ratios(rows, "y", "x") == ([4.0, 2.0], [-3.0, 5.0])
 
 
 def test_peers_are_measured_beside_torchdof(tmp_path: Path) -> None:
     shutil.copytree(DATA / "room", tmp_path / "scenes" / "room")
-    absent = "def available(): return 'apt install absent'\ndef render(image, coc_px): return image\n"
+    absent = "def available(): return 'apt install absent'\ndef blur(image, coc_px): return image\n"
     folder = write(
         tmp_path / "peers",
         toy=TOY,
@@ -142,7 +142,7 @@ def test_peers_are_measured_beside_torchdof(tmp_path: Path) -> None:
         "lazy: left out, as it fails its check: a dot at 6 px is blurred as by a disc of 0.00 px",
     ):
         assert f"- {said}" in text
-        assert said.replace(" (7)", " 7") in result.output
+        assert said in result.output
 
 
 def test_a_folder_without_peers_is_refused(tmp_path: Path) -> None:
@@ -154,4 +154,4 @@ def test_a_folder_without_peers_is_refused(tmp_path: Path) -> None:
 def test_it_refuses_a_file_that_is_no_peer(tmp_path: Path) -> None:
     result = run(DATA, "--peers-folder", write(tmp_path / "peers", empty="x = 1\n"))
     assert result.exit_code == 2
-    assert "empty.py: a peer defines available() and render(image, coc_px)" in result.output
+    assert "empty.py: a peer defines available() and blur(image, coc_px)" in result.output

@@ -1,6 +1,5 @@
 """How close to the truth each renderer comes, on scenes whose depth of field is known."""
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,10 +10,8 @@ import torch
 import torch.nn.functional as functional
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
-from ..io.atomic import whole_file
 from ..io.images import Picture, write_image
 from ..io.transfer import decode
 from ..module import DepthOfField
@@ -22,7 +19,7 @@ from ..optics.blur_table import BlurTable
 from ..reference import metrics
 from ..reference.lens_views import lens_views
 from ..reference.scenes import Scene, read_scenes
-from .report import csv_of, markdown
+from .report import Report, ReportTable, csv_of
 
 __all__ = ["Score", "compare_with_truth", "ikoma", "layered_fft", "renderers", "score"]
 
@@ -174,56 +171,38 @@ def compare_with_truth(truth: Path, out: Path, views: Sequence[int] | None, inne
         scores += [score(name, image, scene, margin, known) for name, image in images.items()]
         rows.append(_worst(scene, images))
     names = [*compared, *reference.values()]
-    text = _markdown(scores, names, [scene.name for scene in scenes], inner)
+    cases = [scene.name for scene in scenes]
+    tables = [
+        ReportTable(meaning, [["scene", *names], *_cells(scores, names, cases, what)], words=("scene",))
+        for what, meaning in _MEASURES.items()
+        if not all(math.isnan(getattr(score, what)) for score in scores)
+    ]
+    where = "the frame without the border that light from outside reaches" if inner else "the whole frame"
+    report = Report(
+        "accuracy",
+        "Accuracy against the truth",
+        [
+            f"Over {where}. The reference renderer averages as many views through the lens as its name says.",
+            *tables,
+            "## accuracy.png",
+            f"A row a scene, in the order above: {_TILE_PX} pixels around the place where torchdof is worst. From the "
+            f"left: sharp, truth, {', '.join(names)}; below each, its error in the display-encoded picture times "
+            f"{_ERROR_GAIN:g}.",
+        ],
+        csv_of(scores),
+    )
     sheet = Picture(torch.cat(rows, 2), transfer="srgb", sample="8")
-    with contextlib.ExitStack() as files:  # all of them or none
-        csv_file, md_file, png_file = (
-            files.enter_context(whole_file(out / f"accuracy.{s}")) for s in ("csv", "md", "png")
-        )
-        csv_file.write_text(csv_of(scores), encoding="utf-8")
-        md_file.write_text(text, encoding="utf-8")
-        write_image(png_file, sheet)
-    _show(scores, names, [scene.name for scene in scenes])
+    report.write(out, picture=lambda path: write_image(path, sheet))
+    tables[0].show()
 
 
 def _cells(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str], what: str) -> list[list[str]]:
     """Rows of a table, a scene each, and their mean."""
-    found: Mapping[tuple[str, str], float] = {(s.scene, s.renderer): getattr(s, what) for s in scores}
+    values: Mapping[tuple[str, str], float] = {(s.scene, s.renderer): getattr(s, what) for s in scores}
     digits = 2 if what.startswith("psnr") else 4
-    rows = [[scene, *(f"{found[scene, name]:.{digits}f}" for name in names)] for scene in scenes]
-    means = [sum(found[scene, name] for scene in scenes) / len(scenes) for name in names]
+    rows = [[scene, *(f"{values[scene, name]:.{digits}f}" for name in names)] for scene in scenes]
+    means = [sum(values[scene, name] for scene in scenes) / len(scenes) for name in names]
     return [*rows, ["mean", *(f"{mean:.{digits}f}" for mean in means)]]
-
-
-def _markdown(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str], inner: bool) -> str:
-    where = "the frame without the border that light from outside reaches" if inner else "the whole frame"
-    parts = [
-        "# Accuracy against the truth\n",
-        f"Over {where}. The reference renderer averages as many views through the lens as its name says.\n",
-    ]
-    for what, meaning in _MEASURES.items():
-        if all(math.isnan(getattr(score, what)) for score in scores):
-            continue
-        parts += [f"## {meaning}\n", markdown([["scene", *names], *_cells(scores, names, scenes, what)]), ""]
-    parts += [
-        "## accuracy.png\n",
-        f"A row a scene, in the order above: {_TILE_PX} pixels around the place where torchdof is worst. From the "
-        f"left: sharp, truth, {', '.join(names)}; below each, its error in the display-encoded picture times "
-        f"{_ERROR_GAIN:g}.",
-    ]
-    return "\n".join(parts) + "\n"
-
-
-def _show(scores: Sequence[Score], names: Sequence[str], scenes: Sequence[str]) -> None:
-    table = Table(title=_MEASURES["psnr_display"])
-    for column in ("scene", *names):
-        table.add_column(column, justify="left" if column == "scene" else "right")
-    *rows, mean = _cells(scores, names, scenes, "psnr_display")
-    for row in rows:
-        table.add_row(*row)
-    table.add_section()
-    table.add_row(*mean)
-    Console().print(table)
 
 
 def _worst(scene: Scene, images: Mapping[str, Tensor]) -> Tensor:

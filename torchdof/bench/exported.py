@@ -7,20 +7,19 @@ import argparse
 import json
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 
 import numpy as np
 import onnxruntime
 
 from torchdof.bench import memory
+from torchdof.bench.timer import median_and_spread, times
 
-__all__ = ["main", "measure"]
+__all__ = ["main", "measure_file"]
 
 SCENES = ("all in focus", "blurred background", "all blurred")
 
 
-def measure(path: str, size: tuple[int, int], scene: str, threads: int = 2, runs: int = 3) -> dict[str, float]:
+def measure_file(path: str, size: tuple[int, int], scene: str, threads: int = 2, runs: int = 3) -> dict[str, float]:
     """Median time and peak memory of one frame, in a process of its own.
 
     Args:
@@ -89,12 +88,12 @@ def main() -> None:
     if arguments.alone:
         runner = session(arguments.model, arguments.threads)
         inputs = feed(runner, (height, width), arguments.alone)
-        seconds = _median(lambda: runner.run(None, inputs), arguments.runs)
+        seconds = median_and_spread(times(lambda: runner.run(None, inputs), arguments.runs))[0]
         print(json.dumps({"seconds": seconds, "peak_gb": memory.peak_mb() * 2**20 / 1e9}))
         return
     print(f"{width} x {height}, {arguments.threads} threads, onnxruntime {onnxruntime.__version__}")
     for scene in SCENES:
-        got = measure(arguments.model, (height, width), scene, arguments.threads, arguments.runs)
+        got = measure_file(arguments.model, (height, width), scene, arguments.threads, arguments.runs)
         line = f"{scene:20} onnxruntime {got['seconds']:7.2f} s, peak {got['peak_gb']:.2f} GB"
         if arguments.torch:
             line += ", eager PyTorch {:7.2f} s, with the file's layers {:7.2f} s".format(
@@ -121,17 +120,9 @@ def _torch_seconds(path: str, size: tuple[int, int], scene: str, threads: int, r
         raise ValueError("PyTorch is timed for files that take depth")
     plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance)
     with torch.no_grad():
-        planned = _median(lambda: dof(*tensors), runs)
-        return planned, _median(lambda: dof(*tensors, plan=plan), runs)
-
-
-def _median(call: Callable[[], object], runs: int) -> float:
-    times = []
-    for _ in range(runs + 1):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times[1:]))
+        planned, _ = median_and_spread(times(lambda: dof(*tensors), runs))
+        fixed, _ = median_and_spread(times(lambda: dof(*tensors, plan=plan), runs))
+        return planned, fixed
 
 
 if __name__ == "__main__":

@@ -59,7 +59,8 @@ class Subject:
         """A square at most ``side`` pixels wide: in the middle, or where the blur is widest."""
         height, width = self.image.shape[-2:]
         row, column = divmod(int(self.coc_px.abs().argmax()), width) if widest else (height // 2, width // 2)
-        top, left = (min(max(0, at - side // 2), max(0, n - side)) for at, n in ((row, height), (column, width)))
+        top = min(max(0, row - side // 2), max(0, height - side))
+        left = min(max(0, column - side // 2), max(0, width - side))
         part = (..., slice(top, top + side), slice(left, left + side))
         return dataclasses.replace(self, image=self.image[part], coc_px=self.coc_px[part])
 

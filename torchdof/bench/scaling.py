@@ -5,15 +5,15 @@ import functools
 import math
 from collections.abc import Sequence
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from .inputs import LEAST_PX, Subject
-from .speed import Setting, median_and_spread, render, times
+from .report import ReportTable
+from .speed import Setting, render_subject
+from .timer import median_and_spread, times
 
-__all__ = ["Growth", "lines", "measure_growth", "scenes", "show_growth"]
+__all__ = ["Growth", "measure_growth", "scenes", "table_of"]
 
 _TOLERANCE = 1 / 255
 _RADII_PX = (4.0, 8.0, 16.0, 32.0, 64.0)
@@ -74,7 +74,7 @@ def measure_growth(subject: Subject, repeat: int, unit: float, console: Console 
         both = []
         for occlusion in (True, False):
             setting = Setting("layered", occlusion, _TOLERANCE)
-            both.append(median_and_spread(times(functools.partial(render, scene, setting), repeat)))
+            both.append(median_and_spread(times(functools.partial(render_subject, scene, setting), repeat)))
         (median, spread), (plain, plain_spread) = both
         radius, pixels = scene.radius_px, width * height
         own = (median, spread, median / unit, 1e9 * median / pixels)
@@ -82,22 +82,12 @@ def measure_growth(subject: Subject, repeat: int, unit: float, console: Console 
     return rows
 
 
-def lines(rows: Sequence[Growth]) -> list[list[str]]:
-    """The table: its columns, and a line for each row."""
-    found = [list(_COLUMNS)]
+def table_of(rows: Sequence[Growth]) -> ReportTable:
+    """A line for each scene of the scans."""
+    lines = [list(_COLUMNS)]
     for r in rows:
         line = [r.scan, f"{r.width} x {r.height}", f"{r.radius_px:.3g}", f"{1e3 * r.median_s:.0f}"]
         line += [f"{1e3 * r.spread_s:.0f}", f"{r.units:.2f}", f"{r.ns_a_pixel:.0f}"]
-        found.append([*line, f"{1e3 * r.plain_median_s:.0f}", f"{1e3 * r.plain_spread_s:.0f}", f"{r.plain_units:.2f}"])
-    return found
-
-
-def show_growth(rows: Sequence[Growth]) -> None:
-    """Prints the table."""
-    head, *body = lines(rows)
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title="How cost grows, at 1/255")
-    for name in head:
-        table.add_column(name.partition(" a ")[0], justify="left" if name == "scan" else "right")
-    for line in body:
-        table.add_row(*line)
-    Console().print(table)
+        lines.append([*line, f"{1e3 * r.plain_median_s:.0f}", f"{1e3 * r.plain_spread_s:.0f}", f"{r.plain_units:.2f}"])
+    remark = "The same scene at 1/255 with other largest radii, and in smaller frames, as blurred for their width."
+    return ReportTable("How cost grows", lines, words=("scan",), remark=remark)

@@ -1,6 +1,5 @@
 """Speed against error: what each tolerance costs on a scene, and how far it stays from the exact rendering."""
 
-import contextlib
 import csv
 import dataclasses
 import functools
@@ -8,7 +7,6 @@ import io
 import math
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +20,6 @@ from rich.table import Table
 from torch import Tensor
 
 from ..attention import weight_map
-from ..io.atomic import whole_file
 from ..module import DepthOfField, blur_by_coc
 from ..optics.camera import Camera
 from ..options import Method
@@ -30,21 +27,20 @@ from ..reference import metrics
 from ..validation import whole
 from . import memory
 from .inputs import LEAST_PX, Subject
-from .report import machine, markdown
+from .report import Report, ReportTable, machine
+from .timer import median_and_spread, timed, times
 
 __all__ = [
-    "Row",
+    "SettingCost",
     "Setting",
     "exact",
-    "measure",
+    "measure_setting",
     "measure_all",
-    "median_and_spread",
     "pareto",
-    "render",
+    "render_subject",
     "renderer",
     "settings",
     "show",
-    "times",
     "unit_s",
     "unit_work",
     "write",
@@ -90,7 +86,7 @@ class Setting:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class SettingCost:
     """What one setting took and reached; NaN is what could not be measured.
 
     Times are in seconds, for a picture from its circle of confusion; ``units`` is the median over unit Y (see
@@ -122,16 +118,16 @@ def settings(subject: Subject, runtimes: Sequence[Runtime] = ()) -> list[Setting
     taps = (2 * math.ceil(subject.radius_px) + 3) ** 2
     bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
     side = min(_FOLD_PX, max(LEAST_PX, math.isqrt(_FOLD_BYTES // bytes_a_pixel)))
-    found = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
+    compared = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
     height, width = subject.image.shape[-2:]
-    found.append(Setting("layered", True, 1 / 255, attention=(width / 2, height / 2, height / _LOOKED_AT)))
-    found += [Setting("layered", seen, 1 / 255, runtime=runtime) for runtime in runtimes for seen in (True, False)]
-    return [*found, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
+    compared.append(Setting("layered", True, 1 / 255, attention=(width / 2, height / 2, height / _LOOKED_AT)))
+    compared += [Setting("layered", seen, 1 / 255, runtime=runtime) for runtime in runtimes for seen in (True, False)]
+    return [*compared, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
 
 
 def exact(subject: Subject, occlusion: bool) -> Tensor:
     """The rendering that errors are measured against: exact kernels, dense layers, full resolution."""
-    return render(subject, Setting("layered", occlusion, 0.0))
+    return render_subject(subject, Setting("layered", occlusion, 0.0))
 
 
 def unit_work() -> Callable[[], Tensor]:
@@ -149,7 +145,7 @@ def unit_s(repeat: int = 5) -> float:
     return statistics.median(times(unit_work(), repeat))
 
 
-def render(subject: Subject, setting: Setting) -> Tensor:
+def render_subject(subject: Subject, setting: Setting) -> Tensor:
     """A subject as a setting of PyTorch says: ``[1, C, H, W]``."""
     with torch.inference_mode():
         return blur_by_coc(
@@ -162,28 +158,6 @@ def render(subject: Subject, setting: Setting) -> Tensor:
         )
 
 
-def times(work: Callable[[], object], repeat: int) -> list[float]:
-    """Seconds of so many calls, after one more to warm up."""
-    work()
-    found = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        work()
-        found.append(time.perf_counter() - start)
-    return found
-
-
-def median_and_spread(seconds: Sequence[float]) -> tuple[float, float]:
-    """Median and interquartile range.
-
-    Example:
-        >>> median_and_spread([4.0, 1.0, 2.0, 3.0, 20.0])
-        (3.0, 2.0)
-    """
-    low, high = torch.tensor(seconds, dtype=torch.float64).quantile(torch.tensor([0.25, 0.75], dtype=torch.float64))
-    return statistics.median(seconds), float(high - low)
-
-
 def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
     """What renders a subject: a function without arguments, once all is prepared.
 
@@ -192,7 +166,7 @@ def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
         ValueError: If the exported file does not render as the module does.
     """
     if setting.runtime == "torch":
-        return lambda: render(subject, setting)
+        return lambda: render_subject(subject, setting)
     reach = max(1.0, float(math.ceil(subject.radius_px)))
     options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
     if setting.runtime == "compiled":
@@ -212,7 +186,7 @@ def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
     return lambda: torch.from_numpy(runner.run(None, feed)[0])
 
 
-def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, unit: float) -> Row:
+def measure_setting(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, unit: float) -> SettingCost:
     """Renders once to see that it is right, then ``repeat`` times for the time.
 
     Args:
@@ -222,9 +196,7 @@ def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, uni
         repeat: How often, at least 1.
         unit: Unit Y in seconds.
     """
-    before = time.perf_counter()
-    work = renderer(subject, setting)
-    ready = 0.0 if setting.runtime == "torch" else time.perf_counter() - before
+    work, ready = timed(lambda: renderer(subject, setting))
     start = memory.reset_peak()
     out = work()
     peak_mb = memory.peak_mb() - start
@@ -237,12 +209,12 @@ def measure(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, uni
     height, width = out.shape[-2:]
     speed = (median, spread, median / unit, width * height / 1e6 / median, peak_mb)
     error = (255 * rms, metrics.psnr(shown, truth), metrics.ssim(shown, truth))
-    return Row(setting, width, height, *speed, *error, keeps, ready)
+    return SettingCost(setting, width, height, *speed, *error, keeps, 0.0 if setting.runtime == "torch" else ready)
 
 
 def measure_all(
     subject: Subject, repeat: int = 5, console: Console | None = None, runtimes: Sequence[Runtime] = ()
-) -> tuple[list[Row], float]:
+) -> tuple[list[SettingCost], float]:
     """Every setting on a subject.
 
     Args:
@@ -267,11 +239,11 @@ def measure_all(
         key = (setting.side, setting.occlusion)
         if key not in references:
             references[key] = exact(part, setting.occlusion)
-        rows.append(measure(part, setting, references[key], repeat, unit))
+        rows.append(measure_setting(part, setting, references[key], repeat, unit))
     return rows, unit
 
 
-def pareto(rows: Sequence[Row]) -> list[Row]:
+def pareto(rows: Sequence[SettingCost]) -> list[SettingCost]:
     """Rows that no other row beats in time or error without losing in the other, fastest first.
 
     Rows with and without occlusion answer different questions, so each is compared with its like; crops and what keeps
@@ -279,7 +251,7 @@ def pareto(rows: Sequence[Row]) -> list[Row]:
     """
     rows = [row for row in rows if row.setting.side is None and row.setting.attention is None]
 
-    def beaten(row: Row, other: Row) -> bool:
+    def beaten(row: SettingCost, other: SettingCost) -> bool:
         no_worse = other.median_s <= row.median_s and other.rms_255 <= row.rms_255
         return no_worse and (other.median_s, other.rms_255) != (row.median_s, row.rms_255)
 
@@ -293,11 +265,11 @@ def pareto(rows: Sequence[Row]) -> list[Row]:
 
 def write(
     folder: Path,
-    rows: Sequence[Row],
+    rows: Sequence[SettingCost],
     subject: Subject,
     unit: float,
     repeat: int,
-    growth: Sequence[Sequence[str]] = (),
+    growth: Sequence[ReportTable] = (),
 ) -> None:
     """Writes ``speed.csv``, ``speed.md`` and ``speed.png``: all of them or none.
 
@@ -307,22 +279,40 @@ def write(
         subject: On what.
         unit: Unit Y in seconds.
         repeat: How often each.
-        growth: A further table for ``speed.md``, of how cost grows: its columns and its lines.
+        growth: Further tables for ``speed.md``, of how cost grows.
 
     Raises:
         OSError: If a file cannot be written.
         ModuleNotFoundError: If matplotlib is missing.
     """
-    with contextlib.ExitStack() as files:
-        csv_file, md_file, png_file = (
-            files.enter_context(whole_file(folder / f"speed.{s}")) for s in ("csv", "md", "png")
-        )
-        _plot(png_file, rows, subject)
-        csv_file.write_text(_csv(rows), encoding="utf-8")
-        md_file.write_text(_markdown(rows, subject, unit, repeat, growth), encoding="utf-8")
+    broken = [row.setting for row in rows if not row.keeps]
+    names = "; ".join(f"{how.name}{'' if how.occlusion else ' without occlusion'}" for how in broken)
+    tables = []
+    for seen in (True, False):
+        lines = [["setting", *_COLUMNS], *(cells for row, cells in _lines(rows) if row.setting.occlusion == seen)]
+        starred = [[cell.replace("*", "\\*") for cell in line] for line in lines]
+        tables.append(ReportTable(f"{'With' if seen else 'Without'} occlusion", starred))
+    report = Report(
+        "speed",
+        "Speed against error",
+        [
+            f"{_title(subject)}. {subject.remark}.",
+            f"{machine()}.",
+            f"Median and spread (interquartile range) of {repeat} renderings after one more. Y is the time of one "
+            f"depthwise 17 x 17 convolution of 1 x 16 x 540 x 960, {1e3 * unit:.3g} ms in this run. MiB is the growth "
+            "of resident memory. RMS (of 255), PSNR and SSIM are display-encoded, against the exact rendering with the "
+            "same occlusion; *kept* says whether RMS is within the stated tolerance, a star that the row is on the "
+            f"Pareto front. {_remarks(rows)}",
+            f"**The tolerance was not kept by: {names}.**" if broken else "Every tolerance was kept.",
+            *tables,
+            *growth,
+        ],
+        _csv(rows),
+    )
+    report.write(folder, picture=lambda path: _plot(path, rows, subject))
 
 
-def show(rows: Sequence[Row], subject: Subject, unit: float) -> None:
+def show(rows: Sequence[SettingCost], subject: Subject, unit: float) -> None:
     """Prints the table."""
     console = Console()
     console.print(f"{_title(subject)}; {subject.remark}", markup=False, highlight=False)
@@ -341,10 +331,10 @@ def show(rows: Sequence[Row], subject: Subject, unit: float) -> None:
     console.print(f"* on the Pareto front; kept: RMS within the tolerance. {_remarks(rows)}", markup=False)
 
 
-def _csv(rows: Iterable[Row]) -> str:
+def _csv(rows: Iterable[SettingCost]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    names = [field.name for field in dataclasses.fields(Row) if field.name != "setting"]
+    names = [field.name for field in dataclasses.fields(SettingCost) if field.name != "setting"]
     writer.writerow(["setting", "method", "runtime", "occlusion", "tolerance", "crop", *names])
     for row in rows:
         how = row.setting
@@ -354,7 +344,7 @@ def _csv(rows: Iterable[Row]) -> str:
     return text.getvalue()
 
 
-def _lines(rows: Sequence[Row]) -> list[tuple[Row, list[str]]]:
+def _lines(rows: Sequence[SettingCost]) -> list[tuple[SettingCost, list[str]]]:
     """Each row with the cells of its line."""
     front, lines = pareto(rows), []
     for row in rows:
@@ -364,7 +354,7 @@ def _lines(rows: Sequence[Row]) -> list[tuple[Row, list[str]]]:
     return lines
 
 
-def _remarks(rows: Sequence[Row]) -> str:
+def _remarks(rows: Sequence[SettingCost]) -> str:
     sizes = {f"{row.width} x {row.height}" for row in rows if row.setting.side is not None}
     crop = f" fold holds k * k columns a pixel: on the {' and '.join(sizes)} pixels in the middle." if sizes else ""
     ready = [
@@ -384,37 +374,7 @@ def _title(subject: Subject) -> str:
     return f"{subject.name}, {width} x {height}, blur radius {low:.1f} to {high:.1f} px"
 
 
-def _markdown(
-    rows: Sequence[Row], subject: Subject, unit: float, repeat: int, growth: Sequence[Sequence[str]] = ()
-) -> str:
-    broken = [row.setting for row in rows if not row.keeps]
-    names = "; ".join(f"{how.name}{'' if how.occlusion else ' without occlusion'}" for how in broken)
-    parts = [
-        "# Speed against error\n",
-        f"{_title(subject)}. {subject.remark}.\n",
-        f"{machine()}.\n",
-        f"Median and spread (interquartile range) of {repeat} renderings after one more. Y is the time of one "
-        f"depthwise 17 x 17 convolution of 1 x 16 x 540 x 960, {1e3 * unit:.3g} ms in this run. MiB is the growth of "
-        "resident memory. RMS (of 255), PSNR and SSIM are display-encoded, against the exact rendering with the same "
-        "occlusion; *kept* says whether RMS is within the stated tolerance, a star that the row is on the Pareto "
-        f"front. {_remarks(rows)}\n",
-        f"**The tolerance was not kept by: {names}.**\n" if broken else "Every tolerance was kept.\n",
-    ]
-    for seen in (True, False):
-        lines = [["setting", *_COLUMNS], *(cells for row, cells in _lines(rows) if row.setting.occlusion == seen)]
-        table = markdown(lines).replace("*", "\\*")
-        parts += [f"## {'With' if seen else 'Without'} occlusion\n", table, ""]
-    if growth:
-        parts += [
-            "## How cost grows\n",
-            "The same scene at 1/255 with other largest radii, and in smaller frames, as blurred for their width.\n",
-            markdown(growth),
-            "",
-        ]
-    return "\n".join(parts)
-
-
-def _plot(path: Path, rows: Sequence[Row], subject: Subject) -> None:
+def _plot(path: Path, rows: Sequence[SettingCost], subject: Subject) -> None:
     # no pyplot: it would choose a screen and keep every figure alive
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -432,11 +392,11 @@ def _plot(path: Path, rows: Sequence[Row], subject: Subject) -> None:
         front = [row for row in pareto(chosen) if row.rms_255 > 0]
         axes.plot([1e3 * r.median_s for r in front], [r.rms_255 for r in front], color=colour, lw=1)
         for row in seen:
-            at = (1e3 * row.median_s, row.rms_255)
-            axes.plot(*at, "o", ms=6, color=colour, mfc=colour if row in front else "none")
+            point = (1e3 * row.median_s, row.rms_255)
+            axes.plot(*point, "o", ms=6, color=colour, mfc=colour if row in front else "none")
             other = row.setting.runtime != "torch"  # these lie side by side
             place: dict[str, Any] = {"xytext": (0, -11), "ha": "center"} if other else {"xytext": (5, 4)}
-            axes.annotate(row.setting.name, at, textcoords="offset points", fontsize=7, color=colour, **place)
+            axes.annotate(row.setting.name, point, textcoords="offset points", fontsize=7, color=colour, **place)
         for row in (row for row in chosen if row.rms_255 == 0):
             axes.axvline(1e3 * row.median_s, color=colour, ls=":", lw=1)
         axes.plot([], [], "o-", color=colour, label="with occlusion" if occlusion else "without")

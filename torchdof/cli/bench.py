@@ -150,10 +150,11 @@ def bench(
     rows, unit = speed.measure_all(subject, repeat, console, runtimes)
     speed.show(rows, subject, unit)
     grown = scaling.measure_growth(subject, repeat, unit, console) if scan else []
-    if grown:
-        scaling.show_growth(grown)
+    growth = [scaling.table_of(grown)] if grown else []
+    for table in growth:
+        table.show()
     if out is not None:
-        speed.write(out, rows, subject, unit, repeat, scaling.lines(grown) if grown else ())
+        speed.write(out, rows, subject, unit, repeat, growth)
 
 
 def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:

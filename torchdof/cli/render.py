@@ -218,9 +218,9 @@ def _render_sequence(
     numbers = source.frames()
     if frames is not None:
         first, last = parse_frames(frames)
-        there = set(numbers)
+        existing = set(numbers)
         numbers = list(range(first, last + 1))
-        absent = [source.name(n) for n in numbers if n not in there]
+        absent = [source.name(n) for n in numbers if n not in existing]
         if absent:
             raise FileNotFoundError(
                 f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} frames missing)"

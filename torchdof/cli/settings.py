@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 
 from ..depth.kinds import DepthKind
-from ..io.decode import Sample
+from ..io.decode import PixelType
 from ..io.metadata import camera_facts
 from ..io.sequence import focus_at_frame
 from ..io.transfer import Transfer
@@ -74,7 +74,7 @@ class RenderSettings:
     device: torch.device = torch.device("cpu")
     transfer: Transfer | None = None
     out_transfer: Transfer | None = None
-    sample: Sample | None = None
+    sample: PixelType | None = None
     layer: str | None = None
     show_focus: bool = False
 

@@ -86,8 +86,8 @@ def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
     seen = depth.flip(dim) if back else depth
     place = torch.arange(seen.shape[dim]).reshape([-1 if d == seen.ndim + dim else 1 for d in range(seen.ndim)])
     last = torch.where(seen.isnan(), -1, place).cummax(dim=dim).values
-    found = torch.where(last >= 0, seen.gather(dim, last.clamp(min=0)), torch.nan)
-    return found.flip(dim) if back else found
+    values = torch.where(last >= 0, seen.gather(dim, last.clamp(min=0)), torch.nan)
+    return values.flip(dim) if back else values
 
 
 def _nearest(depth: Tensor) -> Tensor:

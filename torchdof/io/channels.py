@@ -23,7 +23,7 @@ def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int
         >>> colour_channels([("", ("A", "B", "G", "R", "Z"))], None, True)
         (0, [3, 2, 1, 0], ('R', 'G', 'B', 'A'))
     """
-    found = []
+    layers_with_colour = []
     for part, (label, names) in enumerate(parts):
         prefixes = dict.fromkeys(name.rpartition(".")[0] if layered else "" for name in names)
         for prefix in prefixes:
@@ -31,18 +31,18 @@ def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int
             for wanted in (("R", "G", "B"), ("Y",)):
                 if all(dot + name in names for name in wanted):
                     plain = (*wanted, "A") if dot + "A" in names else wanted
-                    found.append((prefix, label, part, [names.index(dot + name) for name in plain], plain))
+                    layers_with_colour.append((prefix, label, part, [names.index(dot + name) for name in plain], plain))
                     break
     if layer is None:
-        found.sort(key=lambda entry: entry[0] != "")
-        chosen = found[:1]
+        layers_with_colour.sort(key=lambda entry: entry[0] != "")
+        chosen = layers_with_colour[:1]
     else:
-        chosen = [f for f in found if layer in (f[0], f[1]) or f[0].startswith(layer + ".")]
+        chosen = [f for f in layers_with_colour if layer in (f[0], f[1]) or f[0].startswith(layer + ".")]
     if not chosen:
         every = ", ".join(name for _, names in parts for name in names)
         if layer is None:
             raise ValueError(f"has no colour: expected channels R, G, B or Y, found {every}")
-        layers = ", ".join(dict.fromkeys(f[0] or f[1] or "(unnamed)" for f in found)) or "none"
+        layers = ", ".join(dict.fromkeys(f[0] or f[1] or "(unnamed)" for f in layers_with_colour)) or "none"
         raise ValueError(f"has no layer {layer!r} with colour; its layers with colour: {layers}")
     return chosen[0][2:]
 

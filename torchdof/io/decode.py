@@ -17,15 +17,15 @@ import numpy as np
 from ..validation import show
 from .metadata import kept_metadata
 
-__all__ = ["Part", "Sample", "existing", "first_line", "read_array", "read_parts"]
+__all__ = ["Part", "PixelType", "existing", "first_line", "read_array", "read_parts"]
 
-Sample = Literal["8", "16", "half", "float"]
+PixelType = Literal["8", "16", "half", "float"]
 
 MAX_PIXELS = 2**28
 # what numpy and zipfile raise on bytes that are no array
 _BROKEN: tuple[type[Exception], ...] = (ValueError, OSError, EOFError, KeyError, TypeError, MemoryError, OverflowError)
 _BROKEN += (RuntimeError, SyntaxError, zipfile.BadZipFile, struct.error, zlib.error, tokenize.TokenError)
-_SAMPLES: dict[str, Sample] = {"uint8": "8", "uint16": "16", "half": "half"}
+_SAMPLES: dict[str, PixelType] = {"uint8": "8", "uint16": "16", "half": "half"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Part:
     label: str
     names: tuple[str, ...]
     values: np.ndarray
-    samples: tuple[Sample, ...]
+    samples: tuple[PixelType, ...]
     one: float = 1.0
     straight_alpha: bool = False
     metadata: dict[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
@@ -154,7 +154,7 @@ def _read_pfm(path: Path) -> Part:
         raise OSError(f"{path}: is cut short ({len(data)} of {4 * count} bytes of pixels)")
     values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4").astype(np.float32)
     values = values.reshape(height, width, channels)[::-1]  # stored from the bottom row up
-    samples: list[Sample] = ["float"] * channels
+    samples: list[PixelType] = ["float"] * channels
     return Part("", tuple("Y" if channels == 1 else "RGB"), values, tuple(samples))
 
 

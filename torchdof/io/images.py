@@ -18,13 +18,13 @@ from torch import Tensor
 
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
-from .decode import Sample, existing, first_line, read_array, read_parts
+from .decode import PixelType, existing, first_line, read_array, read_parts
 from .transfer import Transfer, decode, default_transfer, encode
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
 _SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".hdr", ".pfm")
-_SAMPLES: dict[str, tuple[Sample, ...]] = {  # what each type of file can hold, its default first
+_SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hold, its default first
     ".exr": ("half", "float"),
     ".png": ("8", "16"),
     ".tif": ("8", "16", "float"),
@@ -58,7 +58,7 @@ class Picture:
     channels: tuple[str, ...] = ("R", "G", "B")
     depth: Tensor | None = None
     metadata: Mapping[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
-    sample: Sample = "float"
+    sample: PixelType = "float"
     transfer: Transfer = "linear"
     window: tuple[int, int, int, int, int, int] | None = None
 
@@ -102,25 +102,25 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    found = parts[part]
-    array = found.values[..., indices].astype(np.float32)
+    stored = parts[part]
+    array = stored.values[..., indices].astype(np.float32)
     if not np.isfinite(array).all():
         bad = int((~np.isfinite(array)).any(axis=-1).sum())
         raise ValueError(f"{path}: {bad} pixels are not finite (NaN or inf); repair them before blurring spreads them")
-    sample: Sample = "half" if all(found.samples[k] == "half" for k in indices) else found.samples[indices[0]]
+    sample: PixelType = "half" if all(stored.samples[k] == "half" for k in indices) else stored.samples[indices[0]]
     transfer = transfer or default_transfer(sample)
     pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]  # [H, W, C] -> [1, C, H, W]
-    pixels = decode(pixels / found.one, transfer, names[-1] == "A", found.straight_alpha)
+    pixels = decode(pixels / stored.one, transfer, names[-1] == "A", stored.straight_alpha)
     depth = None
-    same_size = [p for p in parts if p.values.shape[:2] == found.values.shape[:2]]
+    same_size = [p for p in parts if p.values.shape[:2] == stored.values.shape[:2]]
     where = depth_channel([(p.label, p.names) for p in same_size])
     if where is not None:
         depth = torch.from_numpy(same_size[where[0]].values[..., where[1]].astype(np.float32))[None, None]
-    return Picture(pixels, names, depth, found.metadata, sample, transfer, found.window)
+    return Picture(pixels, names, depth, stored.metadata, sample, transfer, stored.window)
 
 
 def write_image(
-    path: str | os.PathLike[str], picture: Picture, transfer: Transfer | None = None, sample: Sample | None = None
+    path: str | os.PathLike[str], picture: Picture, transfer: Transfer | None = None, sample: PixelType | None = None
 ) -> None:
     """Writes a picture whole or not at all: to a new file in the same folder, renamed once it is complete.
 

@@ -195,8 +195,8 @@ def _average(
     dice = torch.rand(squares.cover.shape, generator=torch.Generator().manual_seed(0)).to(device)
     for view in range(lens.views):
         # A square that covers 30 % of its pixel is there in 30 % of the views.
-        there = ((dice + view * 0.7548776662466927) % 1.0) < squares.cover
-        source, target, light = _draw(squares, there, *lens.shift(view, squares.coc), height, width)
+        is_drawn = ((dice + view * 0.7548776662466927) % 1.0) < squares.cover
+        source, target, light = _draw(squares, is_drawn, *lens.shift(view, squares.coc), height, width)
         front = torch.full((count,), torch.inf, device=device)
         front.scatter_reduce_(0, target, squares.coc[source], "amin")
         visible = squares.coc[source] <= front[target] + _SAME_DEPTH_PX
@@ -218,10 +218,10 @@ def _squares(stack: Sequence[tuple[Tensor, Tensor, Tensor]]) -> _Squares:
     for light, coc, cover in stack:
         height, width = coc.shape[-2:]
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        there = cover.flatten() > 0
+        is_covered = cover.flatten() > 0
         fields = [x.to(coc), y.to(coc), light[0], _light_slope(light, coc), cover[0, 0], coc[0, 0], _coc_slope(coc)]
         sizes = [1, 1, light.shape[1], 2 * light.shape[1], 1, 1, 2]
-        parts.append([f.reshape(n, -1)[:, there] for f, n in zip(fields, sizes, strict=True)])
+        parts.append([f.reshape(n, -1)[:, is_covered] for f, n in zip(fields, sizes, strict=True)])
     x, y, light, light_slope, cover, coc, coc_slope = (torch.cat(p, 1) for p in zip(*parts, strict=True))
     light_slope = light_slope.unflatten(0, (2, -1)).transpose(1, 2)
     return _Squares(x[0], y[0], light.T.contiguous(), light_slope.contiguous(), cover[0], coc[0], coc_slope)
@@ -255,7 +255,7 @@ def _light_slope(light: Tensor, coc: Tensor) -> Tensor:
 
 
 def _draw(
-    squares: _Squares, there: Tensor, dx: Tensor, dy: Tensor, ddx: Tensor, ddy: Tensor, height: int, width: int
+    squares: _Squares, is_drawn: Tensor, dx: Tensor, dy: Tensor, ddx: Tensor, ddy: Tensor, height: int, width: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Squares of a view as (row of the square, pixel it covers the centre of, its light there)."""
     x, y = squares.x + dx, squares.y + dy
@@ -271,7 +271,7 @@ def _draw(
             along = (slope_x * ex + slope_y * ey) / det
             qx, qy = ex - ddx * along, ey - ddy * along
             inside = (qx >= -0.5) & (qx < 0.5) & (qy >= -0.5) & (qy < 0.5)
-            inside &= there & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            inside &= is_drawn & (column >= 0) & (column < width) & (row >= 0) & (row < height)
             s = inside.nonzero()[:, 0]
             sources.append(s)
             targets.append((row[s] * width + column[s]).long())

@@ -183,8 +183,8 @@ def plane_scene(
     depth = torch.full((height, width), math.inf, dtype=torch.float64)
     surfaces = []
     for plane, cover in zip(planes, covers, strict=True):
-        here = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(x, y)
-        depth = torch.where(here, plane.depth_m, depth)
+        is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(x, y)
+        depth = torch.where(is_covered, plane.depth_m, depth)
         surfaces.append((cover.float()[None], torch.full((1, 1, height, width), plane.depth_m)))
     margin_px = math.ceil(max(abs(c) for c in cocs))
     images = (sharp.float()[None], depth.float()[None, None], camera, truth.float()[None])
@@ -204,11 +204,11 @@ def _average(
     for (px, py), (ux, uy) in zip(places, points, strict=True):
         seen = torch.zeros(())
         for k, (plane, coc) in enumerate(zip(planes, cocs, strict=True)):
-            at = (x + px - coc * ux, y + py - coc * uy)
-            light = plane.light(*at)
-            there = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*at)
-            seen = torch.where(there, light, seen)
-            wholes[k] = wholes[k] + torch.cat([light * there, there[None]])
+            place = (x + px - coc * ux, y + py - coc * uy)
+            light = plane.light(*place)
+            is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*place)
+            seen = torch.where(is_covered, light, seen)
+            wholes[k] = wholes[k] + torch.cat([light * is_covered, is_covered[None]])
         total = total + seen
     return total / len(places), [whole / len(places) for whole in wholes]
 

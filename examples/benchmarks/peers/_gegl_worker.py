@@ -17,8 +17,8 @@ def main() -> None:
     """Reads ``image`` and ``radius``, writes ``out``."""
     Gegl.init([])
     if sys.argv[1] == "--version":
-        found = Gegl.get_version()
-        print(f"{found.major}.{found.minor}.{found.micro}")
+        version = Gegl.get_version()
+        print(f"{version.major}.{version.minor}.{version.micro}")
         return
     folder, width, height, largest = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
     frame = Gegl.Rectangle.new(0, 0, width, height)

@@ -32,7 +32,7 @@ def version() -> str:
     return "" if done.returncode else done.stdout.split()[-1]
 
 
-def render(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
+def blur(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Blurs ``image`` ``[1, 3, H, W]`` by ``coc_px`` ``[1, 1, H, W]``; returns it and the seconds that Blender took."""
     height, width = image.shape[-2:]
     with tempfile.TemporaryDirectory() as folder:

@@ -37,7 +37,7 @@ def version() -> str:
     return subprocess.run(["ffmpeg", "-version"], capture_output=True, text=True).stdout.split()[2]
 
 
-def render(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
+def blur(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Blurs ``image`` ``[1, 3, H, W]`` by ``coc_px`` ``[1, 1, H, W]``; returns it and the seconds that FFmpeg took."""
     height, width = image.shape[-2:]
     # A disc has variance R^2 / 4 along an axis and its pixels 1 / 12; n pixels in a row have (n^2 - 1) / 12.

@@ -33,7 +33,7 @@ def version() -> str:
     return _run("--version").strip()
 
 
-def render(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
+def blur(image: Tensor, coc_px: Tensor) -> tuple[Tensor, float]:
     """Blurs ``image`` ``[1, 3, H, W]`` by ``coc_px`` ``[1, 1, H, W]``; returns it and the seconds that GEGL took."""
     height, width = image.shape[-2:]
     radius = (coc_px.abs() - 0.5).clamp_min(0.0)

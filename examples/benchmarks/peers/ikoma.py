@@ -21,6 +21,6 @@ def version() -> str:
     return f"torch {torch.__version__}"
 
 
-def render(image: Tensor, coc_px: Tensor) -> Tensor:
+def blur(image: Tensor, coc_px: Tensor) -> Tensor:
     """Blurs ``image`` ``[1, C, H, W]`` by ``coc_px`` ``[1, 1, H, W]``."""
     return layered_fft(image, coc_px)

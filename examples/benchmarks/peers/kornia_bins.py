@@ -20,7 +20,7 @@ def version() -> str:
     return str(kornia.__version__)
 
 
-def render(image: Tensor, coc_px: Tensor) -> Tensor:
+def blur(image: Tensor, coc_px: Tensor) -> Tensor:
     """Blurs ``image`` ``[1, C, H, W]`` by ``coc_px`` ``[1, 1, H, W]``."""
     radius = coc_px.abs()
     radii = torch.linspace(0.0, float(radius.max()), _BINS)
