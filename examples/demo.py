@@ -17,8 +17,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from torch import Tensor
 
 import torchdof
-from torchdof.depthmap import read_depth
-from torchdof.files import Picture, read_image, write_image
+from torchdof.depth.reading import read_depth
+from torchdof.io.images import Picture, read_image, write_image
 
 FOCUS_M = {"near": 2.3, "middle": 3.1, "far": 4.6}
 FOCAL_PX, BASELINE_M, DISPARITY_OFFSET_PX = 994.978, 0.193001, 31.086

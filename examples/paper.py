@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 import torchdof
-from torchdof.files import Picture, write_image
 from torchdof.fit import BlurFit, blur_strength, fit_captures, fit_pair, fit_profile, read_captures
-from torchdof.fit.lens import Lens
-from torchdof.fit.pictures import picture_of_fit, picture_of_quad, picture_of_table, picture_of_texture
-from torchdof.fit.spot import Spot, focus_sensor, point_spread
+from torchdof.fit.lens.lens import Lens
+from torchdof.fit.lens.spot import Spot, focus_sensor, point_spread
+from torchdof.fit.plots import picture_of_fit, picture_of_quad, picture_of_table, picture_of_texture
+from torchdof.io.images import Picture, write_image
 
 FOCUS_M, PAPER_M = 0.20, 0.50  # where the dot is in focus, and where it is photographed out of focus
 WIDTH, HEIGHT, SENSOR_MM = 480, 360, 9.0  # the middle of a 36 mm sensor of 1920 pixels

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from torchdof.camera import Camera
+from torchdof.optics.camera import Camera
 
 from .graph import Portable
 
@@ -35,7 +35,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         channels: Channels of the image.
         large: Add a frame of 960 x 540.
     """
-    reach = portable.dof.max_coc_px
+    reach = portable.dof.options.max_coc_px
     random = torch.Generator().manual_seed(4)
     frames = [
         ("one pixel", (1, 1, 1), _ramp(0.3, 0.9)),

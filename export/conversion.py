@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import os
-import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ import torch
 from onnxscript import opset20
 
 from torchdof import DepthOfField
+from torchdof.io.atomic import whole_file
 
 from .graph import INPUTS, OUTPUT, Portable, trace
 from .metadata import label
@@ -82,17 +82,9 @@ def to_onnx(
     portable = Portable(dof, inputs, width)
     model = onnx_ir.to_proto(slim(_translate(portable, channels, opset)))
     label(model, dof, portable, channels, opset)
-    handle, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".onnx", dir=path.parent)
-    os.close(handle)
-    try:
-        onnx.save_model(model, part)
-        report = verify(part, dof)
-        os.chmod(part, 0o644)
-        os.replace(part, path)
-    except BaseException:
-        os.unlink(part)
-        raise
-    return report
+    with whole_file(path) as part:
+        onnx.save_model(model, part, format="protobuf")
+        return verify(part, dof)
 
 
 def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:

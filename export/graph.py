@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
-from torchdof.camera import Camera
+from torchdof.optics.camera import Camera
 from torchdof.plan import Blur, Plan
 
 __all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
@@ -45,7 +45,7 @@ class Portable(nn.Module):
                 )
         self.inputs, self.width = inputs, width
         self.dof = copy.copy(dof)
-        self.dof.table = pinned(dof.table, width)
+        self.dof.table = pinned(dof.options.table, width)
         self.dof.check = False
         self.eval()
 
@@ -54,17 +54,17 @@ class Portable(nn.Module):
         plan = None if torch.compiler.is_exporting() else self.plan
         if self.inputs == "depth":
             return self.dof(image, map_, *lens, plan=plan)
-        return blur_by_coc(image, map_, plan=plan, **self.dof._options())
+        return blur_by_coc(image, map_, plan=plan, **self.dof.options.arguments())
 
     @property
     def plan(self) -> Plan:
         """The layers of the graph."""
-        return Plan.all(self.dof.max_coc_px, self.dof.tolerance)
+        return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance)
 
     def blurs(self, size: tuple[int, int]) -> list[Blur]:
         """Kernels of the graph's layers, for a frame of this height and width."""
-        coarse = self.dof.method == "layered"
-        return self.plan.blurs(self.dof.table, size, torch.float32, torch.device("cpu"), coarse)
+        coarse = self.dof.options.method == "layered"
+        return self.plan.blurs(self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse)
 
 
 class _Pinned(BlurTable):
@@ -104,7 +104,7 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     Raises:
         ValueError: If the channels do not fit the table.
     """
-    table, size = portable.dof.table, (2, 64, 64)
+    table, size = portable.dof.options.table, (2, 64, 64)
     if table.channels not in (1, channels):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
     image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0

@@ -12,6 +12,8 @@ import onnx.compose
 import onnx.version_converter
 import onnx_ir
 
+from torchdof.io.atomic import whole_file
+
 from . import bridge
 from .graph import INPUTS, OUTPUT
 from .metadata import UNITS, facts_of, load, write_facts
@@ -145,17 +147,10 @@ def _prefixed(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
 
 
 def _write(joint: onnx.ModelProto, parts: Sequence[onnx.ModelProto], size: tuple[int, int], path: Path) -> None:
-    handle, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".onnx", dir=path.parent)
-    os.close(handle)
-    try:
-        onnx.save_model(joint, part)
+    with whole_file(path) as part:
+        onnx.save_model(joint, part, format="protobuf")
         check_format(joint, part)
         _compare(joint, part, parts, size)
-        os.chmod(part, 0o644)
-        os.replace(part, path)
-    except BaseException:
-        os.unlink(part)
-        raise
 
 
 def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto], size: tuple[int, int]) -> None:

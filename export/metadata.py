@@ -9,7 +9,7 @@ from typing import Any
 import onnx
 
 from torchdof import BlurTable, DepthOfField
-from torchdof.camera import Camera
+from torchdof.optics.camera import Camera
 
 from .graph import OUTPUT, Portable
 
@@ -32,14 +32,14 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
     model.producer_name, model.producer_version = "torchdof", _version()
     model.doc_string = "Depth of field: an all-in-focus image and its depth in, the photograph of a real lens out."
     model.graph.name = "depth_of_field"
-    options = {k: v for k, v in dof._options(table=False).items() if k != "check"}
+    options = {k: v for k, v in dof.options.arguments().items() if k not in ("table", "check")}
     facts: dict[str, Any] = {
         "version": _version(),
         "inputs": {v.name: UNITS[v.name].format(channels=channels) for v in model.graph.input},
         "output": {OUTPUT: UNITS["image"].format(channels=channels)},
         "camera": {k: getattr(dof.camera, k) for k in Camera.__dataclass_fields__},
-        "table": {"name": dof.table.name, "family": dof.table.family, "unit": dof.table.unit}
-        | {"sha256": table_hash(dof.table)},
+        "table": {"name": dof.options.table.name, "family": dof.options.table.family, "unit": dof.options.table.unit}
+        | {"sha256": table_hash(dof.options.table)},
         "options": options,
         "width": portable.width,
         "layers": len(portable.plan.nodes),

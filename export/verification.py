@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import time
+from typing import Any
 
 import numpy as np
 import onnx
@@ -17,14 +18,14 @@ from .cases import Case, cases
 from .graph import INPUTS, OUTPUT, Portable
 from .metadata import facts_of, load, table_hash
 
-__all__ = ["TOLERANCE", "Row", "Verification", "check_format", "session", "verify"]
+__all__ = ["TOLERANCE", "CaseComparison", "Verification", "check_format", "session", "verify"]
 
 TOLERANCE = 1e-5
 """Accepted difference from eager PyTorch, relative to the largest light within a kernel's reach."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class CaseComparison:
     """One case.
 
     Args:
@@ -55,7 +56,7 @@ class Verification:
     """
 
     title: str
-    cases: tuple[Row, ...]
+    cases: tuple[CaseComparison, ...]
     bytes: int
 
     @property
@@ -138,7 +139,7 @@ def local_range(image: Tensor, reach: int) -> Tensor:
     return functional.max_pool2d(largest, (1, 2 * reach + 1), stride=1)
 
 
-def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Case) -> Row:
+def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Case) -> CaseComparison:
     start = time.perf_counter()
     with torch.no_grad():
         expected = portable(*case.tensors)
@@ -152,7 +153,9 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     unit = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
     error = (torch.from_numpy(got) - expected).abs() / unit.clamp_min(torch.finfo(torch.float32).tiny)
     error = torch.where(torch.isfinite(error), error, torch.inf)
-    return Row(case.name, tuple(got.shape), float(error.max()), float(error.mean()), middle - start, end - middle)
+    return CaseComparison(
+        case.name, tuple(got.shape), float(error.max()), float(error.mean()), middle - start, end - middle
+    )
 
 
 def check_format(model: onnx.ModelProto, path: str) -> None:
@@ -175,9 +178,9 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
 
 
 def _check_origin(facts: dict, dof: DepthOfField) -> None:
-    if facts["table"]["sha256"] != table_hash(dof.table):
-        raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.table!r}")
-    options = dof._options(table=False)
+    if facts["table"]["sha256"] != table_hash(dof.options.table):
+        raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.options.table!r}")
+    options: dict[str, Any] = {**dof.options.arguments()}
     for name, value in facts["options"].items():
         if options[name] != value:
             raise ValueError(f"the file was made with {name}={value!r}, the module has {options[name]!r}")

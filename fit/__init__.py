@@ -1,15 +1,15 @@
 """Capture to radial profile to fitted kernel to blur table: lengths in, lengths out, in the caller's unit."""
 
-from .capture import Capture, Captures, read_captures, read_pair
-from .choose import natural_psnr
-from .gaussian import fit_profile
-from .pair import fit_pair
+from .lens.trace import trace_table
+from .photo.family_choice import natural_psnr
+from .photo.manifest import Capture, Captures, read_captures, read_pair
+from .photo.pair import fit_pair
+from .photo.profile_fit import fit_profile
+from .photo.ratio import blur_strength, polar_samples
+from .photo.scale import check_reach
+from .photo.table import TableFit, fit_captures, fit_table
 from .problems import FitError, FitWarning
-from .profile import blur_strength, polar_samples
 from .result import BlurFit
-from .scale import check_reach
-from .table import TableFit, fit_captures, fit_table
-from .trace import trace_table
 
 __all__ = [
     "BlurFit",

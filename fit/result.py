@@ -21,7 +21,7 @@ class BlurFit:
 
     Attributes:
         family: "gaussian", "ring", "disc", "softm" or "radial".
-        params: the family's parameters (see `torchdof.kernel.FAMILIES`), lengths in the caller's unit (pixels for
+        params: the family's parameters (see `torchdof.optics.psf.FAMILIES`), lengths in the caller's unit (pixels for
             `fit_pair`). Floats, and for `radial` the array "values" [P]. A profile fit (`fit_profile`, model "ratio")
             has the strength "N" too.
         stderr: one standard error for each parameter, calibrated against repeated simulated captures.
@@ -69,7 +69,7 @@ class BlurFit:
         return self.residual / self.noise if self.noise > 0 else math.nan
 
     def kernel_params(self) -> dict[str, float | Array]:
-        """The parameters that `torchdof.kernel` takes (without the strength N)."""
+        """The parameters that `torchdof.optics.psf` takes (without the strength N)."""
         return {name: value for name, value in self.params.items() if name != "N"}
 
     def summary(self) -> str:

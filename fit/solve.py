@@ -58,7 +58,7 @@ def best_of(
             with warnings.catch_warnings():
                 # it warns where its own covariance has no inverse; the caller computes one, and reports it
                 warnings.simplefilter("ignore", OptimizeWarning)
-                found, _ = curve_fit(
+                params, _ = curve_fit(
                     model,
                     index,
                     data,
@@ -74,8 +74,8 @@ def best_of(
                 )
         except RuntimeError:  # out of evaluations
             return None
-        squares = float(np.sum((model(index, *found) - data) ** 2))
-        return (squares, np.asarray(found, dtype=np.float64)) if np.isfinite(squares) else None
+        squares = float(np.sum((model(index, *params) - data) ** 2))
+        return (squares, np.asarray(params, dtype=np.float64)) if np.isfinite(squares) else None
 
     rough = [descend(np.asarray(start, dtype=np.float64), max(tolerance, _ROUGH)) for start in starts]
     reached = [r for r in rough if r is not None]

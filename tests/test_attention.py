@@ -6,8 +6,8 @@ from torch import Tensor
 
 import torchdof
 from torchdof.attention import box_around, weight_map
-from torchdof.scenes import posts, waves
-from torchdof.tolerance import NAMED
+from torchdof.options import NAMED
+from torchdof.reference.scenes import posts, waves
 
 
 def scene(height: int = 192, width: int = 320) -> tuple[Tensor, Tensor]:

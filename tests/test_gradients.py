@@ -36,7 +36,7 @@ def case() -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def renderer(way: dict[str, Any], name: str = "disc") -> Callable[..., Tensor]:
-    return DepthOfField(Camera(sensor_width_mm=0.6), TABLES[name], 1 / 60, **way)
+    return DepthOfField(Camera(sensor_width_mm=0.6), TABLES[name], tolerance=1 / 60, **way)
 
 
 def test_the_case_has_blur_in_front_of_and_behind_focus() -> None:

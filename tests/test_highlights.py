@@ -8,7 +8,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof import BlurTable, blur_by_coc, highlights, metrics
+from torchdof import BlurTable, blur_by_coc, highlights
+from torchdof.reference import metrics
 
 LAMP = 3000.0
 

@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdof import Camera, DepthOfField, blur_by_coc, metrics
-from torchdof.scenes import Plane, Scene, plane_scene, posts, waves
+from torchdof import Camera, DepthOfField, blur_by_coc
+from torchdof.reference import metrics
+from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
 
 CAMERA = Camera.from_fov(40.0, 0.09, 3.0)
 DEPTHS = (6.0, 2.0, 1.2)

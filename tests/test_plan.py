@@ -5,9 +5,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchdof.kernel import disc
+from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.psf import disc
 from torchdof.plan import Plan, spacing
-from torchdof.table import BlurTable
 
 TOLERANCE = st.sampled_from([0.0, 1 / 1000, 1 / 255, 1 / 60, 1 / 20, 0.5])
 

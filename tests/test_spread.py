@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchdof import kernel, spread
+from torchdof import spread
+from torchdof.optics import psf
 
 Tolerances = dict[torch.dtype, Any]
 Spread = Callable[[Tensor, Tensor], Tensor]
@@ -24,7 +25,7 @@ REAL = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def bank(*radii: float, size: int | None = None, dtype: torch.dtype = torch.float64) -> Tensor:
     """One soft disc a channel: `[C, k, k]`."""
     radius = torch.tensor(radii, dtype=torch.float64)
-    return kernel.softm(radius, radius / 10, b=0.7, m=2.0, size=size).to(dtype)
+    return psf.softm(radius, radius / 10, b=0.7, m=2.0, size=size).to(dtype)
 
 
 @BOTH
@@ -47,7 +48,7 @@ def test_scatter_equals_a_plain_loop_over_pixels(
 
 def test_fold_with_a_kernel_of_its_own_for_every_pixel_equals_a_plain_loop(loops: ModuleType) -> None:
     light = torch.rand(2, 3, 5, 6, dtype=torch.float64)
-    kernels = kernel.disc(torch.tensor([0.0, 1.3, 2.4]), size=5).unsqueeze(1)
+    kernels = psf.disc(torch.tensor([0.0, 1.3, 2.4]), size=5).unsqueeze(1)
     shares = torch.rand(2, 3, 5, 6, dtype=torch.float64)
 
     def kernel_of(item: int, row: int, column: int) -> Tensor:
@@ -79,7 +80,7 @@ def test_a_highlight_changes_nothing_outside_its_own_disc(radius: float) -> None
     dark = torch.full((1, 1, 9, 201), 0.1)
     lit = dark.clone()
     lit[..., 4, 100] = 6.5e4
-    kernels = kernel.disc(radius).unsqueeze(0).float()
+    kernels = psf.disc(radius).unsqueeze(0).float()
     apart = (torch.arange(201) - 100).abs() > radius + 1
     assert_close(spread.conv(lit, kernels)[..., apart], spread.conv(dark, kernels)[..., apart], rtol=1e-6, atol=0.0)
 
@@ -140,7 +141,7 @@ def test_spreading_symmetric_kernels_is_its_own_adjoint(scatter: Spread) -> None
 def test_strips_agree_with_the_frame_as_a_whole(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     light, kernels = torch.rand(1, 2, 13, 6, dtype=torch.float64), bank(1.2, 2.1, size=7)
     shares = torch.rand(1, 3, 13, 6, dtype=torch.float64)
-    each = kernel.disc(torch.tensor([0.0, 1.0, 3.4]), size=7).unsqueeze(1)
+    each = psf.disc(torch.tensor([0.0, 1.0, 3.4]), size=7).unsqueeze(1)
     whole, whole_shared = spread.fold(light, kernels), spread.fold(light, each, shares)
     strips = []
 
@@ -204,11 +205,13 @@ def test_shapes_that_do_not_fit_are_refused(scatter: Spread, light: Tensor, kern
 
 FRAME_1080P = """
 import torch
-from torchdof import kernel, memory, spread
+from torchdof import spread
+from torchdof.bench import memory
+from torchdof.optics import psf
 light = torch.rand(1, 3, 1080, 1920)
-psf = kernel.disc(16.0).unsqueeze(0).float()
+kernel = psf.disc(16.0).unsqueeze(0).float()
 before = memory.peak_mb()
-spread.fold(light, psf)
+spread.fold(light, kernel)
 print(before, memory.peak_mb())
 """
 
@@ -223,13 +226,13 @@ def test_fold_of_a_1080p_frame_at_radius_16_stays_within_2_gb() -> None:
 
 @pytest.mark.parametrize("radius", [2.5, 14.0])
 def test_one_kernel_serves_all_channels(radius: float) -> None:
-    light, psf = torch.rand(2, 3, 20, 24), kernel.disc(radius).float()[None]
-    assert_close(spread.conv(light, psf), spread.conv(light, psf.repeat(3, 1, 1)), rtol=1e-6, atol=1e-6)
-    assert_close(spread.conv(light, psf), spread.fold(light, psf), rtol=1e-5, atol=1e-6)
+    light, kernel = torch.rand(2, 3, 20, 24), psf.disc(radius).float()[None]
+    assert_close(spread.conv(light, kernel), spread.conv(light, kernel.repeat(3, 1, 1)), rtol=1e-6, atol=1e-6)
+    assert_close(spread.conv(light, kernel), spread.fold(light, kernel), rtol=1e-5, atol=1e-6)
 
 
 def test_a_large_kernel_uses_the_halo_as_if_the_frame_went_on() -> None:
-    light, kernels = torch.rand(1, 2, 90, 100), torch.stack([kernel.disc(12.0), kernel.disc(11.8)]).float()
+    light, kernels = torch.rand(1, 2, 90, 100), torch.stack([psf.disc(12.0), psf.disc(11.8)]).float()
     half = kernels.shape[-1] // 2
     whole = spread.conv(light, kernels)[..., half:-half, half:-half]
     assert_close(spread.conv(light, kernels, half), whole, rtol=1e-5, atol=1e-6)
@@ -241,7 +244,7 @@ def test_a_large_kernel_uses_the_halo_as_if_the_frame_went_on() -> None:
 @pytest.mark.parametrize("channels", [1, 3, 4, 5, 8, 9])
 @pytest.mark.parametrize("rows", [1, 2, 13])
 def test_the_halo_is_used_whatever_shares_a_convolution(rows: int, channels: int, items: int) -> None:
-    bank = torch.stack([kernel.disc(1.6 + 0.2 * c, size=7) for c in range(channels)])
+    bank = torch.stack([psf.disc(1.6 + 0.2 * c, size=7) for c in range(channels)])
     light = torch.rand(items, channels, rows + 6, 17, dtype=torch.float64)
     wanted = spread.fold(light, bank)[..., 3:-3, 3:-3]
     assert_close(spread.conv(light, bank, halo=3), wanted, rtol=0, atol=1e-12)

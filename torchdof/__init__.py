@@ -1,7 +1,36 @@
 """A calibrated depth-of-field post-process: an all-in-focus image and its depth in, a real lens's photograph out."""
 
-from .camera import Camera
-from .module import DepthOfField, blur_by_coc, depth_of_field
-from .table import BlurTable
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .module import DepthOfField, blur_by_coc, depth_of_field
+    from .optics.blur_table import BlurTable
+    from .optics.camera import Camera
 
 __all__ = ["BlurTable", "Camera", "DepthOfField", "blur_by_coc", "depth_of_field"]
+
+# Imported when first asked for, so that the command line can say what it is asked without PyTorch.
+_HOMES = {
+    "BlurTable": "optics.blur_table",
+    "Camera": "optics.camera",
+    "DepthOfField": "module",
+    "blur_by_coc": "module",
+    "depth_of_field": "module",
+}
+_SUBPACKAGES = ("depth", "export", "fit")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+    elif name in _SUBPACKAGES:
+        value = importlib.import_module(f".{name}", __name__)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_SUBPACKAGES})

@@ -1,6 +1,6 @@
 """``python -m torchdof``."""
 
-from .command import main
+from .cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .arguments import show
+from .validation import show
 
 __all__ = ["Attention", "box_around", "weight_map"]
 

@@ -20,8 +20,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .optics.blur_table import BlurTable
 from .pool import any_around, any_of_blocks, bands, between, max_around, max_of_blocks, places
-from .table import BlurTable
 
 __all__ = ["FACTOR", "Rays", "ordinary", "take", "trace"]
 

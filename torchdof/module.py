@@ -1,44 +1,31 @@
-"""Depth of field as a module and as functions: the chain of the other rooms and nothing else."""
+"""Depth of field as a module and as functions: configuration, checks, then one call of the pipeline."""
 
 import dataclasses
-from typing import Any
+import math
+from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
 
-from . import check as checks
-from . import pipeline
+from . import pipeline, validation
 from .attention import Attention
-from .camera import Camera
-from .check import Border, Method, Options
+from .optics.blur_table import BlurTable
+from .optics.camera import Camera
+from .options import OptionArguments, Options, read_state, spells_options
 from .plan import Plan
 from .survey import survey
-from .table import BlurTable
-from .tolerance import Tolerance, tolerance_of
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
-_DISC = BlurTable.disc()  # one for all: what was computed of a table is kept with it
 
-
+@spells_options
 class DepthOfField(nn.Module):
     """The photograph a real lens would have taken, from an all-in-focus image and its depth.
 
     Args:
         camera: The camera; its focus and f-number can be overridden in each call.
         table: Blur measured from a lens; None takes the ideal disc.
-        tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
-            and full resolution. 0 asks for that rendering itself; ``"draft"`` is 8/255, ``"preview"`` 4/255 and
-            ``"final"`` 1/255.
-        occlusion: True composites layers far to near, so that blurred foregrounds cover what is behind and sharp ones
-            are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
-        normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.
-        method: ``"layered"`` spreads layers by convolution (fast); ``"fold"`` by the paper's literal scatter.
-        border: ``"normalize"`` counts only light that was seen: what is outside the frame is unknown and weighs
-            nothing. ``"extend"`` continues the light at the frame's border outwards, as if it were known.
-        max_coc_px: Largest radius that a static plan (compiled, exported) covers; larger ones are rendered with it.
-        check: Look for NaN and non-positive depths and non-finite light before rendering, and refuse them. False skips
-            that (and its cost); a pixel with a bad depth then passes through sharp and touches nothing else.
+        **options: As in :class:`torchdof.options.Options`.
 
     Raises:
         ValueError: If an option is not as described.
@@ -53,26 +40,22 @@ class DepthOfField(nn.Module):
         True
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        table: BlurTable | None = None,
-        tolerance: Tolerance = 1 / 255,
-        occlusion: bool = True,
-        normalize: bool = True,
-        method: Method = "layered",
-        border: Border = "normalize",
-        max_coc_px: float = 64.0,
-        check: bool = True,
-    ) -> None:
+    def __init__(self, camera: Camera, table: BlurTable | None = None, **options: Unpack[OptionArguments]) -> None:
         super().__init__()
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
-        table, tolerance = _DISC if table is None else table, tolerance_of(tolerance)
-        Options(table, tolerance, occlusion, normalize, method, border, max_coc_px, check)  # says what is wrong
-        self.camera, self.table = camera, table
-        self.tolerance, self.occlusion, self.normalize = float(tolerance), bool(occlusion), bool(normalize)
-        self.method, self.border, self.max_coc_px, self.check = method, border, float(max_coc_px), bool(check)
+        self.camera = camera
+        self._set(Options.of(**{"table": table, **options}))
+
+    def _set(self, options: Options) -> None:
+        for name, value in options.arguments().items():
+            setattr(self, name, value)
+
+    @property
+    def options(self) -> Options:
+        """The options of the next rendering; each is an attribute of the module too, and may be set."""
+        values: Any = {field.name: getattr(self, field.name) for field in dataclasses.fields(Options)}
+        return Options.of(**values)
 
     def forward(
         self,
@@ -108,20 +91,13 @@ class DepthOfField(nn.Module):
         Raises:
             ValueError: If shapes, types or values are not as described.
         """
+        options = self.options
         coc = self.coc_px(image, depth, focus_m, f_number)
         behind = None
         if background is not None and background_depth is not None:
             behind = self.coc_px(background, background_depth, focus_m, f_number)
-        checks.both_or_none(background, background_depth)  # here it is the depth that is missing
-        return blur_by_coc(
-            image,
-            coc,
-            plan=plan,
-            background=background,
-            background_coc_px=behind,
-            attention=attention,
-            **self._options(),
-        )
+        validation.both_or_none(background, background_depth)  # here it is the depth that is missing
+        return _blur(image, coc, options, plan, background, behind, attention)
 
     def layers(
         self,
@@ -151,10 +127,10 @@ class DepthOfField(nn.Module):
             >>> dof.layers(rgba, torch.tensor([1.0, 4.0])).shape
             torch.Size([1, 4, 8, 12])
         """
-        depth = checks.stack(rgba, depth_m, self.check)
+        options = self.options
+        depth = validation.stack(rgba, depth_m, options.check)
         batch, count, _, height, width = rgba.shape
         maps = depth.expand(batch, -1, 1, height, width).transpose(1, 2).flatten(2, 3)  # [B, 1, N * H, W]
-        options = Options(**self._options())
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
         coc = self.coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number)
@@ -168,13 +144,14 @@ class DepthOfField(nn.Module):
         f_number: float | Tensor | None = None,
     ) -> Tensor:
         """Signed circle of confusion of the call :meth:`forward` with the same arguments: ``[B, 1, H, W]``, pixels."""
-        checks.image_and_depth(image, depth, values=self.check)
+        check = self.options.check
+        validation.image_and_depth(image, depth, values=check)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
         # as a tensor: an exported graph would take Python's arithmetic with the width to be in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64)
         coc = camera.coc_px(depth, width)
-        return coc if self.check else torch.where(depth > 0, coc, torch.nan)
+        return coc if check else torch.where(depth > 0, coc, torch.nan)
 
     def plan(
         self,
@@ -194,14 +171,16 @@ class DepthOfField(nn.Module):
             >>> print(dof.plan(torch.rand(1, 3, 64, 96), depth))  # doctest: +ELLIPSIS
             96 x 64, tolerance 1/255, predicted error ...
         """
-        coc = self.coc_px(image, depth, focus_m, f_number)
-        plan = Plan.of_scene(coc, self.tolerance)
-        return dataclasses.replace(plan, survey=survey(plan, coc, self.table, self.method == "layered", self.occlusion))
+        options, coc = self.options, self.coc_px(image, depth, focus_m, f_number)
+        plan = Plan.of_scene(coc, options.tolerance)
+        told = survey(plan, coc, options.table, options.method == "layered", options.occlusion)
+        return dataclasses.replace(plan, survey=told)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""
         camera = {k: getattr(self.camera, k) for k in Camera.__dataclass_fields__}
-        return {"camera": camera, "table": self.table.to_dict(), **self._options(table=False)}
+        options = self.options
+        return {"camera": camera, **options.arguments(), "table": options.table.to_dict()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave, all of it or nothing.
@@ -209,45 +188,39 @@ class DepthOfField(nn.Module):
         Raises:
             ValueError: Naming the field that is missing, unknown or makes no sense.
         """
-        camera, options = checks.state(state)
-        self.camera = camera
-        for field in dataclasses.fields(options):
-            setattr(self, field.name, getattr(options, field.name))
+        self.camera, options = read_state(state)
+        self._set(options)
 
     def extra_repr(self) -> str:
         """Camera, table and options, as ``repr`` shows them."""
-        options = ", ".join(f"{k}={v!r}" for k, v in self._options(table=False).items())
-        return f"{self.camera!r},\n{self.table!r},\n{options}"
-
-    def _options(self, table: bool = True) -> dict[str, Any]:
-        names = ("table", "tolerance", "occlusion", "normalize", "method", "border", "max_coc_px", "check")
-        return {name: getattr(self, name) for name in names[0 if table else 1 :]}
+        options: dict[str, Any] = {**self.options.arguments()}
+        table = options.pop("table")
+        return f"{self.camera!r},\n{table!r},\n" + ", ".join(f"{k}={v!r}" for k, v in options.items())
 
 
+@spells_options
 def depth_of_field(
     image: Tensor,
     depth: Tensor,
     camera: Camera,
     *,
-    table: BlurTable | None = None,
     focus_m: float | Tensor | None = None,
     f_number: float | Tensor | None = None,
     plan: Plan | None = None,
     attention: Attention | None = None,
-    **options: Any,
+    **options: Unpack[OptionArguments],
 ) -> Tensor:
-    """Functional form of :class:`DepthOfField`; the options are those of its constructor.
+    """Functional form of :class:`DepthOfField`.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres.
         camera: The camera.
-        table: Blur measured from a lens; None takes the ideal disc.
         focus_m: Overrides the camera's focus distance, float or ``[B]``.
         f_number: Overrides the camera's f-number, float or ``[B]``.
         plan: Layers to render with; None plans for this image.
         attention: Where the viewer looks, as in :meth:`DepthOfField.forward`.
-        **options: Of :class:`DepthOfField`.
+        **options: As in :class:`torchdof.options.Options`.
 
     Returns:
         ``[B, C, H, W]`` in the image's dtype.
@@ -260,43 +233,31 @@ def depth_of_field(
         >>> depth_of_field(image, depth, Camera(focus_m=1.0)).shape
         torch.Size([1, 3, 8, 12])
     """
-    return DepthOfField(camera, table, **options)(image, depth, focus_m, f_number, plan, attention=attention)
+    return DepthOfField(camera, **options)(image, depth, focus_m, f_number, plan, attention=attention)
 
 
+@spells_options
 def blur_by_coc(
     image: Tensor,
     coc_px: Tensor,
     *,
-    table: BlurTable | None = None,
-    tolerance: Tolerance = 1 / 255,
-    occlusion: bool = True,
-    normalize: bool = True,
-    method: Method = "layered",
-    border: Border = "normalize",
-    max_coc_px: float = 64.0,
-    check: bool = True,
     plan: Plan | None = None,
     background: Tensor | None = None,
     background_coc_px: Tensor | None = None,
     attention: Attention | None = None,
+    **options: Unpack[OptionArguments],
 ) -> Tensor:
     """Depth of field for pipelines that hold a map of the circle of confusion already.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane.
-        table: Blur measured from a lens; None takes the ideal disc.
-        tolerance: As in :class:`DepthOfField`.
-        occlusion: As in :class:`DepthOfField`.
-        normalize: As in :class:`DepthOfField`.
-        method: As in :class:`DepthOfField`.
-        border: As in :class:`DepthOfField`.
-        max_coc_px: As in :class:`DepthOfField`.
-        check: As in :class:`DepthOfField`; a bad coc is NaN.
+        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane,
+            NaN where it is unknown and ``check=False``.
         plan: Layers to render with; None plans for this image.
         background: As in :meth:`DepthOfField.forward`.
         background_coc_px: Its signed radius in pixels.
         attention: As in :meth:`DepthOfField.forward`.
+        **options: As in :class:`torchdof.options.Options`.
 
     Returns:
         ``[B, C, H, W]`` in the image's dtype.
@@ -309,13 +270,53 @@ def blur_by_coc(
         >>> blur_by_coc(image, torch.linspace(-2, 2, 12).expand(1, 1, 8, 12)).shape
         torch.Size([1, 3, 8, 12])
     """
-    table = _DISC if table is None else table
-    options = Options(table, tolerance_of(tolerance), occlusion, normalize, method, border, max_coc_px, check)
-    checks.image_and_coc(image, coc_px, table, values=check)
-    checks.plan(plan)
-    behind = checks.background(image, background, background_coc_px, table, options)
-    checks.attention(attention, plan)
+    return _blur(image, coc_px, Options.of(**options), plan, background, background_coc_px, attention)
+
+
+def _blur(
+    image: Tensor,
+    coc_px: Tensor,
+    options: Options,
+    plan: Plan | None,
+    background: Tensor | None,
+    background_coc_px: Tensor | None,
+    attention: Attention | None,
+) -> Tensor:
+    channels = options.table.channels
+    validation.image_and_coc(image, coc_px, channels, values=options.check)
+    _check_plan(plan)
+    hidden = validation.background(image, background, background_coc_px, channels, values=options.check)
+    if hidden is not None and not options.occlusion:
+        raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
+    _check_attention(attention, plan)
     if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
         with torch.autocast(image.device.type, enabled=False):
-            return pipeline.blur_attended(image, coc_px, plan, options, behind, attention)
-    return pipeline.blur_attended(image, coc_px, plan, options, behind, attention)
+            return pipeline.blur_attended(image, coc_px, plan, options, hidden, attention)
+    return pipeline.blur_attended(image, coc_px, plan, options, hidden, attention)
+
+
+def _check_plan(plan: Plan | None) -> None:
+    """Refuse what is not a plan, or one without layers in order."""
+    if plan is None:
+        return
+    if not isinstance(plan, Plan):
+        raise ValueError(
+            f"plan must be a Plan, as DepthOfField.plan(image, depth) gives, or None, got {validation.show(plan)}; "
+            "leave it out to plan for this image"
+        )
+    nodes = plan.nodes
+    numbers = isinstance(nodes, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in nodes)
+    if not numbers or not nodes or any(low >= high for low, high in zip(nodes, nodes[1:], strict=False)):
+        raise ValueError(
+            f"plan must hold layers as a tuple of strictly increasing numbers, got {validation.show(nodes)}"
+        )
+
+
+def _check_attention(attention: Attention | None, plan: Plan | None) -> None:
+    """Refuse attention where it cannot be paid: beside a plan, which holds one tolerance, and where code is traced."""
+    if attention is None:
+        return
+    if plan is not None:
+        raise ValueError("attention plans for two tolerances; leave plan out, or attention")
+    if validation.is_traced():
+        raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from . import background, composite, highlights, layers
 from .attention import Attention, box_around, weight_map
-from .check import Options
 from .frame import Frame, Sample, margin_and_align
 from .loop import side, tile_by_tile
+from .options import NAMED, Options
 from .plan import Blur, Plan
 from .spread import layers_by_conv, layers_by_fold
-from .tolerance import NAMED
 
 __all__ = ["blur", "blur_attended", "blur_stack"]
 

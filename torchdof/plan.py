@@ -10,8 +10,8 @@ from torch import Tensor
 
 from . import placement
 from .layers import from_blur_axis
+from .optics.blur_table import BlurTable
 from .resolution import shrink
-from .table import BlurTable
 
 if TYPE_CHECKING:
     from .survey import Survey

@@ -16,7 +16,7 @@ import math
 import torch
 from torch import Tensor
 
-from .table import BlurTable
+from .optics.blur_table import BlurTable
 
 __all__ = ["shrink"]
 

@@ -42,10 +42,10 @@ def fold(light: Tensor, kernels: Tensor, shares: Tensor | None = None) -> Tensor
         Sato, Dobashi, Yamamoto, section 3, steps (a) to (c). The adjoint is ``unfold``.
 
     Example:
-        >>> from torchdof import kernel
+        >>> from torchdof.optics import psf
         >>> light = torch.zeros(1, 1, 3, 3)
         >>> light[..., 1, 1] = 1.0
-        >>> bool(torch.allclose(fold(light, kernel.disc(1.2)[None].float())[0, 0], kernel.disc(1.2).float()))
+        >>> bool(torch.allclose(fold(light, psf.disc(1.2)[None].float())[0, 0], psf.disc(1.2).float()))
         True
     """
     _check(light, kernels)
@@ -94,9 +94,9 @@ def conv(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
         ValueError: If the shapes do not fit.
 
     Example:
-        >>> from torchdof import kernel
+        >>> from torchdof.optics import psf
         >>> light = torch.rand(1, 2, 9, 9, dtype=torch.float64)
-        >>> bank = kernel.disc(1.7)[None].expand(2, -1, -1)
+        >>> bank = psf.disc(1.7)[None].expand(2, -1, -1)
         >>> bool(torch.allclose(conv(light, bank), fold(light, bank)))
         True
     """

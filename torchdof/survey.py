@@ -9,8 +9,8 @@ from torch import Tensor
 
 from .frame import TILE, Frame, Sample, margin_and_align
 from .layers import blur_axis, share_at_or_behind
+from .optics.blur_table import BlurTable
 from .plan import Blur, Plan
-from .table import BlurTable
 
 __all__ = ["LayerUse", "Survey", "survey"]
 

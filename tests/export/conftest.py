@@ -31,7 +31,7 @@ class Exported:
     def eager(self, *tensors: Tensor) -> Tensor:
         """What PyTorch makes of the module, with the layers of the file."""
         with torch.no_grad():
-            return self.dof(*tensors, plan=Plan.all(self.dof.max_coc_px, self.dof.tolerance))
+            return self.dof(*tensors, plan=Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance))
 
 
 def _exported(tmp_path_factory: pytest.TempPathFactory, dof: torchdof.DepthOfField) -> Exported:

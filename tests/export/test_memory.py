@@ -21,7 +21,7 @@ SIZE = (1080, 1920)
 RENDER = """
 import json, sys
 import numpy as np
-from torchdof import memory
+from torchdof.bench import memory
 from torchdof.export import timing
 session = timing.session(sys.argv[1], threads=1)
 feed = timing.feed(session, (int(sys.argv[2]), int(sys.argv[3])), "blurred background")
@@ -49,7 +49,9 @@ def test_1080p_is_rendered_right_with_less_than_3_gb(layered: Any, tmp_path: Pat
     rows, columns = slice(400, 640), slice(1280, 1600)  # of the blurred half, on the coarse layers' grid
     part = [tensor[..., rows, columns].contiguous() for tensor in (image, coc)]
     with torch.no_grad():
-        expected = blur_by_coc(*part, plan=Plan.all(32.0, layered.dof.tolerance), **layered.dof._options())
+        expected = blur_by_coc(
+            *part, plan=Plan.all(32.0, layered.dof.options.tolerance), **layered.dof.options.arguments()
+        )
     inner = (..., slice(80, -80), slice(80, -80))  # where the part's border is out of reach
     assert (expected - part[0])[inner].abs().max() > 0.3
     torch.testing.assert_close(out[..., rows, columns][inner], expected[inner], atol=1e-5, rtol=0)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdof.export.verification import TOLERANCE, local_range
-from torchdof.scenes import read_scenes
+from torchdof.reference.scenes import read_scenes
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
 SIZE = (72, 100)
@@ -32,7 +32,7 @@ def three_ways(request: pytest.FixtureRequest) -> tuple[Any, Any]:
 @pytest.mark.parametrize("name", ["highlights/0", "planes/0", "room/1"])
 def test_eager_compiled_and_exported_agree(three_ways: tuple[Any, Any], name: str) -> None:
     exported, compiled = three_ways
-    image, depth, focus, reach = inputs(name, exported.dof.max_coc_px)
+    image, depth, focus, reach = inputs(name, exported.dof.options.max_coc_px)
     camera = exported.dof.camera.replace(focus_m=float(focus), f_number=1.0)
     f_number = camera.coc_px(depth, SIZE[1]).abs().amax().reshape(1) / reach
     tensors = (image, depth, focus, f_number)

@@ -49,7 +49,7 @@ def test_the_report_is_a_table_with_both_times(plain: Any) -> None:
     ],
 )
 def test_another_module_is_refused(plain: Any, change: dict[str, Any], message: str) -> None:
-    options = {"camera": plain.dof.camera, "table": plain.dof.table, **plain.dof._options(table=False)} | change
+    options = {"camera": plain.dof.camera, **plain.dof.options.arguments()} | change
     with pytest.raises(ValueError, match=message):
         verify(plain.path, torchdof.DepthOfField(**options))
 
@@ -99,7 +99,7 @@ def test_metadata_tell_what_a_file_is(plain: Any, model: onnx.ModelProto, tmp_pa
     assert "metres" in facts["inputs"]["depth"] and "linear light" in facts["output"]["out"]
     assert facts["camera"]["focal_length_mm"] == plain.dof.camera.focal_length_mm
     assert facts["table"]["family"] == "disc" and len(facts["table"]["sha256"]) == 64
-    assert facts["options"]["tolerance"] == plain.dof.tolerance and facts["opset"] == 20
+    assert facts["options"]["tolerance"] == plain.dof.options.tolerance and facts["opset"] == 20
     del model.metadata_props[:]
     with pytest.raises(ValueError, match="not written by torchdof.export"):
         describe(save(model, tmp_path))

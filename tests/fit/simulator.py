@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.signal import fftconvolve
 
-from torchdof.kernel import render
+from torchdof.optics.psf import pixel_kernels
 
 
 def draw_dot(size: int, radius: float, centre: tuple[float, float] = (0.0, 0.0), oversample: int = 16) -> np.ndarray:
@@ -24,8 +24,8 @@ def draw_dot(size: int, radius: float, centre: tuple[float, float] = (0.0, 0.0),
 
 
 def blur(picture: np.ndarray, family: str, params: dict) -> np.ndarray:
-    """The picture convolved with a kernel of `torchdof.kernel`."""
-    kernel = render(family, {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}).numpy()
+    """The picture convolved with a kernel of `torchdof.optics.psf`."""
+    kernel = pixel_kernels(family, {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}).numpy()
     return fftconvolve(picture, kernel, mode="same")
 
 
@@ -127,7 +127,7 @@ def write_captures(
 
     import torch
 
-    from torchdof.files import Picture, write_image
+    from torchdof.io.images import Picture, write_image
 
     folder.mkdir(parents=True, exist_ok=True)
     places = grid or [(0.0, 0.0)]

@@ -55,7 +55,7 @@ class Exported:
         return self.run(image, depth, float(self.camera.focus_m), f_number)
 
 
-def measure(exported: Exported, cases: ModuleType, case: Any) -> float:
+def worst_error(exported: Exported, cases: ModuleType, case: Any) -> float:
     """Largest relative error of a pixel in all that a case renders, through onnxruntime."""
     with _through(exported, cases) as errors:
         case.measure(torch.float32)

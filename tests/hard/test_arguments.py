@@ -15,11 +15,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, kernel
-from torchdof.depthmap import depth_from_values, fill_holes
-from torchdof.metadata import camera_facts
-from torchdof.render import RenderSettings, load_table, pick_device, tint_focus
-from torchdof.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
+from torchdof.cli.frame import tint_focus
+from torchdof.cli.settings import RenderSettings, load_table, pick_device
+from torchdof.depth.holes import fill_holes
+from torchdof.depth.kinds import depth_from_values
+from torchdof.io.metadata import camera_facts
+from torchdof.io.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
+from torchdof.optics import psf
 
 pytestmark = pytest.mark.hard
 
@@ -122,14 +125,14 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "BlurTable.kernels": (RING.kernels, {"coc_px": torch.ones(2), "width": 5, "size": 7}),
     "BlurTable.reach_px": (RING.reach_px, {"coc_px": 1.0, "width": 5}),
     "BlurTable.blur_texture": (RING.blur_texture, {"coc_px": 1.0, "width": 5, "size": None}),
-    "kernel.gaussian": (kernel.gaussian, {"sigma": 1.0, "size": 9}),
-    "kernel.ring": (kernel.ring, {"sigma": 1.0, "r_c": 1.0, "size": 9}),
-    "kernel.disc": (kernel.disc, {"radius": 1.0, "size": None}),
-    "kernel.softm": (kernel.softm, {"radius": 1.0, "sigma": 1.0, "b": 0.0, "m": 2.0, "size": 9}),
-    "kernel.radial": (kernel.radial, {"values": torch.ones(3), "radius": 1.0, "size": 9}),
-    "kernel.render": (kernel.render, {"family": "disc", "params": {"radius": 1.0}, "size": 9}),
-    "kernel.profile": (kernel.profile, {"family": "disc", "r": torch.ones(2), "params": {"radius": 1.0}}),
-    "kernel.support": (kernel.support, {"family": "disc", "params": {"radius": 1.0}}),
+    "psf.gaussian": (psf.gaussian, {"sigma": 1.0, "size": 9}),
+    "psf.ring": (psf.ring, {"sigma": 1.0, "r_c": 1.0, "size": 9}),
+    "psf.disc": (psf.disc, {"radius": 1.0, "size": None}),
+    "psf.softm": (psf.softm, {"radius": 1.0, "sigma": 1.0, "b": 0.0, "m": 2.0, "size": 9}),
+    "psf.radial": (psf.radial, {"values": torch.ones(3), "radius": 1.0, "size": 9}),
+    "psf.pixel_kernels": (psf.pixel_kernels, {"family": "disc", "params": {"radius": 1.0}, "size": 9}),
+    "psf.profile": (psf.profile, {"family": "disc", "r": torch.ones(2), "params": {"radius": 1.0}}),
+    "psf.support": (psf.support, {"family": "disc", "params": {"radius": 1.0}}),
     "DepthOfField": (DepthOfField, {"camera": Camera(), **OPTIONS}),
     "depth_of_field": (depth_blurred, {"image": IMAGE, "depth": DEPTH, "camera": Camera()}),
     "depth_of_field, lens": (

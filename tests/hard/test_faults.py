@@ -22,12 +22,12 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from torchdof import BlurTable, Camera, DepthOfField
-from torchdof.command import app
-from torchdof.depthmap import read_depth
+from torchdof.cli.main import app
+from torchdof.depth.reading import read_depth
 from torchdof.export import describe
-from torchdof.files import Picture, read_image, read_values, write_image
 from torchdof.fit import FitError, read_captures
-from torchdof.fit.lens import Lens
+from torchdof.fit.lens.lens import Lens
+from torchdof.io.images import Picture, read_image, read_values, write_image
 
 pytestmark = pytest.mark.hard
 
@@ -113,8 +113,8 @@ def huge_npy(path: Path) -> None:
 
 MEASURED = """
 import resource, sys
-from torchdof import memory
-from torchdof.files import read_image, read_values
+from torchdof.bench import memory
+from torchdof.io.images import read_image, read_values
 resource.setrlimit(resource.RLIMIT_AS, (6 << 30, 6 << 30))
 for read in (read_image, read_values):
     try:
@@ -335,16 +335,16 @@ def test_an_interruption_while_a_frame_is_written_leaves_nothing_of_it(
 
 FULL = """
 import resource, signal, sys
-import torchdof.command, torchdof.render_command, OpenImageIO  # before files may not grow any more
+import torchdof.cli.main, torchdof.cli.render, OpenImageIO  # before files may not grow any more
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (200, resource.RLIM_INFINITY))
-torchdof.command.app(sys.argv[1:])
+torchdof.cli.main.app(sys.argv[1:])
 """
 
 
 CUT = """
 import resource, signal, sys, torch
-from torchdof.files import Picture, read_image, write_image
+from torchdof.io.images import Picture, read_image, write_image
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 name, sample = sys.argv[1:]
 picture = Picture(torch.linspace(0, 1, 3 * 30 * 40).reshape(1, 3, 30, 40))
@@ -421,7 +421,7 @@ def test_two_frames_never_share_a_name(tmp_path: Path, monkeypatch: pytest.Monke
 def test_writers_of_one_name_at_once_leave_one_whole_file(tmp_path: Path) -> None:
     script = """
 import sys, torch
-from torchdof.files import Picture, write_image
+from torchdof.io.images import Picture, write_image
 for _ in range(20):
     write_image("x.exr", Picture(torch.full((1, 3, 50, 60), float(sys.argv[1]))))
 """

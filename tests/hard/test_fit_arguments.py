@@ -28,7 +28,7 @@ from torchdof.fit import (
     read_pair,
     trace_table,
 )
-from torchdof.fit.lens import Lens
+from torchdof.fit.lens.lens import Lens
 
 pytestmark = pytest.mark.hard
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchdof import BlurTable, blur_by_coc, kernel
+from torchdof import BlurTable, blur_by_coc
+from torchdof.optics import psf
 from torchdof.plan import Plan
 
 pytestmark = pytest.mark.hard
@@ -145,4 +146,4 @@ def test_a_disc_far_larger_than_the_frame_needs_no_more_memory_than_the_frame() 
     with torch.inference_mode():
         out = blur_by_coc(torch.ones(1, 1, 30, 400), torch.full((1, 1, 30, 400), 1e5))
     assert_close(out, torch.ones(1, 1, 30, 400), rtol=1e-6, atol=0.0)
-    assert kernel.disc(900.0, size=61).shape == (61, 61)
+    assert psf.disc(900.0, size=61).shape == (61, 61)

@@ -70,7 +70,7 @@ def main() -> None:
     cases, exported = beside("cases"), beside("exported")
     with tempfile.TemporaryDirectory() as folder:
         file = exported.Exported(Path(folder), cases.CAMERA)
-    rows = table(cases, lambda case: exported.measure(file, cases, case))
+    rows = table(cases, lambda case: exported.worst_error(file, cases, case))
     head = HEAD.format(
         half=2**-11,
         layers=len(file.portable.plan.nodes),

@@ -1,0 +1,319 @@
+"""What whole frames, crops, batches and gradients cost, beside the goals of this project.
+
+    python examples/benchmarks/goals.py SCENES --out results
+
+``SCENES`` is a folder of scenes as for ``torchdof bench --truth``. It takes minutes, and 8 GB of memory.
+
+What is compared is timed in turns, so that whatever else the machine does meets both sides alike; each figure is the
+median, and the interquartile range, of the ratios within the turns.
+"""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
+
+from torchdof.bench import memory
+from torchdof.bench.inputs import Subject, shipped
+from torchdof.bench.report import Report, ReportTable, csv_of, existing_folder, machine
+from torchdof.bench.speed import Setting, exact, render_subject, unit_work
+from torchdof.bench.timer import in_turns, median_and_spread, timed
+from torchdof.cli.errors import told_in_one_sentence
+from torchdof.module import blur_by_coc
+from torchdof.reference import metrics
+from torchdof.reference.scenes import read_scenes
+from torchdof.validation import whole
+
+__all__ = ["Figure", "compare", "measure_goals", "subjects"]
+
+_FRAME, _HALF, _DOUBLE, _LARGEST = (1080, 1920), (540, 960), (2160, 3840), (4320, 7680)  # height, width
+_CROP_PX, _FOLD_PX = 512, 64
+_FINE, _LOOSE = 1 / 255, 4 / 255
+_GOALS = {8.0: (10.0, 5.0), 16.0: (12.0, 6.0), 32.0: (16.0, 8.0), 64.0: (math.nan, math.nan)}  # of Y, by radius in px
+_USUAL_PX, _WIDE_PX, _CROP_RADIUS_PX = 16.0, 64.0, 8.0
+_WITHIN = 8.0  # tolerances: the error of all but a thousandth of the pixels
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """What was measured on one scene: the median of the turns, their interquartile range, and the goal.
+
+    Args:
+        scene: Its name.
+        what: What was measured.
+        unit: Unit of the next three; ``times`` for a ratio.
+        value: Median.
+        spread: Interquartile range.
+        goal: What it should be at most, or at least; NaN where none was set.
+        at_least: Which of the two.
+    """
+
+    scene: str
+    what: str
+    unit: str
+    value: float
+    spread: float
+    goal: float = math.nan
+    at_least: bool = False
+
+    @property
+    def missed(self) -> bool:
+        """Whether there is a goal and it was not reached."""
+        return self.value < self.goal if self.at_least else self.value > self.goal
+
+
+def subjects(scenes: Path) -> list[Subject]:
+    """What is measured: the built-in scene, and of each scene of a folder the setting in the middle.
+
+    Raises:
+        OSError: If there is no scene.
+        ValueError: If one is not as :func:`torchdof.reference.scenes.read_scenes` takes it.
+    """
+    measured = [shipped(*_FRAME)]
+    for _, settings in itertools.groupby(read_scenes(scenes), lambda scene: scene.name.rpartition("/")[0]):
+        cases = list(settings)
+        middle = cases[len(cases) // 2]
+        subject = Subject(middle.name, middle.image, middle.coc_px).resized(*_FRAME)
+        if not subject.radius_px > 0:
+            raise ValueError(f"{subject.name}: is all in focus; goals are for scenes with blur, leave it out")
+        measured.append(subject)
+    return measured
+
+
+def compare(scenes: Path, out: Path | None, repeat: int) -> None:
+    """Measures every figure on every scene, prints and writes the tables.
+
+    Args:
+        scenes: Folder of scenes, as :func:`torchdof.reference.scenes.read_scenes` takes it.
+        out: Folder for ``goals.csv`` and ``goals.md``; None: the table is printed only.
+        repeat: How many turns, after one more.
+
+    Raises:
+        ValueError: If input is wrong.
+        OSError: If there is no scene, or a file cannot be written.
+    """
+    whole("--repeat", repeat, 1, 10000)
+    progress, figures = Console(stderr=True), []
+    works = [
+        *(functools.partial(measure_goals, subject, repeat) for subject in subjects(scenes)),
+        functools.partial(_quad, repeat),
+    ]
+    for work in track(works, "scenes", console=progress, transient=True, disable=not progress.is_terminal):
+        of_scene = work()
+        _show(of_scene)  # the next one takes a minute
+        figures += of_scene
+    if out is not None:
+        _report(figures, repeat).write(out)
+    Console().print(f"{machine()}. {_remark(figures, repeat)}", markup=False, highlight=False)
+
+
+def measure_goals(subject: Subject, repeat: int) -> list[Figure]:
+    """Every figure of one scene.
+
+    Args:
+        subject: A frame of 1920 x 1080, not all in focus.
+        repeat: How many turns, after one more.
+    """
+    parts = (_errors(subject), _frames(subject, repeat), _crops(subject, repeat), _sizes(subject, repeat))
+    return [dataclasses.replace(figure, scene=subject.name) for part in parts for figure in part]
+
+
+def _errors(subject: Subject) -> Iterator[Figure]:
+    """Whether the renderings that are timed are right."""
+    subject, size = subject.blurred(_USUAL_PX), _size(_FRAME)
+    for occlusion in (True, False):
+        shown, wanted = (
+            metrics.display(image)
+            for image in (render_subject(subject, Setting("layered", occlusion, _FINE)), exact(subject, occlusion))
+        )
+        error = (shown.double() - wanted.double()).abs()
+        rms, rare = math.sqrt(float(error.square().mean())), float(torch.quantile(error, 0.999))
+        what = f"{size}, {_USUAL_PX:g} px{_without(occlusion)}: error at 1/255"
+        yield _figure(f"{what}, RMS", "of 255", [255 * rms], 255 * _FINE)
+        yield _figure(f"{what}, of 99.9 % of all values", "of 255", [255 * rare], 255 * _FINE * _WITHIN)
+
+
+def _frames(subject: Subject, repeat: int) -> Iterator[Figure]:
+    """A frame by its radius, in Y and beside other tolerances, radii and methods."""
+    works: dict[Hashable, Callable[[], object]] = {"Y": unit_work()}
+    works["in focus"] = functools.partial(render_subject, subject.blurred(0.0), Setting("layered", True, _FINE))
+    usual = subject.blurred(_USUAL_PX)
+    part = usual.crop(_FOLD_PX, widest=True)  # its kernels are as large as the frame's
+    for occlusion in (True, False):
+        setting = Setting("layered", occlusion, _FINE)
+        for radius in _GOALS:
+            works[radius, occlusion] = functools.partial(render_subject, subject.blurred(radius), setting)
+        works["loose", occlusion] = functools.partial(render_subject, usual, Setting("layered", occlusion, _LOOSE))
+        works["fold", occlusion] = functools.partial(render_subject, part, Setting("fold", occlusion, _FINE))
+    timings = in_turns(works, repeat)
+    frame = _size(_FRAME)
+    yield _figure("Y", "ms", [1e3 * seconds for seconds in timings["Y"]])
+    yield _figure(f"{frame}, all in focus", "Y", _ratios(timings, "in focus", "Y"), 0.5)
+    for number, occlusion in enumerate((True, False)):
+        for radius, goals in _GOALS.items():
+            what = f"{frame}, {radius:g} px{_without(occlusion)}"
+            yield _figure(what, "Y", _ratios(timings, (radius, occlusion), "Y"), goals[number])
+    for occlusion in (True, False):
+        wide = _ratios(timings, (_WIDE_PX, occlusion), (_USUAL_PX, occlusion))
+        yield _figure(f"radius {_WIDE_PX:g} over {_USUAL_PX:g} px{_without(occlusion)}", "times", wide, 1.3)
+        loose = _ratios(timings, (_USUAL_PX, occlusion), ("loose", occlusion))
+        yield _figure(f"4/255 faster than 1/255{_without(occlusion)}", "times", loose, 1.5, at_least=True)
+        share = usual.coc_px.numel() / part.coc_px.numel()
+        fold = [share * ratio for ratio in _ratios(timings, ("fold", occlusion), (_USUAL_PX, occlusion))]
+        yield _figure(f"layered faster than fold, by pixel{_without(occlusion)}", "times", fold, 50.0, at_least=True)
+
+
+def _crops(subject: Subject, repeat: int) -> Iterator[Figure]:
+    """A crop, and what gradients cost on it."""
+    part = subject.blurred(_CROP_RADIUS_PX).crop(_CROP_PX)
+    wide = subject.blurred(_USUAL_PX).crop(_CROP_PX)
+    image, coc_px = (x.clone().requires_grad_() for x in (wide.image, wide.coc_px))
+
+    def forward() -> Tensor:
+        return blur_by_coc(image, coc_px, tolerance=_FINE)
+
+    timings = in_turns(
+        {
+            **{
+                seen: functools.partial(render_subject, part, Setting("layered", seen, _FINE)) for seen in (True, False)
+            },
+            "forward": forward,
+            "both": lambda: torch.autograd.grad(forward().square().mean(), (image, coc_px)),
+        },
+        repeat,
+    )
+    crop = f"{part.image.shape[-1]} x {part.image.shape[-2]} crop"
+    for seen in (True, False):
+        milliseconds = [1e3 * seconds for seconds in timings[seen]]
+        yield _figure(f"{crop}, {_CROP_RADIUS_PX:g} px{_without(seen)}", "ms", milliseconds, 60.0)
+    both = _ratios(timings, "both", "forward")
+    yield _figure(f"{crop}, {_USUAL_PX:g} px: forward and backward over forward", "times", both, 4.0)
+
+
+def _sizes(subject: Subject, repeat: int) -> Iterator[Figure]:
+    """Larger frames, and several of them."""
+    setting = Setting("layered", True, _FINE)
+    usual = subject.blurred(_USUAL_PX)
+    one = usual.resized(*_HALF).blurred(_USUAL_PX)
+    flips: list[list[int]] = [[], [-1], [-2], [-2, -1]]
+    items = [dataclasses.replace(one, image=one.image.flip(f), coc_px=one.coc_px.flip(f)) for f in flips]
+
+    def batch() -> Tensor:
+        with torch.inference_mode():
+            return blur_by_coc(*(torch.cat([getattr(i, x) for i in items]) for x in ("image", "coc_px")))
+
+    works: dict[Hashable, Callable[[], object]] = {
+        "frame": functools.partial(render_subject, usual, setting),
+        "double": functools.partial(render_subject, usual.resized(*_DOUBLE), setting),
+        "batch": batch,
+        "alone": lambda: [render_subject(item, setting) for item in items],
+    }
+    timings = in_turns(works, repeat)
+    yield _figure(
+        f"{_size(_DOUBLE)} over {_size(_FRAME)}, twice the radius", "times", _ratios(timings, "double", "frame"), 4.4
+    )
+    yield _figure(f"{len(items)} x {_size(_HALF)} over one by one", "times", _ratios(timings, "batch", "alone"), 1.0)
+    largest = subject.resized(*_LARGEST).blurred(_WIDE_PX)
+    peaks, seconds = [], []
+    for _ in range(2):
+        held = memory.reset_peak()
+        seconds.append(timed(functools.partial(render_subject, largest, setting))[1])
+        peaks.append((memory.peak_mb() - held) / 1024)
+    what = f"{_size(_LARGEST)}, {_WIDE_PX:g} px"
+    yield _figure(f"{what}: memory on top of the frame", "GiB", peaks, 6e9 / 2**30)
+    yield _figure(f"{what}: time", "s", seconds)
+
+
+def _quad(repeat: int) -> list[Figure]:
+    """The case of the paper: a quad on black, at one depth."""
+    n = _CROP_PX
+    image = torch.zeros(1, 3, n, n)
+    image[..., 2 * n // 5 : 3 * n // 5, 2 * n // 5 : 3 * n // 5] = 1.0
+    subject = Subject("quad on black", image, torch.full((1, 1, n, n), _CROP_RADIUS_PX))
+    timings = in_turns({"": functools.partial(render_subject, subject, Setting("layered", True, _FINE))}, repeat)
+    milliseconds = [1e3 * seconds for seconds in timings[""]]
+    what = f"{_size((n, n))}, {_CROP_RADIUS_PX:g} px everywhere"
+    return [dataclasses.replace(_figure(what, "ms", milliseconds, 26.4), scene=subject.name)]
+
+
+def _ratios(timings: Mapping[Hashable, Sequence[float]], over: Hashable, under: Hashable) -> list[float]:
+    return [a / b for a, b in zip(timings[over], timings[under], strict=True)]
+
+
+def _figure(what: str, unit: str, values: Sequence[float], goal: float = math.nan, at_least: bool = False) -> Figure:
+    return Figure("", what, unit, *median_and_spread(values), goal, at_least)
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[1]} x {size[0]}"
+
+
+def _without(occlusion: bool) -> str:
+    return "" if occlusion else ", without occlusion"
+
+
+def _goal(figure: Figure) -> str:
+    return "" if math.isnan(figure.goal) else f"at {'least' if figure.at_least else 'most'} {figure.goal:.3g}"
+
+
+def _measured(figure: Figure) -> str:
+    value, spread = (f"{x:.0f}" if x >= 100 else f"{x:.{n}g}" for x, n in ((figure.value, 3), (figure.spread, 2)))
+    return f"{value} ± {spread}"
+
+
+def _lines(figures: Sequence[Figure]) -> list[list[str]]:
+    """A line for each figure, a column for each scene; what misses its goal is bold."""
+    scenes = list(dict.fromkeys(figure.scene for figure in figures))
+    lines: dict[str, list[str]] = {}
+    for figure in figures:
+        line = lines.setdefault(figure.what, [figure.what, figure.unit, _goal(figure), *("" for _ in scenes)])
+        bold = "**" if figure.missed else ""
+        line[3 + scenes.index(figure.scene)] = f"{bold}{_measured(figure)}{bold}"
+    return [["figure", "in", "goal", *scenes], *lines.values()]
+
+
+def _remark(figures: Sequence[Figure], repeat: int) -> str:
+    asked = [figure for figure in figures if not math.isnan(figure.goal)]
+    return (
+        f"Median and spread (interquartile range) of {repeat} turns after one more, each figure from within the turns; "
+        "the errors from one rendering, memory and time of the largest frame from two. Y: one depthwise 17 x 17 "
+        f"convolution of 1 x 16 x 540 x 960. Goals missed: {sum(f.missed for f in asked)} of {len(asked)}."
+    )
+
+
+def _report(figures: Sequence[Figure], repeat: int) -> Report:
+    remark = f"{_remark(figures, repeat)} They are bold."
+    table = ReportTable("Figures", _lines(figures))
+    return Report("goals", "Cost beside the goals", [f"{machine()}.", remark, table], csv_of(figures))
+
+
+def _show(figures: Sequence[Figure]) -> None:
+    """Prints the figures of one scene."""
+    lines = [["figure", "measured", "in", "goal", ""]]
+    for figure in figures:
+        missed = "missed" if figure.missed else ""
+        lines.append([figure.what, _measured(figure), figure.unit, _goal(figure), missed])
+    ReportTable(figures[0].scene, lines, words=("figure", "in", "goal", "")).show()
+
+
+def main(
+    scenes: Annotated[Path, typer.Argument(help="Folder with scenes, as for torchdof bench --truth.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for goals.csv and goals.md.")] = None,
+    repeat: Annotated[int, typer.Option(help="Timed renderings of each.", min=1)] = 5,
+) -> None:
+    """What whole frames, crops, batches and gradients cost, beside what this project wants them to cost at most."""
+    with told_in_one_sentence():
+        compare(scenes, existing_folder(out), repeat)
+
+
+if __name__ == "__main__":
+    typer.run(main)

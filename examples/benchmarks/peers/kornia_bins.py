@@ -1,0 +1,42 @@
+"""A loop of kornia's filter2d over 16 radii, each with a disc, and for every pixel the nearest of the 16 results."""
+
+import kornia
+import torch
+from kornia.filters import filter2d
+from torch import Tensor
+
+NAME = "kornia, 16 bins"
+NOTE = "float32; 16 radii from 0 to the largest, discs with smooth edges. Time: the whole call."
+_BINS = 16
+_FINE = 8  # samples along a pixel
+
+
+def available() -> None:
+    """Kornia comes with torchdof."""
+
+
+def version() -> str:
+    """Version of kornia."""
+    return str(kornia.__version__)
+
+
+def blur(image: Tensor, coc_px: Tensor) -> Tensor:
+    """Blurs ``image`` ``[1, C, H, W]`` by ``coc_px`` ``[1, 1, H, W]``."""
+    radius = coc_px.abs()
+    radii = torch.linspace(0.0, float(radius.max()), _BINS)
+    nearest = (radius[..., None] - radii).abs().argmin(-1)
+    out = torch.zeros_like(image)
+    for index, size in enumerate(radii.tolist()):
+        if bool((nearest == index).any()):
+            blurred = image if size < 0.5 else filter2d(image, _disc(size), border_type="replicate")
+            out = torch.where(nearest == index, blurred, out)
+    return out
+
+
+def _disc(radius: float) -> Tensor:
+    """A disc's share of each pixel, ``[1, k, k]``."""
+    half = int(radius + 0.5)
+    place = (torch.arange((2 * half + 1) * _FINE) + 0.5) / _FINE - half - 0.5
+    inside = (place[:, None] ** 2 + place**2 <= radius**2).float()
+    share = torch.nn.functional.avg_pool2d(inside[None], _FINE)
+    return share / share.sum()

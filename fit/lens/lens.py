@@ -1,0 +1,254 @@
+"""Lens prescriptions: the list of surfaces a lens is made of, and what first-order optics says about it.
+
+Light travels to the right, along +z; z = 0 at the first surface's vertex. A positive radius is convex to the object.
+Lengths are in millimetres. :mod:`torchdof.fit.lens.prescription` describes the file format.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchdof.validation import show
+
+from ..result import Array
+from . import prescription
+
+__all__ = ["RGB_UM", "Lens", "Paraxial"]
+
+
+D_UM, F_UM, C_UM = 0.58756, 0.48613, 0.65627
+RGB_UM = (C_UM, 0.54607, F_UM)
+"""Wavelengths that stand for red, green and blue, in micrometres: the lines C, e and F."""
+
+_SHIPPED = Path(__file__).parent / "lenses"
+_MARKED = 1.03  # a lens is sold by a rounded f-number: f/2.03 is marked f/2
+
+
+@dataclass(frozen=True)
+class Paraxial:
+    """First-order properties of a lens in air, object at infinity. Millimetres; positions along +z.
+
+    Attributes:
+        focal_length: rear focal length f.
+        back_focal: rear focal point, from the last vertex (the back focal distance).
+        front_focal: front focal point, from the first vertex (negative in front of it).
+        front_principal: front principal plane H, from the first vertex. A thin lens's object distances start here.
+        rear_principal: rear principal plane H', from the last vertex. A thin lens's image distances start here.
+        entrance_pupil: the stop's image in object space, from the first vertex.
+        entrance_pupil_diameter: its diameter A.
+        exit_pupil: the stop's image in image space, from the last vertex; ``inf`` for a telecentric lens.
+        exit_pupil_diameter: its diameter.
+        f_number: f / A.
+    """
+
+    focal_length: float
+    back_focal: float
+    front_focal: float
+    front_principal: float
+    rear_principal: float
+    entrance_pupil: float
+    entrance_pupil_diameter: float
+    exit_pupil: float
+    exit_pupil_diameter: float
+    f_number: float
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """Spherical surfaces on one axis with an aperture stop, in air.
+
+    Args:
+        radius: Radii of curvature ``[S]``, ``inf`` for a flat surface and for the stop.
+        thickness: Distance from each surface to the next ``[S]``, >= 0; the last is not used.
+        index: Refractive index behind each surface at the d line ``[S]``, >= 1; 1 behind the last.
+        abbe: Abbe number V of the medium behind each surface ``[S]``, ``inf`` where there is no dispersion.
+        diameter: Clear diameter of each surface ``[S]``, > 0.
+        stop: Number of the surface that is the aperture stop.
+        name: Short name.
+        source: Where the numbers are from.
+
+    Raises:
+        ValueError: If a number is outside its range.
+
+    Reference:
+        Kolb, Mitchell, Hanrahan, "A realistic camera model for computer graphics", SIGGRAPH 1995, section 3.1.
+
+    Example:
+        >>> lens = Lens.read("double_gauss_50mm")
+        >>> round(lens.paraxial().focal_length, 4), round(lens.paraxial().back_focal, 4)
+        (50.3582, 36.1059)
+    """
+
+    radius: Array
+    thickness: Array
+    index: Array
+    abbe: Array
+    diameter: Array
+    stop: int
+    name: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the numbers, so that whatever is computed later is about a lens."""
+        columns = {name: getattr(self, name) for name in (*prescription.COLUMNS, "abbe")}
+        for name, value in columns.items():
+            try:
+                array = np.asarray(value)
+                if array.dtype.kind not in "iuf":
+                    raise TypeError
+                array = array.astype(np.float64)
+            except (TypeError, ValueError, OverflowError):
+                raise ValueError(f"{name} must hold one number a surface, got {show(value)}") from None
+            if array.ndim != 1 or array.shape != np.shape(self.radius):
+                raise ValueError(f"{name} must hold one number a surface, got shape {list(array.shape)}")
+            object.__setattr__(self, name, array)
+        if isinstance(self.stop, bool) or not isinstance(self.stop, int) or not 0 <= self.stop < len(self.radius):
+            raise ValueError(
+                f"stop must be the number of a surface (0 to {len(self.radius) - 1}), got {show(self.stop)}"
+            )
+        for i in range(len(self.radius)):
+            for name, value in columns.items():
+                if wrong := prescription.wrong(name, float(value[i])):
+                    raise ValueError(f"surface {i}: {wrong}")
+        if self.index[-1] != 1.0:
+            raise ValueError(f"the index behind the last surface must be 1 (air), got {self.index[-1]:g}")
+
+    @classmethod
+    def read(cls, source: str | os.PathLike[str]) -> Lens:
+        """Read a prescription from a file, or a shipped one by its name.
+
+        Args:
+            source: Path of a file, or a name: ``"double_gauss_50mm"``, ``"wide_22mm"``, ``"telephoto_250mm"``.
+
+        Raises:
+            ValueError: If the content is not a prescription; the message names file, line and column.
+            FileNotFoundError: If there is neither such a file nor such a shipped lens.
+        """
+        if not isinstance(source, str | os.PathLike):
+            raise ValueError(f"source must be the name or the path of a prescription, got {show(source)}")
+        path = Path(source)
+        if not path.suffix and not path.exists():
+            path = _SHIPPED / f"{path}.txt"
+        if not path.is_file():
+            shipped = ", ".join(sorted(p.stem for p in _SHIPPED.glob("*.txt")))
+            raise FileNotFoundError(f"no lens {str(source)!r}: neither a file nor one of the shipped ({shipped})")
+        try:
+            columns, stop, comment = prescription.parse(path.read_text(encoding="utf-8"))
+            return cls(**columns, stop=stop, name=path.stem, source=comment)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    @property
+    def vertices(self) -> Array:
+        """Position of each surface's vertex on the axis ``[S]``; the first is 0."""
+        return np.concatenate([[0.0], np.cumsum(self.thickness[:-1])])
+
+    @property
+    def dispersive(self) -> bool:
+        """Whether any glass has an Abbe number."""
+        return bool(np.isfinite(self.abbe).any())
+
+    def indices(self, wavelength_um: float | None = None) -> Array:
+        """Refractive indices along the light's way ``[S + 1]``: before the first surface (air), then behind each.
+
+        Cauchy's two terms, ``n = a + b / wavelength^2``, through the index at d and with the dispersion
+        ``n_F - n_C = (n_d - 1) / V``. None is the d line.
+        """
+        index = self.index
+        if wavelength_um is not None:
+            if not 0.3 <= wavelength_um <= 1.2:
+                raise ValueError(f"wavelength_um must be in micrometres, 0.3 to 1.2, got {wavelength_um}")
+            share = (wavelength_um**-2 - D_UM**-2) / (F_UM**-2 - C_UM**-2)
+            index = index + (index - 1.0) / self.abbe * share
+        return np.concatenate([[1.0], index])
+
+    def matrix(self, first: int, last: int, wavelength_um: float | None = None) -> Array:
+        """Ray matrix ``[2, 2]`` on (height, angle) from just before surface ``first`` to just behind ``last - 1``."""
+        n = self.indices(wavelength_um)
+        matrix = np.eye(2)
+        for i in range(first, last):
+            if i > first:
+                matrix = np.array([[1.0, self.thickness[i - 1]], [0.0, 1.0]]) @ matrix
+            power = (n[i + 1] - n[i]) / self.radius[i]
+            matrix = np.array([[1.0, 0.0], [-power / n[i + 1], n[i] / n[i + 1]]]) @ matrix
+        return matrix
+
+    def paraxial(self, wavelength_um: float | None = None) -> Paraxial:
+        """First-order properties.
+
+        Raises:
+            ValueError: If the lens does not converge light.
+        """
+        last = len(self.radius)
+        a, _, c, d = self.matrix(0, last, wavelength_um).ravel()
+        if c >= 0:
+            raise ValueError(f"lens {self.name!r} must have a positive focal length: it does not converge light")
+        focal = -1.0 / c
+        front = self._to_stop(wavelength_um)
+        rear = self.matrix(self.stop, last, wavelength_um)
+        aperture = self.diameter[self.stop]
+        entrance = aperture / abs(front[0, 0])
+        # an image of the stop's centre: height 0 at the stop, whatever the angle
+        exit_at = -rear[0, 1] / rear[1, 1] if rear[1, 1] else math.inf
+        exit_diameter = abs(rear[0, 0] + exit_at * rear[1, 0]) * aperture if math.isfinite(exit_at) else math.inf
+        return Paraxial(
+            focal_length=float(focal),
+            back_focal=float(a * focal),
+            front_focal=float(-d * focal),
+            front_principal=float((1.0 - d) * focal),
+            rear_principal=float((a - 1.0) * focal),
+            entrance_pupil=float(front[0, 1] / front[0, 0]),
+            entrance_pupil_diameter=float(entrance),
+            exit_pupil=float(exit_at),
+            exit_pupil_diameter=float(exit_diameter),
+            f_number=float(focal / entrance),
+        )
+
+    def with_stop(self, diameter: float) -> Lens:
+        """The lens with its stop opened or closed to a diameter in millimetres."""
+        changed = self.diameter.copy()
+        changed[self.stop] = diameter
+        return dataclasses.replace(self, diameter=changed)
+
+    def with_f_number(self, f_number: float) -> Lens:
+        """The lens stopped down so that its paraxial f-number is ``f_number``.
+
+        A lens is sold by a rounded f-number. An ``f_number`` up to 3 % below that of the open stop means fully open.
+
+        Raises:
+            ValueError: If the lens cannot be opened that far.
+        """
+        _check_positive("f_number", f_number)
+        open_at = self.paraxial().f_number
+        if f_number * _MARKED < open_at:
+            raise ValueError(f"f_number must be at least {open_at:.3g} for lens {self.name!r}, got {f_number:g}")
+        return self.with_stop(self.diameter[self.stop] * min(1.0, open_at / f_number))
+
+    def scaled(self, focal_length_mm: float) -> Lens:
+        """The lens enlarged or shrunk as a whole to another focal length; its f-number stays."""
+        _check_positive("focal_length_mm", focal_length_mm)
+        factor = focal_length_mm / self.paraxial().focal_length
+        return dataclasses.replace(
+            self, radius=self.radius * factor, thickness=self.thickness * factor, diameter=self.diameter * factor
+        )
+
+    def lines(self) -> list[str]:
+        """The surfaces as lines of a prescription file."""
+        return prescription.lines(self.radius, self.thickness, self.index, self.abbe, self.diameter, self.stop)
+
+    def _to_stop(self, wavelength_um: float | None) -> Array:
+        if self.stop == 0:
+            return np.eye(2)
+        front = self.matrix(0, self.stop, wavelength_um)
+        return np.array([[1.0, self.thickness[self.stop - 1]], [0.0, 1.0]]) @ front
+
+
+def _check_positive(name: str, value: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1e-9 < value < 1e9:
+        raise ValueError(f"{name} must be positive and finite (below 1e9), got {show(value)}")

@@ -1,0 +1,112 @@
+"""The text of a lens prescription: a table of surfaces, front to rear, one a line.
+
+::
+
+    # source: US patent 2,673,491 (Tronnier)
+    # radius  thickness  index  diameter
+    29.475    3.76       1.67   25.2
+    0         4.5        0      17.1
+
+Millimetres. ``thickness`` is the distance to the next surface, ``index`` the refractive index behind the surface and
+``diameter`` the clear diameter. Radius 0 is the aperture stop (its index 0: unchanged), ``inf`` a flat surface.
+``1.67/47.1`` is an index at 587.56 nm (the d line) with its Abbe number V; without one the glass has the same index at
+any wavelength. ``#`` starts a comment; ``# source:`` is kept.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..result import Array
+
+__all__ = ["COLUMNS", "lines", "parse", "wrong"]
+
+COLUMNS = ("radius", "thickness", "index", "diameter")
+"""The columns of a line."""
+
+
+def parse(text: str) -> tuple[dict[str, Array], int, str]:
+    r"""Read the text of a prescription.
+
+    Returns:
+        The columns by name (``radius``, ``thickness``, ``index``, ``abbe``, ``diameter``), the number of the stop's
+        surface, and the source.
+
+    Raises:
+        ValueError: If it is not a prescription; the message names line and column.
+
+    Example:
+        >>> columns, stop, _ = parse("50 5 1.5/64 20 \n 0 1 0 18 \n -50 0 1 20")
+        >>> columns["abbe"].tolist(), stop
+        ([64.0, 64.0, inf], 1)
+    """
+    rows: list[list[float]] = []
+    stop, source = None, ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        content, _, comment = line.partition("#")
+        if comment.strip().startswith("source:"):
+            source = comment.split(":", 1)[1].strip()
+        fields = content.split()
+        if not fields:
+            continue
+        if len(fields) != len(COLUMNS):
+            raise ValueError(f"line {number}: expected the columns {' '.join(COLUMNS)}, got {len(fields)}: {line!r}")
+        row = [_number(text, column, number) for text, column in zip(fields, COLUMNS, strict=True)]
+        radius, thickness, (index, abbe), diameter = row[0][0], row[1][0], row[2], row[3][0]
+        before = rows[-1][2:4] if rows else [1.0, math.inf]
+        if radius == 0.0:
+            if stop is not None:
+                raise ValueError(f"line {number}, column radius: a second stop (radius 0); write inf for flat")
+            if index not in (0.0, before[0]):
+                raise ValueError(f"line {number}, column index: the stop does not change the index, write 0")
+            stop, radius, (index, abbe) = len(rows), math.inf, before
+        for column, value in zip(COLUMNS, (radius, thickness, index, diameter), strict=True):
+            if problem := wrong(column, value):
+                raise ValueError(f"line {number}, column {column}: {problem}")
+        rows.append([radius, thickness, index, abbe, diameter])
+    if stop is None:
+        raise ValueError(f"no aperture stop among {len(rows)} surfaces; one line must have radius 0")
+    names = ("radius", "thickness", "index", "abbe", "diameter")
+    return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}, stop, source
+
+
+def lines(radius: Array, thickness: Array, index: Array, abbe: Array, diameter: Array, stop: int) -> list[str]:
+    """Surfaces as lines of a prescription, the inverse of :func:`parse`."""
+    written = []
+    for i, row in enumerate(zip(radius, thickness, index, abbe, diameter, strict=True)):
+        glass = f"{row[2]:.9g}/{row[3]:.9g}" if math.isfinite(row[3]) else f"{row[2]:.9g}"
+        curve, glass = ("0", "0") if i == stop else (f"{row[0]:.9g}", glass)
+        written.append(f"{curve} {row[1]:.9g} {glass} {row[4]:.9g}")
+    return written
+
+
+def _number(text: str, column: str, line: int) -> tuple[float, float]:
+    """A field's number, and for an index its Abbe number (inf without one)."""
+    value, slash, abbe = text.partition("/")
+    try:
+        if slash and column != "index":
+            raise ValueError
+        pair = float(value), float(abbe) if slash else math.inf
+    except ValueError:
+        kind = "a number or index/V" if column == "index" else "a number"
+        raise ValueError(f"line {line}, column {column}: expected {kind}, got {text!r}") from None
+    if not pair[1] > 0:
+        raise ValueError(f"line {line}, column {column}: the Abbe number must be positive, got {text!r}")
+    return pair
+
+
+def wrong(column: str, value: float) -> str:
+    """What is wrong with a number of a column, or nothing."""
+    if column == "radius" and (math.isnan(value) or value == 0.0):
+        return f"radius must be a number other than 0, got {value:g}"
+    if column == "thickness" and not 0 <= value < math.inf:
+        return f"thickness must be >= 0 and finite, got {value:g}"
+    if column == "index" and not 1 <= value < 5:
+        return f"index must be between 1 and 5 (0 at the stop only), got {value:g}"
+    if column == "abbe" and not value > 0:
+        return f"the Abbe number must be positive, got {value:g}"
+    if column == "diameter" and not 0 < value < math.inf:
+        return f"diameter must be positive and finite, got {value:g}"
+    return ""

@@ -1,0 +1,165 @@
+"""The distances of one capture, fitted so that each informs its neighbours."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from torchdof.optics.psf import FAMILIES, LENGTHS
+
+from ..problems import FitWarning
+from ..result import Array, BlurFit
+from .manifest import Capture
+from .pair import fit_pair
+
+__all__ = ["fit_distances", "fit_one"]
+
+_KNOTS = 33
+_SWEEPS = 2
+
+
+def fit_distances(
+    pairs: list[Capture],
+    focus_m: float,
+    family: str,
+    smooth: bool,
+    done: Callable[[Capture, BlurFit], None],
+) -> list[BlurFit]:
+    """Fit all pairs with one family.
+
+    Args:
+        pairs: by increasing distance.
+        focus_m: distance of the focus.
+        family: of the kernel.
+        smooth: whether neighbouring distances inform each other after the first fits.
+        done: called after each first fit.
+
+    Returns:
+        One fit a pair.
+    """
+    fits: dict[int, BlurFit] = {}
+    for i, before in _towards_focus([p.distance_m for p in pairs], focus_m):
+        start = _scaled(fits[before], pairs[before], pairs[i], focus_m) if before is not None else None
+        fits[i] = fit_one(pairs[i], focus_m, family, start)
+        done(pairs[i], fits[i])
+    if smooth:
+        join = _aligned if family == "radial" else _together
+        fits = join(pairs, focus_m, family, fits)
+    return [fits[i] for i in range(len(pairs))]
+
+
+def fit_one(
+    pair: Capture,
+    focus_m: float,
+    family: str,
+    start: BlurFit | None,
+    accuracy_db: float = 45.0,
+    prior: dict[str, tuple[float, float]] | None = None,
+    reach: float | None = None,
+) -> BlurFit:
+    """Fit one pair, its size expected from the distances."""
+    return fit_pair(
+        pair.sharp,
+        pair.blurred,
+        family,
+        accuracy_db=accuracy_db,
+        magnification=focus_m / pair.distance_m,
+        white=pair.white,
+        start=start,
+        prior=prior,
+        knots=_KNOTS if family == "radial" else None,
+        reach=reach,
+        files=pair.files,
+    )
+
+
+def _towards_focus(distances: list[float], focus_m: float) -> list[tuple[int, int | None]]:
+    """Indices from both ends towards focus, each with the neighbour it starts from."""
+    near = [i for i, d in enumerate(distances) if d < focus_m]
+    far = [i for i, d in enumerate(distances) if d > focus_m][::-1]
+    return [(i, side[k - 1] if k else None) for side in (near, far) for k, i in enumerate(side)]
+
+
+def _scaled(fit: BlurFit, before: Capture, after: Capture, focus_m: float) -> BlurFit:
+    ratio = abs(1 / focus_m - 1 / after.distance_m) / abs(1 / focus_m - 1 / before.distance_m)
+    params = {k: v * ratio if k in LENGTHS else v for k, v in fit.params.items()}
+    return replace(fit, params=params)
+
+
+def _together(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
+    """Fit every pair once more, expecting what its neighbours on the same side of focus say.
+
+    Parameters that trade with each other (a rim's height and its steepness) are thus told alike at all distances,
+    while what the pictures determine stays as they say: the expectation is loose.
+    """
+    place = np.array([1 / focus_m - 1 / p.distance_m for p in pairs])
+    fits = dict(fits)
+    for _ in range(_SWEEPS):
+        for i in sorted(fits, key=lambda k: -abs(place[k])):
+            sides = [k for k in fits if place[k] * place[i] > 0]
+            lower = [k for k in sides if abs(place[k]) < abs(place[i])]
+            upper = [k for k in sides if abs(place[k]) > abs(place[i])]
+            inner = max(lower, key=lambda k: abs(place[k]), default=None)
+            outer = min(upper, key=lambda k: abs(place[k]), default=None)
+            if outer is None and inner is None:
+                continue
+            prior = {n: _expected(n, i, inner, outer, place, fits) for n in FAMILIES[family]}
+            with warnings.catch_warnings():
+                # the first fit of this pair has said it
+                warnings.simplefilter("ignore", FitWarning)
+                fits[i] = fit_one(pairs[i], focus_m, family, fits[i], prior=prior)
+    return fits
+
+
+def _aligned(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
+    """Fit free profiles once more, each up to a radius on one line over the circle of confusion.
+
+    Between nodes a table mixes values at equal shares of the radius: shapes are alike there only if the radii follow
+    one rule.
+    """
+    place = np.array([1 / focus_m - 1 / p.distance_m for p in pairs])
+    fits = dict(fits)
+    for sign in (-1, 1):
+        side = [i for i in fits if place[i] * sign > 0]
+        if len(side) < 2:
+            continue
+        x, ends = np.abs(place[side]), np.array([_end(fits[i]) for i in side])
+        # near focus a profile may have any end: the outer nodes set the line, which is lifted to hold theirs
+        slope, start = np.polyfit(x, ends, 1, w=x)
+        lift = max(float(np.max((ends - slope * x - start)[x > 0.25 * x.max()])), 0.0)
+        for i, defocus, end in zip(side, x, ends, strict=True):
+            with warnings.catch_warnings():
+                # the first fit of this pair has said it
+                warnings.simplefilter("ignore", FitWarning)
+                reach = max(float(slope * defocus + start + lift), float(end), 1.0)
+                fits[i] = fit_one(pairs[i], focus_m, family, fits[i], reach=reach)
+    return fits
+
+
+def _end(fit: BlurFit) -> float:
+    """Radius in px that holds all but a thousandth of a free profile's light."""
+    values, radius = np.asarray(fit.params["values"]), float(fit.params["radius"])
+    r = np.linspace(0, radius, 1001)
+    light = np.cumsum(np.interp(r, np.linspace(0, radius, values.size), values) * r)
+    return float(r[np.searchsorted(light, 0.999 * light[-1])]) + radius / (values.size - 1)
+
+
+def _expected(
+    name: str, i: int, inner: int | None, outer: int | None, place: Array, fits: dict[int, BlurFit]
+) -> tuple[float, float]:
+    """Value and standard deviation expected of a parameter: on the line between the neighbours, as the table has it."""
+    length = name in LENGTHS
+    if inner is None or outer is None:
+        only = outer if inner is None else inner
+        value = float(fits[only].params[name]) * (abs(place[i] / place[only]) if length else 1.0)  # type: ignore[index]
+        loose = 3.0
+    else:
+        share = (place[i] - place[inner]) / (place[outer] - place[inner])
+        value = float((1 - share) * fits[inner].params[name] + share * fits[outer].params[name])
+        loose = 1.0
+    size = max(float(fits[i].params[n]) for n in fits[i].params if n in LENGTHS)
+    deviation = {"b": 0.1, "m": 0.3}.get(name, 0.05 * size + 0.05)
+    return value, loose * deviation

@@ -1,0 +1,136 @@
+"""An ideal dot: a uniform disc with a soft edge, integrated over the pixels, fitted to a sharp picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..result import Array
+from ..solve import best_of
+from .dot import Dot, noise_inside
+from .profile_fit import inverse
+
+__all__ = ["STEPS", "Edge", "draw_edge", "soft_edge"]
+
+STEPS = {"radius": 1e-2, "softness": 0.1}
+"""Steps in px over which an edge's errors are passed on."""
+
+_FINE = 6  # samples across a pixel near the edge
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Where a dot ends, and how softly.
+
+    Attributes:
+        x: the dot's centre in px.
+        y: the same, downwards.
+        radius: px, where the level is half.
+        softness: px, sigma of the edge beyond the pixel's own.
+        level: of the dot above its background.
+        exponent: 1 in linear light; of the edge's levels, where it was fitted.
+        covariance: of radius and softness `[2, 2]`.
+        rms: of what the ideal dot does not explain, over the dot's peak.
+        misfit: the same over the noise expected there.
+    """
+
+    x: float
+    y: float
+    radius: float
+    softness: float
+    level: float
+    exponent: float
+    covariance: Array
+    rms: float
+    misfit: float
+
+
+def draw_edge(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:
+    """Level, 0 to 1, of a soft disc in each pixel, integrated over it.
+
+    Args:
+        rows: pixel rows `[...]`.
+        columns: pixel columns `[...]`.
+        x: centre in px.
+        y: centre in px.
+        radius: px.
+        softness: px, sigma of the edge.
+    """
+    from scipy.special import erfc
+
+    distance = np.hypot(columns - x, rows - y)
+    level = (distance < radius).astype(np.float64)
+    # within the fine grid's own step an edge is soft anyway
+    sigma = max(softness, 0.3 / _FINE)
+    band = np.abs(distance - radius) < 0.75 + 5 * sigma
+    step = (np.arange(_FINE) + 0.5) / _FINE - 0.5
+    fine = np.hypot(
+        (columns[band] - x)[:, None, None] + step[None, None, :], (rows[band] - y)[:, None, None] + step[None, :, None]
+    )
+    level[band] = (0.5 * erfc((fine - radius) / (np.sqrt(2) * sigma))).mean((1, 2))
+    return level
+
+
+def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_exponent: bool = False) -> Edge:
+    """Fit a soft disc to a dot.
+
+    Args:
+        picture: `[H, W]`.
+        dot: where the dot is.
+        white: pixels at this level or above are allowed to be brighter than they look.
+        fit_exponent: let the levels be a power of the light. A round white dot has as much light missing inside its
+            edge as there is outside; encoding (a power of about 0.45) breaks that balance and so shows itself.
+    """
+    grid: Array = np.indices(picture.shape).astype(np.float64)
+    near = np.hypot(grid[1] - dot.x, grid[0] - dot.y) <= dot.reach + 3
+    rows, columns, levels = grid[0][near], grid[1][near], (picture[near] - dot.background) / dot.peak
+    top = np.inf if white is None else (white - dot.background) / dot.peak
+
+    def model(_: Array, *p: float) -> Array:
+        dx, dy, radius, softness, level = p[:5]
+        share = draw_edge(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
+        return np.minimum(level * (share ** p[5] if fit_exponent else share), top)
+
+    def jacobian(_: Array, *p: float) -> Array:
+        params: Array = np.array(p, dtype=np.float64)
+        columns_: list[Array] = []
+        for i, h in enumerate((1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-4)[: len(p)]):
+            up, down = params.copy(), params.copy()
+            up[i], down[i] = up[i] + h, max(down[i] - h, 0.0) if i > 1 else down[i] - h
+            columns_.append((model(_, *up) - model(_, *down)) / (up[i] - down[i]))
+        return np.stack(columns_, axis=1)
+
+    bounds = ([-3, -3, 0.2, 0.0, 0.3], [3, 3, dot.reach + 3, dot.reach + 3, 30.0])
+    starts = [[0, 0, dot.radius, 0.4, 1.0], [0, 0, dot.radius, 0.3 * dot.radius + 0.1, 1.1]]
+    if fit_exponent:
+        bounds = [*bounds[0], 0.2], [*bounds[1], 3.0]
+        starts = [[0, 0, dot.radius - 0.4, s, 1.0, 0.45] for s in (0.1, 0.6, 1.5)]
+    solution = best_of(model, levels, starts, bounds, jacobian=jacobian, tolerance=1e-7)
+    residual = levels - model(levels, *solution)
+    slope = jacobian(levels, *solution)
+    # a soft edge shows by its variance: a step that is finite has a slope even where the softness is 0
+    for i, h in ((2, STEPS["radius"]), (3, STEPS["softness"])):
+        moved = solution.copy()
+        moved[i] += h
+        slope[:, i] = (model(levels, *moved) - model(levels, *solution)) / h
+    variance = float(residual @ residual) / max(levels.size - len(solution), 1)
+    expected = float(np.sqrt(np.mean(_variance(picture, dot)[near]))) / dot.peak
+    return Edge(
+        x=dot.x + float(solution[0]),
+        y=dot.y + float(solution[1]),
+        radius=float(solution[2]),
+        softness=float(solution[3]),
+        level=float(solution[4]) * dot.peak,
+        exponent=float(solution[5]) if fit_exponent else 1.0,
+        covariance=inverse(slope.T @ slope)[2:4, 2:4] * variance,
+        rms=float(np.sqrt(variance)),
+        misfit=float(np.sqrt(variance)) / expected if expected > 0 else np.inf,
+    )
+
+
+def _variance(picture: Array, dot: Dot) -> Array:
+    """Noise variance of each pixel: the background's, growing with the level to that inside the dot (shot noise)."""
+    bright = noise_inside(picture, dot)
+    level = np.clip((picture - dot.background) / dot.peak, 0, 1)
+    return np.asarray(dot.noise**2 + (max(bright[0] ** 2 - dot.noise**2, 0.0) if bright is not None else 0.0) * level)

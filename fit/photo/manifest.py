@@ -1,0 +1,272 @@
+"""Photographs of a dot at several distances: read, linearise, subtract the dark, find the dot, cut the windows."""
+
+from __future__ import annotations
+
+import math
+import os
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from torchdof.io.images import read_image
+from torchdof.validation import show
+
+from ..problems import DistanceError, FitError, ManifestError, NonFiniteError
+from ..result import Array
+from .crop import Capture, Dots, cut_pairs, size_of
+
+__all__ = ["Capture", "Captures", "read_captures", "read_pair"]
+
+Transfer = Literal["linear", "srgb"]
+
+MANIFEST = "capture.toml"
+
+
+@dataclass(frozen=True)
+class Captures:
+    """Pairs of one dot at increasing distances, and the camera that took them.
+
+    Attributes:
+        pairs: by increasing distance.
+        focus_m: distance of the sharp picture: what the lens stays focused on.
+        width_px: width of the whole frame.
+        focal_length_mm: of the lens, or None.
+        f_number: of the lens, or None.
+        sensor_width_mm: of the camera, or None.
+        name: of the table to be.
+        notes: more about the capture, for the table's provenance.
+    """
+
+    pairs: tuple[Capture, ...]
+    focus_m: float
+    width_px: int
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    sensor_width_mm: float | None = None
+    name: str = ""
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check what all later steps rely on.
+
+        Raises:
+            DistanceError: distances are not increasing, not positive, or one is that of the focus.
+            FitError: no pair, or a camera number that is not positive.
+        """
+        if not isinstance(self.pairs, Sequence) or not all(isinstance(p, Capture) for p in self.pairs):
+            raise FitError(f"pairs must be a tuple of Capture(sharp, blurred, distance_m), got {show(self.pairs)}")
+        if not self.pairs:
+            raise FitError("captures hold no pair of pictures; photograph the dot at one more distance at least")
+        _check_distances([p.distance_m for p in self.pairs], self.focus_m, None)
+        for what in ("width_px", "focal_length_mm", "f_number", "sensor_width_mm"):
+            value = getattr(self, what)
+            plain = isinstance(value, int | float) and not isinstance(value, bool)
+            if not (plain and 0 < value < 1e100) and (value is not None or what == "width_px"):
+                raise FitError(f"{what} must be positive, got {show(value)}")
+
+    def __iter__(self) -> Iterator[Capture]:
+        """Iterate over the pairs."""
+        return iter(self.pairs)
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.pairs)
+
+
+def read_captures(folder: str | os.PathLike[str], *, dots: Dots | None = None) -> list[Captures]:
+    """Read a folder of photographs described by its `capture.toml`.
+
+    ```toml
+    focus_m = 0.20              # the lens stays focused here
+    sharp = "0200mm.png"        # the dot at that distance
+    focal_length_mm = 50.0      # camera: optional, all of them together make the table know its unit
+    f_number = 2.8
+    sensor_width_mm = 36.0
+    transfer = "srgb"           # optional: "srgb" or "linear"; by default integers are sRGB, floats are linear
+    dark = "dark.png"           # optional: lens cap on, same exposure
+    exposure_s = 0.02           # optional: of the sharp picture
+    dots = "one"                # or "centre", "each" for a grid of dots
+    name = "my lens at f/2.8"   # optional
+
+    [[shot]]                    # by increasing distance
+    file = "0500mm.png"
+    distance_m = 0.50
+    exposure_s = 0.02           # optional
+    ```
+
+    Args:
+        folder: with the manifest and the pictures, or the manifest's path.
+        dots: instead of the manifest's "dots".
+
+    Returns:
+        One `Captures`; with `dots="each"` one for every dot of the grid, the most central first.
+
+    Raises:
+        ManifestError: the manifest is missing, is not TOML, or a field is wrong.
+        DistanceError: distances are not increasing, not positive, or that of the focus.
+        FitError: a picture's kind of trouble, with its file.
+        OSError: a picture is missing or damaged.
+    """
+    if not isinstance(folder, str | os.PathLike):
+        raise ManifestError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}")
+    path = Path(folder)
+    path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
+    fields = _manifest(path)
+    where, base = str(path), path.parent
+    focus = _number(fields, "focus_m", where)
+    shots = fields.get("shot")
+    if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
+        raise ManifestError("give at least one [[shot]] with file and distance_m", file=where)
+    _known(fields, _FIELDS, where)
+    for shot in shots:
+        _known(shot, ("file", "distance_m", "exposure_s"), where)
+    distances = [_number(s, "distance_m", where) for s in shots]
+    _check_distances(distances, focus, where)
+    transfer = fields.get("transfer")
+    if transfer not in (None, "linear", "srgb"):
+        raise ManifestError(f"transfer must be 'linear' or 'srgb', got {transfer!r}", file=where)
+    chosen = dots or fields.get("dots", "one")
+    if chosen not in ("one", "centre", "each"):
+        raise ManifestError(f"dots must be 'one', 'centre' or 'each', got {chosen!r}", file=where)
+    dark = _text(fields, "dark", where)
+    darkness = None if dark is None else _read(base / dark, transfer)[0]
+    sharp = base / _text(fields, "sharp", where, needed=True)  # type: ignore[operator]
+    still, white = _read(sharp, transfer, darkness)
+    first = _optional(fields, "exposure_s", where)
+    columns: list[list[Capture]] = []
+    for shot, distance in zip(shots, distances, strict=True):
+        file = base / _text(shot, "file", where, needed=True)  # type: ignore[operator]
+        moved, _ = _read(file, transfer, darkness)
+        if moved.shape != still.shape:
+            raise ManifestError(f"{file.name} is {size_of(moved)}, {sharp.name} is {size_of(still)}", file=where)
+        second = _optional(shot, "exposure_s", where)
+        exposure = None if first is None or second is None else second / first
+        columns.append(
+            cut_pairs(still, moved, distance, focus / distance, chosen, (str(sharp), str(file)), white, exposure)
+        )
+    notes = {"manifest": path.name, "transfer": transfer or "by file type", "pictures": [s["file"] for s in shots]}
+    return [
+        Captures(
+            pairs=tuple(column[i] for column in columns),
+            focus_m=focus,
+            width_px=still.shape[1],
+            focal_length_mm=_optional(fields, "focal_length_mm", where),
+            f_number=_optional(fields, "f_number", where),
+            sensor_width_mm=_optional(fields, "sensor_width_mm", where),
+            name=_text(fields, "name", where) or base.resolve().name,
+            notes=notes | {"position_px": list(columns[0][i].position_px)},
+        )
+        for i in range(min(len(c) for c in columns))
+    ]
+
+
+def read_pair(
+    sharp: str | os.PathLike[str],
+    blurred: str | os.PathLike[str],
+    *,
+    distance_m: float = 1.0,
+    magnification: float = 1.0,
+    transfer: Transfer | None = None,
+) -> Capture:
+    """Read two photographs of one dot and cut the windows that hold it.
+
+    Args:
+        sharp: file of the dot in focus.
+        blurred: file of the dot out of focus, the same size.
+        distance_m: of the dot in `blurred`.
+        magnification: expected size of the dot in `blurred` over that in `sharp`.
+        transfer: "linear" or "srgb"; None takes integers as sRGB and floats as linear.
+
+    Raises:
+        FitError: a picture's kind of trouble, with its file.
+        OSError: a picture is missing or damaged.
+    """
+    for name, file in (("sharp", sharp), ("blurred", blurred)):
+        if not isinstance(file, str | os.PathLike):
+            raise FitError(f"{name} must be the path of a picture, got {show(file)}")
+    still, white = _read(Path(sharp), transfer)
+    moved, _ = _read(Path(blurred), transfer)
+    if still.shape != moved.shape:
+        raise FitError(f"the pictures must have one size, got {size_of(still)} and {size_of(moved)}", file=str(blurred))
+    return cut_pairs(still, moved, distance_m, magnification, "one", (str(sharp), str(blurred)), white, None)[0]
+
+
+_FIELDS = (
+    "focus_m", "sharp", "shot", "focal_length_mm", "f_number", "sensor_width_mm", "transfer", "dark", "exposure_s",
+    "dots", "name",
+)  # fmt: skip
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise ManifestError("there is no such manifest; write a capture.toml beside the pictures", file=str(path))
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ManifestError(f"is not TOML: {error}", file=str(path)) from error
+
+
+def _known(fields: Mapping[str, Any], names: Sequence[str], where: str) -> None:
+    for name in fields:
+        if name not in names:
+            raise ManifestError(f"{name!r} is not a field; known are {', '.join(names)}", file=where)
+
+
+def _number(fields: Mapping[str, Any], name: str, where: str) -> float:
+    value = fields.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+        raise ManifestError(f"{name} must be a positive number, got {value!r}", file=where)
+    return float(value)
+
+
+def _optional(fields: Mapping[str, Any], name: str, where: str) -> float | None:
+    return _number(fields, name, where) if name in fields else None
+
+
+def _text(fields: Mapping[str, Any], name: str, where: str, needed: bool = False) -> str | None:
+    value = fields.get(name)
+    if (value is None and needed) or not (value is None or (isinstance(value, str) and value and "\0" not in value)):
+        raise ManifestError(f"{name} must be a text, got {value!r}", file=where)
+    return value
+
+
+def _check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
+    for what, value in [("focus_m", focus), *(("distance_m", d) for d in distances)]:
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e100:
+            raise DistanceError(f"{what} must be a positive number of metres, got {show(value)}", file=where)
+    for before, distance in zip([0.0, *distances], distances, strict=False):
+        if not before < distance < math.inf:
+            raise DistanceError(
+                f"distances must be positive and increasing, got {', '.join(f'{d:g}' for d in distances)} m",
+                file=where,
+                number=float(distance),
+            )
+        if distance == focus:
+            raise DistanceError(f"a shot lies at the focus ({focus:g} m) and has no blur", file=where, number=focus)
+    if not 0 < focus < math.inf:
+        raise DistanceError(f"focus_m must be positive, got {focus}", file=where, number=float(focus))
+
+
+def _read(path: Path, transfer: Any, dark: Array | None = None) -> tuple[Array, float | None]:
+    """A picture `[H, W]` in linear light, mean of its colours, and the level at which it is clipped."""
+    picture = read_image(path, transfer=transfer)
+    pixels = picture.pixels[0].numpy().astype(np.float64)
+    pixels = pixels[[i for i, name in enumerate(picture.channels) if name != "A"]]
+    bad = int(np.sum(~np.isfinite(pixels)))
+    if bad:
+        raise NonFiniteError(f"{bad} values are NaN or infinite", file=str(path), number=float(bad))
+    white = 1.0 if picture.sample in ("8", "16") else None
+    # one clipped colour clips the mean
+    clipped = (pixels >= 1.0 - 1e-6).any(axis=0) if white else None
+    light = pixels.mean(axis=0)
+    if dark is not None:
+        if dark.shape != light.shape:
+            raise FitError(f"the dark frame is {size_of(dark)}, the picture {size_of(light)}", file=str(path))
+        light = light - dark
+    if clipped is not None:
+        light[clipped] = white
+    return light, white

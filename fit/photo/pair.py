@@ -1,0 +1,285 @@
+"""One pair of pictures, sharp and defocused, to one fitted kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from torchdof.optics.psf import FAMILIES
+from torchdof.validation import show
+
+from ..problems import FitError, NotInFocusWarning, SaturatedWarning, warn
+from ..result import Array, BlurFit
+from ..validation import a_count, a_number, a_picture
+from .description import bic_of, describe, kernel_lists
+from .diagnostics import EXPLAINED, doubt_forward, doubt_linearity
+from .dot import find_dot
+from .dot_model import soft_edge
+from .family_choice import COST, choose
+from .forward import ALL_MOVES, Forward, Solution
+from .profile_fit import fit_profile
+from .radial import solve_radial
+from .ratio import blur_strength
+from .saturation import used_pixels
+from .source import IdealDot, PictureOfDot, point_source
+
+__all__ = ["fit_pair"]
+
+Model = Literal["forward", "ratio"]
+SourceKind = Literal["auto", "image", "dot"]
+
+_SMALLEST_WINDOW = 15
+_AS_GOOD = 2e-3
+_SOFT = 1.5  # px: an edge softer than this is not in focus
+_SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
+
+
+def fit_pair(
+    sharp: ArrayLike | None,
+    blurred: ArrayLike,
+    family: str = "auto",
+    model: Model = "forward",
+    *,
+    accuracy_db: float = 45.0,
+    source: SourceKind = "auto",
+    magnification: float = 1.0,
+    fit_magnification: bool | None = None,
+    white: float | None = None,
+    start: BlurFit | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
+    knots: int | None = None,
+    reach: float | None = None,
+    files: tuple[str | None, str | None] = (None, None),
+) -> BlurFit:
+    """The kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
+
+    The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
+    moved and magnified) + background`. Exposure, stray light, displacement and magnification are fitted, so they do
+    not bias the kernel. The kernel is pixel-integrated and acts on the picture's pixels, as in rendering: it is what
+    turns *this* sharp picture into *this* blurred one (a pixel's own blur, 1/12 px^2 of variance, is already in both).
+
+    `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
+    convolved with the kernel, so its widths depend on the dot. Use it to compare with the paper.
+
+    Args:
+        sharp: `[H, W]`, linear light, the dot in focus on a dark ground; None for a point of light (a star).
+        blurred: `[H, W]`, linear light, the same dot out of focus, the whole blur inside the window.
+        family: "gaussian", "ring", "disc", "softm", "radial", or "auto": the cheapest that reaches `accuracy_db`.
+        model: "forward" or "ratio".
+        accuracy_db: PSNR on a natural image that "auto" asks of a family, against the free profile `radial`.
+        source: what stands for the sharp dot. "image": its picture; "dot": an ideal round dot fitted to it, which has
+            no noise; "auto": the ideal one where it explains the picture to within its noise, or that is clipped.
+        magnification: expected size of the dot in the blurred picture over its size in the sharp one.
+        fit_magnification: True fits it, False holds it, None fits it only where the pictures contradict the expected
+            one by more than 3.5 standard errors. Where it is held, the standard errors take it as known.
+        white: level at and above which a pixel is clipped; None looks for a plateau.
+        start: a fit of a similar pair, to start from (several distances of one lens).
+        prior: expected value and standard deviation of parameters of `family`, known from elsewhere (the neighbouring
+            distances), in px; the result is what both the pictures and it allow, and so are its standard errors.
+        knots: number of values of a "radial" profile; None takes two a pixel.
+        reach: where a "radial" profile ends, px; None finds it from a soft disc.
+        files: names of the two pictures, for errors and warnings.
+
+    Returns:
+        A `BlurFit` with lengths in pixels.
+
+    Raises:
+        FitError: wrong shapes, family or model; or one of its kinds, named after what is wrong with the capture.
+
+    Warns:
+        FitWarning: one of its kinds; the result is given, and what to doubt about it.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 2 (model="ratio").
+
+    Example:
+        >>> import torch
+        >>> from torchdof.optics import psf
+        >>> sharp = torch.nn.functional.pad(psf.disc(6.0), (20, 20, 20, 20))  # a picture of a dot
+        >>> blurred = torch.nn.functional.conv2d(sharp[None, None], psf.disc(8.0)[None, None], padding=8)[0, 0]
+        >>> fit = fit_pair(sharp.numpy(), blurred.numpy())
+        >>> fit.family, round(fit.params["radius"], 3)
+        ('disc', 8.0)
+    """
+    _check_options(family, model, source, magnification, accuracy_db, fit_magnification, white, start, prior)
+    _check_radial(knots, reach)
+    data = a_picture("blurred", blurred, _SMALLEST_WINDOW, files[1])
+    still = None if sharp is None else a_picture("sharp", sharp, _SMALLEST_WINDOW, files[0])
+    if still is not None and still.shape != data.shape:
+        raise FitError(
+            f"sharp and blurred must have the same shape, got {list(still.shape)} and {list(data.shape)}; "
+            "cut the same window from both"
+        )
+    if model == "ratio":
+        if still is None:
+            raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
+        return _ratio(still, data, "ring" if family == "auto" else family)
+    pair = _prepare(still, data, source, magnification, white, files)
+    if start is not None and start.family in FAMILIES:
+        pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
+    pair.prior = dict(prior or {})
+    held = _held(pair, fit_magnification, sharp is None)
+    why, psnr = "", dict[str, float]()
+    if family in ("auto", "radial"):
+        solutions = {"radial": _solve_radial(pair, held, knots, reach)}
+        if family == "auto":
+            family, why, psnr = _choose(pair, solutions, accuracy_db)
+    else:
+        solutions = {family: pair.solve(family)}
+        if held is None and _improves(pair, solutions[family], free := _with_magnification(pair).solve(family)):
+            pair.fit_moves, solutions[family] = ALL_MOVES, free
+    fit = describe(pair, solutions[family], why)
+    # a family that was chosen for being cheap is not to blame for what the free profile explains
+    doubt_forward(pair, solutions[family], fit, files, describe(pair, solutions["radial"], "") if why else fit)
+    return replace(fit, psnr=psnr)
+
+
+def _check_options(
+    family: Any,
+    model: Any,
+    source: Any,
+    magnification: Any,
+    accuracy_db: Any,
+    fit_magnification: Any,
+    white: Any,
+    start: Any,
+    prior: Any,
+) -> None:
+    if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
+        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
+    texts = isinstance(model, str) and isinstance(source, str)
+    if not texts or model not in get_args(Model) or source not in get_args(SourceKind):
+        told = f"got {show(model)}, {show(source)}"
+        raise FitError(f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; {told}")
+    try:
+        # beyond this the dot of one picture is not seen in the other
+        a_number("magnification", magnification, 1e-3, 1e3)
+    except FitError:
+        told = f"got {show(magnification)}"
+        raise FitError(f"magnification must be positive (0.001 to 1000), {told}") from None
+    a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
+    if white is not None:
+        a_number("white", white, -1e100, 1e100)
+    if fit_magnification is not None and not isinstance(fit_magnification, bool):
+        raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
+    if start is not None and not isinstance(start, BlurFit):
+        raise FitError(f"start must be a BlurFit of a similar pair, got {show(start)}")
+    pairs = isinstance(prior, Mapping) and all(isinstance(v, tuple) and len(v) == 2 for v in prior.values())
+    if prior is not None and not pairs:
+        raise FitError(f"prior must map names of parameters to (expected value, deviation), got {show(prior)}")
+    for name, (mean, deviation) in (prior or {}).items():
+        a_number(f"the expected {name}", mean, -1e100, 1e100)
+        a_number(f"the deviation of {name}", deviation, 0)
+
+
+def _check_radial(knots: Any, reach: Any) -> None:
+    if knots is not None:
+        a_count("knots", knots, 2, 1000)
+    if reach is not None:
+        a_number("reach", reach, 0, unit="pixels")
+
+
+def _ratio(still: Array, data: Array, family: str) -> BlurFit:
+    r, strength, spokes = blur_strength(still, data)
+    return replace(fit_profile(r, strength, family, groups=spokes), model="ratio")
+
+
+def _prepare(
+    still: Array | None,
+    data: Array,
+    source: SourceKind,
+    magnification: float,
+    white: float | None,
+    files: tuple[str | None, str | None],
+) -> Forward:
+    """Find the dots, leave out what is clipped, doubt the focus, and decide what stands for the sharp dot."""
+    data_dot = find_dot(data, file=files[1])
+    used = used_pixels(data, data_dot, white, files[1], "blurred")
+    if still is None:
+        return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification)
+    dot = find_dot(still, file=files[0])
+    whole = used_pixels(still, dot, white, files[0], "sharp", refuse=False)
+    clipped = int(np.sum(~whole))
+    edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)
+    if edge.softness > _SOFT and edge.radius > 2 * _SOFT:
+        warn(
+            NotInFocusWarning(
+                f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px (at most {_SOFT}); "
+                "focus on the dot, or expect a kernel that is too small",
+                file=files[0],
+                number=edge.softness,
+            ),
+            stacklevel=4,
+        )
+    if not clipped:
+        doubt_linearity(still, dot, edge, files[0])
+    if clipped:
+        warn(
+            SaturatedWarning(
+                f"{clipped} pixels of the sharp picture are clipped; an ideal dot of radius {edge.radius:.2f} px "
+                "stands in for it",
+                file=files[0],
+                number=float(clipped),
+            ),
+            stacklevel=4,
+        )
+    # a spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified
+    close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
+    explained = close and edge.radius > 2 * edge.softness
+    if clipped or source == "dot" or (source == "auto" and explained):
+        return Forward(IdealDot.of(dot, edge), data, used, data_dot, magnification)
+    return Forward(PictureOfDot.of(still, dot), data, used, data_dot, magnification)
+
+
+def _held(pair: Forward, fit_magnification: bool | None, point: bool) -> bool | None:
+    """Whether the magnification is settled before the fit: a point has none."""
+    held = True if point else None if fit_magnification is None else not fit_magnification
+    pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
+    return held
+
+
+def _with_magnification(pair: Forward) -> Forward:
+    return replace(pair, fit_moves=ALL_MOVES)
+
+
+def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
+    """Whether a fitted magnification explains the pictures significantly better than the expected one."""
+    # the scale of chi squared: what remains, or the rounding of a spline where there is no noise
+    floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
+    return (held.squares - free.squares) / floor > _SIGNIFICANT
+
+
+def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: float | None) -> Solution:
+    """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`."""
+    soft = pair.solve("softm")
+    reach = _reach(pair, soft) if reach is None else min(reach, pair.half - 1.0)
+    solution = solve_radial(pair, soft, reach, knots)
+    if held is None:
+        free = solve_radial(_with_magnification(pair), solution, reach, knots)
+        if _improves(pair, solution, free):
+            pair.fit_moves, solution = ALL_MOVES, free
+    pair.held_magnification = solution.moves["magnification"]
+    return solution
+
+
+def _choose(pair: Forward, solutions: dict[str, Solution], accuracy_db: float) -> tuple[str, str, dict[str, float]]:
+    """Fit every family at the free profile's magnification and choose; the chosen one's is then fitted with it."""
+    fit_moves, pair.fit_moves = pair.fit_moves, ("dx", "dy")
+    solutions |= {f: pair.solve(f) for f in COST[:-1]}
+    kernels = {f: pair.kernels(f, kernel_lists(s))[0] for f, s in solutions.items()}
+    family, why, psnr = choose(kernels, {f: bic_of(pair, s) for f, s in solutions.items()}, accuracy_db)
+    pair.fit_moves = fit_moves
+    if family != "radial" and fit_moves == ALL_MOVES:
+        pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
+        solutions[family] = pair.solve(family)
+    return family, why, psnr
+
+
+def _reach(pair: Forward, soft: Solution) -> float:
+    """Where a free profile may end: a little beyond what the soft disc says."""
+    reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
+    return min(reach, pair.half - 1.0)

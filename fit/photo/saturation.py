@@ -1,0 +1,78 @@
+"""Which pixels of a picture are clipped: at a stated level, or on a plateau that noise would not leave flat."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..problems import FitError, SaturatedError, SaturatedWarning, warn
+from ..result import Array, Mask
+from .dot import Dot
+
+__all__ = ["plateau", "used_pixels"]
+
+_MOST = 0.6  # share of the dot's pixels beyond which what is left does not fix a fit
+
+
+def plateau(picture: Array, dot: Dot) -> float | None:
+    """The level at which a picture is clipped, or None.
+
+    A clipped picture has many pixels at exactly its highest level, although its noise is larger than the distance
+    between its levels. Without noise a flat top is only a flat top.
+    """
+    top = float(picture.max())
+    above = picture[picture > dot.background + 0.5 * dot.peak]
+    at_top = int(np.sum(above == top))
+    if at_top < 5 or at_top < 0.02 * above.size:
+        return None
+    levels = np.unique(above)
+    spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
+    return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
+
+
+def used_pixels(
+    picture: Array, dot: Dot, white: float | None, file: str | None, name: str, *, refuse: bool = True
+) -> Mask:
+    """Pixels that are not clipped `[H, W]`, those that noise may have clipped left out with them.
+
+    Raises:
+        SaturatedError: `refuse` and too little of the dot is left.
+
+    Warns:
+        SaturatedWarning: `refuse` and some pixels were left out.
+    """
+    from scipy.ndimage import uniform_filter
+
+    if white is not None and not white > dot.background:
+        raise FitError(
+            f"white is {white:g} but the background of the {name} picture is {dot.background:g}; "
+            "give the value at which the camera clips, which lies above it, or None to look for it",
+            file=file,
+            number=white,
+        )
+    level = white if white is not None else plateau(picture, dot)
+    if level is None:
+        return np.ones(picture.shape, dtype=bool)
+    clipped = picture >= level * (1 - 1e-6)
+    count = int(clipped.sum())
+    if not count:
+        return ~clipped
+    # where the level is within the noise of white, only the dark half of the noise is left
+    clipped |= uniform_filter(picture, 3, mode="nearest") > level - 3 * dot.noise
+    bright = picture > dot.background + 0.15 * dot.peak
+    share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
+    if refuse and share > _MOST:
+        raise SaturatedError(
+            f"{100 * share:.0f} % of the {name} dot's pixels are clipped at {level:.4g}; expose less",
+            file=file,
+            number=share,
+        )
+    if refuse:
+        warn(
+            SaturatedWarning(
+                f"{count} pixels of the {name} picture are clipped at {level:.4g} and were left out; expose less",
+                file=file,
+                number=float(count),
+            ),
+            stacklevel=5,
+        )
+    return ~clipped

@@ -1,0 +1,263 @@
+"""Fits at several distances to one blur table, keyed by the signed circle of confusion, smooth between its nodes."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.camera import Camera
+from torchdof.optics.psf import FAMILIES, LENGTHS, profile, support
+from torchdof.validation import show
+
+from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
+from ..result import Array, BlurFit
+from .distances import fit_distances, fit_one
+from .family_choice import COST
+from .manifest import Capture, Captures
+from .scale import signed_coc
+
+__all__ = ["TableFit", "fit_captures", "fit_table"]
+
+_EXPOSED = 1.3
+
+
+@dataclass(frozen=True)
+class TableFit:
+    """A table and the fits it was made of.
+
+    Attributes:
+        table: the blur table.
+        fits: one for each pair, by increasing distance.
+        coc_px: signed circle of confusion of each, px of the frame.
+        why: how the family was chosen.
+        scale: where the circles of confusion come from: "camera" or "measured".
+    """
+
+    table: BlurTable
+    fits: tuple[BlurFit, ...]
+    coc_px: tuple[float, ...]
+    why: str
+    scale: str
+
+
+def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **options: Any) -> BlurTable:
+    """The blur table of a camera from photographs of a dot at one or more distances: `fit_captures(...).table`.
+
+    Args:
+        captures: from `read_captures`, or made of arrays.
+        family: "auto", or one of `torchdof.optics.psf.FAMILIES`.
+        **options: see `fit_captures`.
+
+    Returns:
+        A table in mm of the sensor where its width is known, else in fractions of the frame's width.
+
+    Raises:
+        FitError: see `fit_captures`.
+
+    Example:
+        >>> import torch
+        >>> from torchdof.optics import psf
+        >>> def picture(radius, blur=0.0):  # a white dot of a radius, blurred by a disc
+        ...     dot = psf.disc(radius, size=61) * 3.14159 * radius**2
+        ...     return torch.nn.functional.conv2d(dot[None, None], psf.disc(blur)[None, None], padding="same")[0, 0]
+        >>> near = Capture(picture(8.0).numpy(), picture(10.0, 5.0).numpy(), distance_m=0.8)
+        >>> far = Capture(picture(8.0).numpy(), picture(6.4, 4.0).numpy(), distance_m=1.25)
+        >>> fit_table(Captures((near, far), focus_m=1.0, width_px=1000), "disc")
+        BlurTable('unnamed', disc, 2 nodes)
+    """
+    if not isinstance(captures, Captures):
+        raise FitError(
+            "captures must be a Captures(pairs, focus_m=..., width_px=...), which knows the focus and the frame's "
+            f"width; got {type(captures).__name__}"
+        )
+    return fit_captures(captures, family, **options).table
+
+
+def fit_captures(
+    captures: Captures,
+    family: str = "auto",
+    *,
+    accuracy_db: float = 45.0,
+    smooth: bool = True,
+    progress: Callable[[int, int, str], None] | None = None,
+    command: str = "torchdof.fit.fit_table",
+) -> TableFit:
+    """Fit every distance and join the fits.
+
+    Nodes are keyed by the thin lens's signed circle of confusion at their distance. Where focal length and f-number
+    are known it is the camera's; else its scale is measured: the radius of the uniform disc with the fitted kernels'
+    second moment, by least squares over all distances.
+
+    Each fit starts from its outer neighbour's, scaled by geometry, from both ends towards focus, and leaves that
+    branch only where the pictures clearly ask for it. Then all are fitted once more, each loosely expecting what lies
+    on the line between its neighbours; free profiles are given radii on one line instead.
+
+    Args:
+        captures: pairs at increasing distances.
+        family: "auto" takes the cheapest family that is enough at every distance; or one of the families.
+        accuracy_db: what "auto" asks for, see `fit_pair`.
+        smooth: whether neighbouring distances inform each other.
+        progress: called with (done, all, what) after each fit.
+        command: recorded in the table's provenance.
+
+    Returns:
+        The table and its fits.
+
+    Raises:
+        FitError: a pair cannot be fitted; the message names its file.
+
+    Warns:
+        SingleDistanceWarning: one distance only; the thin lens scales it.
+        ExposureWarning: a fitted gain contradicts the stated exposures.
+        FitWarning: what `fit_pair` warns about.
+    """
+    if not isinstance(captures, Captures):
+        raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
+    if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
+        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
+    pairs = list(captures)
+    total, done = len(pairs) * (2 if family == "auto" else 1), 0
+    why = f"family {family!r} was asked for"
+    if family == "auto":
+        family, why = _choose(pairs, captures.focus_m, accuracy_db, progress, total)
+        done = len(pairs)
+
+    def report(pair: Capture, fit: BlurFit) -> None:
+        nonlocal done
+        _check_exposure(pair, fit)
+        done += 1
+        if progress:
+            progress(done, total, f"{pair.distance_m:g} m")
+
+    ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
+    coc_px, scale = _keys(captures, ordered)
+    params = _nodes(ordered, family)
+    if len(pairs) == 1:
+        text = (
+            f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
+            "other side of focus mirrors it"
+        )
+        warn(SingleDistanceWarning(text, file=pairs[0].files[1], number=pairs[0].distance_m))
+    return TableFit(
+        table=_table(captures, ordered, coc_px, params, family, scale, command, why),
+        fits=tuple(ordered),
+        coc_px=tuple(coc_px),
+        why=why,
+        scale=scale,
+    )
+
+
+def _choose(
+    pairs: list[Capture],
+    focus_m: float,
+    accuracy_db: float,
+    progress: Callable[[int, int, str], None] | None,
+    total: int,
+) -> tuple[str, str]:
+    worst = 0
+    why = ""
+    for i, pair in enumerate(pairs):
+        fit = fit_one(pair, focus_m, "auto", None, accuracy_db)
+        # the richest family that any distance needs serves all
+        if not why or COST.index(fit.family) > worst:
+            worst, why = COST.index(fit.family), f"{fit.family}, for {pair.distance_m:g} m: {fit.why}"
+        if progress:
+            progress(i + 1, total, f"{pair.distance_m:g} m")
+    return COST[worst], why
+
+
+def _check_exposure(pair: Capture, fit: BlurFit) -> None:
+    if pair.exposure is None or not fit.gain > 0:
+        return
+    off = fit.gain / pair.exposure
+    if max(off, 1 / off) > _EXPOSED:
+        text = (
+            f"the blurred dot is {off:.2f} times as bright as the exposures say; is the image linear, and did the "
+            "light stay the same?"
+        )
+        warn(ExposureWarning(text, file=pair.files[1], number=off), stacklevel=4)
+
+
+def _keys(captures: Captures, fits: list[BlurFit]) -> tuple[list[float], str]:
+    """Signed circle of confusion of each pair in px of the frame."""
+    if captures.focal_length_mm is not None and captures.f_number is not None and captures.sensor_width_mm is not None:
+        camera = Camera(
+            focal_length_mm=captures.focal_length_mm,
+            f_number=captures.f_number,
+            focus_m=captures.focus_m,
+            sensor_width_mm=captures.sensor_width_mm,
+        )
+        return [signed_coc(camera, p.distance_m, captures.width_px) for p in captures], "camera"
+    vergence = np.array([1 / captures.focus_m - 1 / p.distance_m for p in captures])
+    size = np.array([math.sqrt(2) * rms_radius(f) for f in fits])
+    factor = float(np.abs(vergence) @ size / (vergence @ vergence))
+    return [float(factor * v) for v in vergence], "measured"
+
+
+def rms_radius(fit: BlurFit) -> float:
+    """Root of a kernel's mean squared radius, in the fit's unit; over a uniform disc it is its radius / sqrt(2)."""
+    given = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
+    r = np.linspace(0, support(fit.family, given) + 1e-9, 4001)
+    f = profile(fit.family, torch.from_numpy(r), given).numpy()
+    return float(np.sqrt((f * r**3).sum() / (f * r).sum()))
+
+
+def _nodes(fits: list[BlurFit], family: str) -> dict[str, Array]:
+    """Parameters at the nodes in px: `[n]`, "values" `[n, knots]`."""
+    if family == "radial":
+        return _radial_nodes(fits)
+    return {n: np.array([float(f.params[n]) for f in fits]) for n in FAMILIES[family]}
+
+
+def _radial_nodes(fits: list[BlurFit]) -> dict[str, Array]:
+    """Free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change."""
+    radius = np.array([float(f.params["radius"]) for f in fits])
+    values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
+    return {"values": values, "radius": radius}
+
+
+def _table(
+    captures: Captures,
+    fits: list[BlurFit],
+    coc_px: list[float],
+    params: dict[str, Array],
+    family: str,
+    scale: str,
+    command: str,
+    why: str,
+) -> BlurTable:
+    sensor = captures.sensor_width_mm
+    unit = captures.width_px if sensor is None else captures.width_px / sensor
+    provenance = {
+        "source": "photographs of a dot",
+        "date": datetime.date.today().isoformat(),
+        "command": command,
+        "focus_m": captures.focus_m,
+        "distances_m": [p.distance_m for p in captures],
+        "coc_from": scale,
+        "width_px": captures.width_px,
+        "family_because": why,
+        "residual_over_noise": [round(f.residual_over_noise, 3) for f in fits if math.isfinite(f.residual_over_noise)],
+        "asymmetry": [round(f.asymmetry, 4) for f in fits],
+        **dict(captures.notes),
+    }
+    for name in ("focal_length_mm", "f_number", "sensor_width_mm"):
+        if getattr(captures, name) is not None:
+            provenance[name] = getattr(captures, name)
+    return BlurTable(
+        family,
+        [c / unit for c in coc_px],
+        {k: (v / unit if k in LENGTHS else v).tolist() for k, v in params.items()},
+        unit="fraction" if sensor is None else "mm",
+        sensor_width_mm=sensor,
+        name=captures.name,
+        provenance=provenance,
+        residual=[round(f.residual, 6) for f in fits],
+    )

@@ -1,0 +1,163 @@
+"""The paper's figures for any fit and table, drawn with matplotlib."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.psf import LENGTHS
+
+from .photo.profile_fit import evaluate
+from .problems import FitError
+from .result import Array, BlurFit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["picture_of_fit", "picture_of_quad", "picture_of_table", "picture_of_texture"]
+
+_DATA, _MODEL = "#7a7a7a", "#c2410c"
+
+
+def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
+    """Samples with the fitted curve: the paper's Fig. 2.
+
+    For a forward fit the samples are the blurred dot's pixels and the curve is the model of them, with the kernel's own
+    profile beside it; for a profile fit they are the samples of blur strength.
+
+    Args:
+        fit: any fit.
+        unit: of its lengths, for the axis.
+        title: above the picture.
+
+    Raises:
+        FitError: the fit carries no samples.
+    """
+    if not fit.samples.shape[1]:
+        raise FitError("this fit carries no samples to draw")
+    figure, axes = _figure(5.4, 3.6)
+    forward = fit.model == "forward"
+    axes.plot(
+        *fit.samples,
+        ".",
+        color=_DATA,
+        markersize=2.5 if forward else 4,
+        label="samples" if not forward else "pixels",
+        zorder=1,
+    )
+    if forward:
+        r, level = _averaged(*fit.curve)
+        axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
+        line = np.linspace(0, fit.samples[0].max(), 400)
+        shape = evaluate(fit.family, line, fit.kernel_params())
+        axes.plot(line, shape / shape.max() * level.max(), "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
+    else:
+        axes.plot(*fit.curve, color=_MODEL, label=f"fitted {fit.family}", zorder=3)
+    axes.set(xlabel=f"r [{unit}]", ylabel="level above background" if forward else "blur strength", ylim=(0, None))
+    axes.set_title(title or f"{fit.family}: {_values(fit)}", fontsize=9)
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str = "") -> Figure:
+    """The blur texture at a circle of confusion: the paper's Fig. 3.
+
+    Args:
+        table: blur table.
+        coc_px: signed circle of confusion in pixels.
+        width: width of the image in pixels.
+        title: above the picture.
+    """
+    texture = table.blur_texture(coc_px, width).detach().numpy()
+    figure, axes = _figure(4.2, 3.6)
+    half = texture.shape[-1] / 2
+    colours = np.moveaxis(texture, 0, -1) / texture.max() if texture.shape[0] == 3 else texture[0]
+    shown = axes.imshow(colours, cmap="gray", vmin=0, extent=(-half, half, half, -half))
+    if texture.shape[0] != 3:
+        figure.colorbar(shown, ax=axes, label="blur strength")
+    axes.set(xlabel="px", ylabel="px")
+    axes.set_title(title or f"blur texture, coc {coc_px:+.1f} px", fontsize=9)
+    return figure
+
+
+def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
+    """A quad in focus and out of focus side by side, with the row through their middle: the paper's Fig. 4.
+
+    Args:
+        sharp: `[H, W]` linear light.
+        blurred: `[H, W]` linear light.
+        title: above the picture.
+    """
+    figure, (left, right, below) = _figure(9.6, 3.4, 3)
+    top = max(float(sharp.max()), 1e-12)
+    for axes, picture, name in ((left, sharp, "in focus"), (right, blurred, "out of focus")):
+        axes.imshow((np.clip(picture / top, 0, 1)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+        axes.set_title(name, fontsize=9)
+        axes.set_axis_off()
+    row = sharp.shape[0] // 2
+    below.plot(sharp[row], color=_DATA, label="in focus")
+    below.plot(blurred[row], color=_MODEL, label="out of focus")
+    below.set(xlabel="px", ylabel="linear light, middle row")
+    below.legend(frameon=False, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def picture_of_table(table: BlurTable, title: str = "") -> Figure:
+    """A table over depth: every parameter at its nodes, and the lines the table draws between them.
+
+    Args:
+        table: blur table.
+        title: above the picture.
+    """
+    names = list(table.node_params)
+    figure, axes = _figure(3.2 * len(names), 3.2, len(names))
+    reach = float(table.coc.abs().max())
+    width = 1 if table.sensor_width_mm is None else int(table.sensor_width_mm) or 1
+    scale = 1.0 if table.unit != "mm" else width / float(table.sensor_width_mm or 1.0)
+    line = torch.linspace(-reach, reach, 401, dtype=torch.float64)
+    between = table.params(line * scale, width)
+    unit = {"mm": "mm", "fraction": "of the width", "relative": "relative"}[table.unit]
+    for ax, name in zip(np.atleast_1d(axes), names, strict=True):
+        nodes = table.node_params[name]
+        if name == "values":
+            picture = between[name][0].T.numpy()
+            ax.imshow(
+                picture / np.maximum(picture.max(axis=0), 1e-12), aspect="auto", origin="lower", cmap="magma",
+                extent=(-reach, reach, 0, 1),
+            )  # fmt: skip
+            ax.set(ylabel="r / radius", title="profile, each over its peak")
+        else:
+            per = scale if name in LENGTHS else 1.0
+            for channel in range(nodes.shape[0]):
+                colour = _MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
+                ax.plot(line, between[name][channel] / per, color=colour, linewidth=1)
+                ax.plot(table.coc, nodes[channel], "o", color=colour, markersize=3)
+            ax.set(ylabel=name + (f" [{unit}]" if name in LENGTHS else ""))
+        ax.set(xlabel=f"signed coc [{unit}]")
+    figure.suptitle(title or f"{table.name or 'table'} ({table.family})", fontsize=10)
+    return figure
+
+
+def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
+    # no pyplot: it would choose a screen and keep every figure alive
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(1, columns)
+
+
+def _averaged(r: Array, level: Array) -> tuple[Array, Array]:
+    bins = np.floor(r * 2 + 0.5).astype(int)
+    count = np.bincount(bins)
+    kept = count > 0
+    return (np.bincount(bins, r)[kept] / count[kept]), (np.bincount(bins, level)[kept] / count[kept])
+
+
+def _values(fit: BlurFit) -> str:
+    return ", ".join(f"{k} = {v:.4g} ± {fit.stderr[k]:.1g}" for k, v in fit.params.items() if not np.ndim(v))

@@ -1,0 +1,65 @@
+"""`torchdof fit` as a user runs it."""
+
+import pytest
+from typer.testing import CliRunner
+
+from torchdof import BlurTable
+from torchdof.cli.main import app
+
+
+def kernel(distance):
+    return "disc", {"radius": 10.0 * abs(1 / 0.5 - 1 / distance)}
+
+
+@pytest.fixture(scope="module")
+def folder(simulator, tmp_path_factory):
+    camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
+    fields = 'focal_length_mm = 50.0\nf_number = 4.0\nsensor_width_mm = 36.0\nname = "my lens"'
+    return simulator.write_captures(
+        tmp_path_factory.mktemp("lens"), camera, 0.5, [0.4, 0.8, 1.0], kernel, camera_fields=fields
+    )
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["fit", *map(str, arguments)])
+
+
+def test_a_folder_becomes_a_table_with_pictures(folder, tmp_path):
+    result = run(folder, "-o", tmp_path / "mine.json", "--plots", tmp_path / "pictures")
+    assert result.exit_code == 0, result.output
+    table = BlurTable.load(tmp_path / "mine.json")
+    assert table.family == "disc" and len(table.coc) == 3 and table.name == "my lens"
+    assert table.provenance["command"].startswith("torchdof fit ")
+    assert "±" in result.output and "family: disc" in result.output and "x noise" in result.output
+    assert sorted(f.name for f in (tmp_path / "pictures").iterdir()) == [
+        "mine_1000mm.png", "mine_400mm.png", "mine_800mm.png", "mine_table.png", "mine_texture.png",
+    ]  # fmt: skip
+
+
+def test_a_lens_becomes_a_table(tmp_path):
+    result = run("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
+    assert result.exit_code == 0, result.output
+    assert BlurTable.load(tmp_path / "lens.json").unit == "mm"
+    told = " ".join(result.output.split())
+    assert "50.3582 mm, f/4, focus 2.0 m; 5 distances from" in told and "family: radial, residual" in told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "either a folder of captures or --lens"),
+        (("nowhere",), "capture.toml"),
+        (("--lens", "nowhere"), "nowhere"),
+        (("nowhere", "-o", "table.txt"), "name it table.json"),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_exit_code_2(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert message in result.output.replace("\n", " ") and "Traceback" not in result.output
+
+
+def test_help_teaches():
+    result = run("--help")
+    assert result.exit_code == 0 and "capture.toml" in result.output and "--lens" in result.output

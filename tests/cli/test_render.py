@@ -1,0 +1,367 @@
+"""The command from the outside: files in, files out, one line that says what was done, exit code 2 for wrong input."""
+
+import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import torchdof
+from torchdof.cli.main import app
+from torchdof.io.images import Picture, read_image, write_image
+
+HEIGHT, WIDTH = 16, 24
+LENS = ("--focal-length-mm", "50", "--f-number", "1.4", "--sensor-width-mm", "4")  # blurs by 1.8 px
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with image.exr, depth.npy (2 m left, 6 m right) and both in zed.exr; it is the working folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    write_image("image.exr", Picture(image(), sample="float"))
+    np.save("depth.npy", depth().numpy())
+    return tmp_path
+
+
+def store(path: str, array: np.ndarray, sample: str, names: tuple[str, ...]) -> None:
+    spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], sample)
+    spec.channelnames = names
+    output = oiio.ImageOutput.create(path)
+    assert output is not None and output.open(path, spec) and output.write_image(array) and output.close()
+
+
+def image() -> torch.Tensor:
+    return torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1))
+
+
+def depth() -> torch.Tensor:
+    metres = torch.full((1, 1, HEIGHT, WIDTH), 2.0)
+    metres[..., WIDTH // 2 :] = 6.0
+    return metres
+
+
+def lens(focus_m: float) -> torchdof.Camera:
+    return torchdof.Camera(focal_length_mm=50.0, f_number=1.4, focus_m=focus_m, sensor_width_mm=4.0)
+
+
+def run(*arguments: str, code: int = 0) -> str:
+    """Runs ``torchdof render`` and gives its standard output, or its standard error where it should fail."""
+    result = CliRunner().invoke(app, ["render", *arguments], catch_exceptions=False)
+    assert result.exit_code == code, result.output
+    return result.stdout if code == 0 else result.stderr
+
+
+def pixels(path: str) -> torch.Tensor:
+    return read_image(path).pixels
+
+
+def test_render_is_the_function_on_files(scene: Path) -> None:
+    line = run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", *LENS, "--device", "cpu")
+    camera = lens(2.0)
+    expected = torchdof.depth_of_field(image(), depth(), camera)
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+    assert not torch.equal(expected, image())
+    radius = float(camera.coc_px(depth(), WIDTH).abs().max())
+    assert line.startswith(
+        f"out.exr: focus 2 m, f/1.4, 50 mm on 4 mm; blur radius up to {radius:.1f} px; disc, layered"
+    )
+    assert "[" not in line and line.count("\n") == 1
+
+
+def test_depth_channel_of_the_image_is_used_when_no_depth_is_named(scene: Path) -> None:
+    both = torch.cat([image(), depth()], dim=1)[0].permute(1, 2, 0).contiguous().numpy()
+    store("zed.exr", both, "float", ("R", "G", "B", "Z"))
+    run("zed.exr", "-o", "a.exr", "--focus-m", "2", *LENS)
+    run("image.exr", "depth.npy", "-o", "b.exr", "--focus-m", "2", *LENS)
+    assert torch.equal(pixels("a.exr"), pixels("b.exr"))
+
+
+def test_scene_in_focus_comes_back_bit_exact(scene: Path) -> None:
+    np.save("depth.npy", np.full((HEIGHT, WIDTH), 2.0))
+    run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", *LENS)
+    assert torch.equal(pixels("out.exr"), image())
+
+
+def test_focus_at_a_pixel_is_focus_on_its_depth(scene: Path) -> None:
+    line = run("image.exr", "depth.npy", "-o", "a.exr", "--focus-at", f"{WIDTH - 3},5", *LENS)
+    assert "focus 6 m" in line
+    run("image.exr", "depth.npy", "-o", "b.exr", "--focus-m", "6", *LENS)
+    assert torch.equal(pixels("a.exr"), pixels("b.exr"))
+
+
+def test_field_of_view_and_aperture_radius_are_the_camera_of_a_rendered_image(scene: Path) -> None:
+    run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", "--fov-deg", "40", "--aperture-radius-m", "0.2")
+    camera = torchdof.Camera.from_fov(40.0, 0.2, 2.0)
+    expected = torchdof.depth_of_field(image(), depth(), camera)
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+
+
+def test_f_number_with_a_field_of_view_opens_the_equivalent_lens(scene: Path) -> None:
+    f_number = torchdof.Camera.from_fov(40.0, 0.2, 2.0).f_number
+    run("image.exr", "depth.npy", "-o", "a.exr", "--focus-m", "2", "--fov-deg", "40", "--f-number", str(f_number))
+    run("image.exr", "depth.npy", "-o", "b.exr", "--focus-m", "2", "--fov-deg", "40", "--aperture-radius-m", "0.2")
+    torch.testing.assert_close(pixels("a.exr"), pixels("b.exr"), rtol=0, atol=1e-6)
+
+
+def test_camera_comes_from_the_file_when_nobody_states_it_and_that_is_said(scene: Path) -> None:
+    tags = {"Exif:FocalLength": 85.0, "FNumber": 1.8, "Exif:SubjectDistance": 3.0, "Exif:FocalLengthIn35mmFilm": 85.0}
+    write_image("photo.exr", Picture(image(), metadata={name: ("float", value) for name, value in tags.items()}))
+    line = run("photo.exr", "depth.npy", "-o", "out.exr")
+    assert "focus 3 m, f/1.8, 85 mm on 36 mm" in line
+    assert (
+        "[focus from the file, focal length from the file, f-number from the file, sensor width from the file]" in line
+    )
+    line = run("photo.exr", "depth.npy", "-o", "out.exr", "--f-number", "4", "--focus-m", "2")
+    assert "focus 2 m, f/4, 85 mm" in line and "f-number from" not in line
+
+
+def test_assumed_lens_is_said(scene: Path) -> None:
+    line = run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2")
+    assert "[focal length assumed, f-number assumed, sensor width assumed]" in line
+
+
+def test_disparity_in_sixteen_bits_with_holes_is_filled_and_counted(scene: Path) -> None:
+    disparity = np.where(depth()[0, 0].numpy() == 2.0, 300, 100).astype(np.uint16)
+    disparity[3, 4] = disparity[9, 20] = 0
+    store("disparity.png", disparity[..., None], "uint16", ("Y",))
+    options = ("--depth-kind", "disparity", "--depth-scale", "600", "--depth-unknown", "0", "--focus-m", "2", *LENS)
+    message = run("image.exr", "disparity.png", "-o", "a.exr", *options, code=2)
+    assert message.startswith("error: disparity.png: 2 pixels (0.5 %) have no depth")
+    line = run("image.exr", "disparity.png", "-o", "a.exr", *options, "--fill-depth", "nearest")
+    assert "2 px of depth filled (nearest)" in line
+    run("image.exr", "depth.npy", "-o", "b.exr", "--focus-m", "2", *LENS)
+    assert torch.equal(pixels("a.exr"), pixels("b.exr"))
+
+
+def test_distance_along_the_ray_is_made_depth_by_the_field_of_view(scene: Path) -> None:
+    focal_px = WIDTH / 2 / math.tan(math.radians(20))
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    ray = np.sqrt(1 + ((x - WIDTH / 2) / focal_px) ** 2 + ((y - HEIGHT / 2) / focal_px) ** 2)
+    np.save("ray.npy", depth()[0, 0].numpy() * ray)
+    camera = ("--focus-m", "2", "--fov-deg", "40", "--aperture-radius-m", "0.2")
+    run("image.exr", "ray.npy", "-o", "a.exr", "--depth-kind", "distance", *camera)
+    run("image.exr", "depth.npy", "-o", "b.exr", *camera)
+    torch.testing.assert_close(pixels("a.exr"), pixels("b.exr"), rtol=0, atol=1e-4)
+
+
+def test_ready_circles_of_confusion_need_no_camera(scene: Path) -> None:
+    coc_px = torch.linspace(-3, 3, WIDTH).expand(1, 1, HEIGHT, WIDTH)
+    np.save("coc.npy", coc_px.numpy())
+    line = run("image.exr", "coc.npy", "-o", "out.exr", "--depth-kind", "coc")
+    torch.testing.assert_close(pixels("out.exr"), torchdof.blur_by_coc(image(), coc_px), rtol=0, atol=1e-6)
+    assert "focus" not in line and "blur radius up to 3.0 px" in line
+
+
+@pytest.mark.parametrize(
+    ("options", "arguments"),
+    [
+        (("--no-occlusion",), {"occlusion": False}),
+        (("--method", "fold"), {"method": "fold"}),
+        (("--table", "gaussian"), {"table": torchdof.BlurTable.gaussian()}),
+        (("--table", "sato_j15"), {"table": torchdof.BlurTable.load("sato_j15")}),
+        (("--tolerance", "0"), {"tolerance": 0.0}),
+        (("--tolerance", "draft"), {"tolerance": 8 / 255}),
+    ],
+)
+def test_options_of_the_blur_are_those_of_the_function(
+    scene: Path, options: tuple[str, ...], arguments: dict[str, Any]
+) -> None:
+    run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", *LENS, *options)
+    camera = lens(2.0)
+    expected = torchdof.depth_of_field(image(), depth(), camera, **arguments)
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+
+
+def test_method_reaches_the_function(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    methods = []
+
+    def spy(*arguments: Any, method: str, **options: Any) -> torch.Tensor:
+        methods.append(method)
+        return torchdof.depth_of_field(*arguments, method=method, **options)
+
+    monkeypatch.setattr("torchdof.cli.frame.depth_of_field", spy)
+    for method in ("fold", "layered"):
+        run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", "--method", method)
+    assert methods == ["fold", "layered"]
+
+
+def test_alpha_goes_through_the_blur_premultiplied(scene: Path) -> None:
+    alpha = torch.zeros(1, 1, HEIGHT, WIDTH)
+    alpha[..., 4:12, 6:18] = 1.0
+    write_image("cut.exr", Picture(torch.cat([image() * alpha, alpha], dim=1), ("R", "G", "B", "A"), sample="float"))
+    run("cut.exr", "depth.npy", "-o", "out.exr", "--focus-m", "1", *LENS)
+    out = pixels("out.exr")
+    camera = lens(1.0)
+    expected = torchdof.depth_of_field(torch.cat([image() * alpha, alpha], dim=1), depth(), camera)
+    torch.testing.assert_close(out, expected, rtol=0, atol=1e-6)
+    assert bool(((out[:, 3] > 0.01) & (out[:, 3] < 0.99)).any())
+
+
+def test_table_of_three_colours_blurs_alpha_like_green(scene: Path) -> None:
+    table = torchdof.BlurTable("gaussian", coc=[1.0], params={"sigma": [[0.2], [0.5], [0.9]]})
+    table.save("colours.json")
+    grey = image()[:, :1].expand(-1, 4, -1, -1)
+    write_image("cut.exr", Picture(grey, ("R", "G", "B", "A"), sample="float"))
+    run("cut.exr", "depth.npy", "-o", "out.exr", "--focus-m", "1", *LENS, "--table", "colours.json")
+    out = pixels("out.exr")
+    torch.testing.assert_close(out[:, 3], out[:, 1])
+    assert not torch.allclose(out[:, 0], out[:, 1], atol=1e-3)
+
+
+def test_show_focus_tints_near_sharp_and_far(scene: Path) -> None:
+    write_image("white.png", Picture(torch.full((1, 1, HEIGHT, WIDTH), 0.3), ("Y",)))
+    np.save("coc.npy", np.tile(np.repeat([-4.0, 0.0, 4.0], WIDTH // 3), (HEIGHT, 1)))
+    line = run("white.png", "coc.npy", "-o", "tint.png", "--depth-kind", "coc", "--show-focus")
+    strongest = pixels("tint.png")[0, :, 0].argmax(dim=0)
+    assert strongest.tolist() == [0] * 8 + [1] * 8 + [2] * 8
+    assert "focus shown" in line
+
+
+def test_jpeg_in_jpeg_out_keeps_metadata(scene: Path) -> None:
+    picture = Picture(image(), metadata={"Make": ("string", "Maker"), "FNumber": ("float", 2.0)})
+    write_image("photo.jpg", picture)
+    run("photo.jpg", "depth.npy", "-o", "out.jpg", "--focus-m", "2")
+    metadata = read_image("out.jpg").metadata
+    assert metadata["Make"][1] == "Maker" and metadata["FNumber"][1] == 2.0
+
+
+def test_bits_and_transfer_of_the_result_are_as_asked(scene: Path) -> None:
+    np.save("depth.npy", np.full((HEIGHT, WIDTH), 2.0))
+    run("image.exr", "depth.npy", "-o", "out.png", "--focus-m", "2", "--bits", "16", "--out-transfer", "linear")
+    back = read_image("out.png", transfer="linear")
+    assert back.sample == "16"
+    torch.testing.assert_close(back.pixels, image(), rtol=0, atol=1e-5)
+
+
+def sequence(count: int = 3) -> None:
+    for n in range(1, count + 1):
+        write_image(f"shot.{n:04d}.exr", Picture(image() * n, sample="float"))
+        np.save(f"depth.{n:04d}.npy", depth().numpy())
+
+
+def test_sequence_follows_the_focus_of_its_keyframes(scene: Path) -> None:
+    sequence()
+    arguments = ("shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "1:2,3:6", *LENS)
+    lines = run(*arguments).splitlines()
+    assert [re.search(r"out.(\d+).exr: focus ([\d.]+) m", line).groups() for line in lines] == [  # type: ignore[union-attr]
+        ("0001", "2"),
+        ("0002", "3"),
+        ("0003", "6"),
+    ]
+    for n, focus_m in ((1, 2.0), (2, 3.0), (3, 6.0)):
+        camera = lens(focus_m)
+        expected = torchdof.depth_of_field(image() * n, depth(), camera)
+        torch.testing.assert_close(pixels(f"out.{n:04d}.exr"), expected, rtol=0, atol=1e-5)
+
+
+def test_resume_renders_only_what_is_missing(scene: Path) -> None:
+    sequence()
+    arguments = ("shot.####.exr", "depth.npy", "-o", "out.####.exr", "--focus-m", "2", *LENS)
+    run(*arguments)
+    (scene / "out.0002.exr").unlink()
+    os.utime("out.0001.exr", (1, 1))
+    lines = run(*arguments, "--resume").splitlines()
+    assert lines[0] == "2 of 3 frames are there already"
+    assert len(lines) == 2 and lines[1].startswith("out.0002.exr: ")
+    assert os.stat("out.0001.exr").st_mtime == 1
+
+
+def test_frames_choose_a_part_of_a_sequence(scene: Path) -> None:
+    sequence()
+    run("shot.####.exr", "depth.npy", "-o", "out.####.exr", "--focus-m", "2", "--frames", "2-3")
+    assert sorted(p.name for p in scene.glob("out.*")) == ["out.0002.exr", "out.0003.exr"]
+    message = run("shot.####.exr", "depth.npy", "-o", "o.####.exr", "--focus-m", "2", "--frames", "2-5", code=2)
+    assert "shot.0004.exr: there is no such file (2 of 4 frames missing)" in message
+
+
+def test_missing_depth_frame_is_found_before_anything_is_rendered(scene: Path) -> None:
+    sequence()
+    (scene / "depth.0003.npy").unlink()
+    message = run("shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "2", code=2)
+    assert "depth.0003.npy: there is no such file (1 of 3 depths missing)" in message
+    assert list(scene.glob("out.*")) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("none.exr", "depth.npy", "--focus-m", "2"), "none.exr: there is no such file"),
+        (("image.exr", "none.npy", "--focus-m", "2"), "none.npy: there is no such file"),
+        (("image.exr", "--focus-m", "2"), "image.exr: has no depth channel; name a depth file"),
+        (("image.exr", "depth.npy"), "where is the focus? give --focus-m METRES or --focus-at X,Y"),
+        (("image.exr", "depth.npy", "--focus-m", "near"), "--focus-m expects metres (2.0) or keyframes"),
+        (("image.exr", "depth.npy", "--focus-m", "1:2,5:3"), "--focus-m has keyframes but IMAGE is a single image"),
+        (("image.exr", "depth.npy", "--focus-m", "0.01"), "focus_m must be longer than the focal length"),
+        (("image.exr", "depth.npy", "--focus-at", "3"), "--focus-at expects a pixel X,Y such as 320,200, got '3'"),
+        (("image.exr", "depth.npy", "--focus-at", "99,5"), "focus point (99.0, 5.0) must lie in the frame of 24 x 16"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--focus-at", "3,3"), "--focus-m and --focus-at both say"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--f-number", "-1"), "f_number must be positive"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--fov-deg", "40"), "--fov-deg needs the opening of the lens"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--aperture-radius-m", "0.1"), "goes with --fov-deg"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--fov-deg", "40", "--focal-length-mm", "50"), "say the same"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--table", "nowhere"), "nowhere"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--tolerance", "-1"), "tolerance must be"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--tolerance", "best"), "one of 'draft', 'preview', 'final'"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--device", "warp"), "--device warp: there is no such device"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--fill-depth", "x"),
+            "--fill-depth expects nearest, far or metres",
+        ),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "disparity"), "disparity needs a scale"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "distance"),
+            "--depth-kind distance needs --fov-deg",
+        ),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "coc"), "--depth-kind coc is the blur itself"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--layer", "b"), "image.exr: has no layer 'b'"),
+        (("image.exr", "small.npy", "--focus-m", "2"), "small.npy: depth is 4 x 3 pixels but the image is 24 x 16"),
+        (("image.exr", "depth.####.npy", "--focus-m", "2"), "image.exr: is a single image"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--frames", "1-2"), "image.exr: is a single image"),
+        (("shot.####.exr", "depth.npy", "--focus-m", "2"), "out.exr: expected one place for the frame number"),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_exit_code_2(scene: Path, arguments: tuple[str, ...], says: str) -> None:
+    np.save("small.npy", np.ones((3, 4)))
+    message = run(*arguments, "-o", "out.exr", code=2)
+    assert message.startswith("error: ") and says in message
+    assert message.count("\n") == 1
+    assert not (scene / "out.exr").exists()
+
+
+def test_inputs_are_not_overwritten(scene: Path) -> None:
+    before = (scene / "image.exr").read_bytes()
+    assert "is one of the inputs" in run("image.exr", "depth.npy", "-o", "./image.exr", "--focus-m", "2", code=2)
+    assert (scene / "image.exr").read_bytes() == before
+
+
+@pytest.mark.parametrize("arguments", [["render", "image.exr"], ["render", "--nonsense"], ["nonsense"]])
+def test_wrong_usage_is_exit_code_2(scene: Path, arguments: list[str]) -> None:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+
+
+def test_help_teaches_by_examples() -> None:
+    text = CliRunner().invoke(app, ["render", "--help"], env={"COLUMNS": "200"}).output
+    for example in ("torchdof render shot.exr -o out.exr", "--focus-m 1:2,48:5.5", "--depth-kind disparity"):
+        assert example in text
+
+
+def test_python_dash_m_is_the_command(scene: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "torchdof", "render", "image.exr", "none.npy", "-o", "out.exr", "--focus-m", "2"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert result.stderr == "error: none.npy: there is no such file\n"

@@ -1,0 +1,153 @@
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchdof.depth.holes import fill_holes
+from torchdof.depth.kinds import depth_from_values
+from torchdof.depth.reading import read_depth
+
+NAN, INF = math.nan, math.inf
+
+
+def row(*values: float) -> torch.Tensor:
+    return torch.tensor([[[values]]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "value", "expected"),
+    [
+        ("z", {}, 2.5, 2.5),
+        ("z", {"scale": 0.001}, 1500.0, 1.5),
+        ("z", {"scale": 0.5, "offset": 2.0}, 4.0, 3.0),
+        ("z", {}, INF, INF),
+        ("disparity", {"scale": 0.193001 * 994.978, "offset": 31.086}, 50.0, 2.368248),
+        ("disparity", {"scale": 100.0}, 0.0, INF),
+        ("inverse", {}, 0.25, 4.0),
+        ("inverse", {"scale": 2.0, "offset": 0.5}, 0.5, 2.0),
+        ("coc", {}, -3.5, -3.5),
+        ("coc", {"scale": 0.5}, 4.0, 2.0),
+        ("coc", {}, 0.0, 0.0),
+    ],
+)
+def test_kinds_of_depth_agree_with_their_formulas(
+    kind: Any, options: dict[str, float], value: float, expected: float
+) -> None:
+    assert depth_from_values(row(value), kind, **options).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_distance_along_the_ray_of_a_plane_gives_back_its_depth() -> None:
+    height, width, focal_px = 30, 40, 35.0
+    y, x = torch.meshgrid(torch.arange(height) + 0.5 - height / 2, torch.arange(width) + 0.5 - width / 2, indexing="ij")
+    length = 3.0 * torch.sqrt(1 + (x / focal_px) ** 2 + (y / focal_px) ** 2)
+    fov_x_deg = math.degrees(2 * math.atan(width / 2 / focal_px))
+    depth = depth_from_values(length[None, None], "distance", fov_x_deg=fov_x_deg)
+    torch.testing.assert_close(depth, torch.full_like(depth, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "value"),
+    [
+        ("z", {}, 0.0),
+        ("z", {}, -1.0),
+        ("z", {}, NAN),
+        ("z", {}, -INF),
+        ("z", {"unknown": INF}, INF),
+        ("z", {"unknown": 65535.0, "scale": 0.001}, 65535.0),
+        ("disparity", {"scale": 100.0}, INF),
+        ("disparity", {"scale": 100.0}, -2.0),
+        ("disparity", {"scale": 100.0, "unknown": 0.0, "offset": 5.0}, 0.0),
+        ("inverse", {}, NAN),
+        ("coc", {}, INF),
+        ("coc", {}, NAN),
+    ],
+)
+def test_pixels_without_depth_are_nan(kind: Any, options: dict[str, float], value: float) -> None:
+    assert depth_from_values(row(value, 1.0), kind, **options).isnan().tolist() == [[[[True, False]]]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "says"),
+    [
+        ("metres", {}, "must be one of z, distance, disparity, inverse, coc, got 'metres'"),
+        ("disparity", {}, "disparity needs a scale"),
+        ("distance", {}, "needs the horizontal field of view"),
+        ("distance", {"fov_x_deg": 180.0}, r"must be in \(0, 180\) degrees"),
+        ("z", {"scale": 0.0}, "scale must be finite and not 0"),
+        ("z", {"offset": NAN}, "offset finite"),
+    ],
+)
+def test_kind_that_lacks_something_is_refused(kind: Any, options: dict[str, float], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        depth_from_values(row(1.0), kind, **options)
+
+
+@pytest.mark.parametrize(
+    ("fill", "expected"),
+    [
+        ("nearest", [1.0, 1.0, 1.0, 4.0, 4.0]),
+        ("far", [1.0, 4.0, 4.0, 4.0, 4.0]),
+        (9.0, [1.0, 9.0, 9.0, 9.0, 4.0]),
+        (INF, [1.0, INF, INF, INF, 4.0]),
+    ],
+)
+def test_holes_are_filled_as_asked(fill: Any, expected: list[float]) -> None:
+    filled = fill_holes(row(1.0, NAN, NAN, NAN, 4.0), fill)
+    if fill == "nearest":
+        filled[..., 2] = 1.0  # as near to one as to the other
+    assert filled.flatten().tolist() == expected
+
+
+def test_far_looks_up_and_down_too_and_takes_infinity() -> None:
+    depth = torch.tensor([[[[1.0, INF, 1.0], [2.0, NAN, 3.0], [1.0, 1.0, 1.0]]]])
+    assert fill_holes(depth, "far")[0, 0, 1, 1].item() == INF
+
+
+def test_far_of_a_coc_map_is_the_largest_signed_radius() -> None:
+    assert fill_holes(row(-5.0, NAN, -2.0), "far").flatten().tolist() == [-5.0, -2.0, -2.0]
+
+
+def test_hole_without_depth_in_its_row_or_column_is_filled_from_the_nearest() -> None:
+    depth = torch.full((1, 1, 5, 5), NAN)
+    depth[0, 0, 1, 1] = 2.0
+    assert fill_holes(depth, "far").unique().tolist() == [2.0]
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
+def test_nearest_is_as_near_as_the_nearest_of_all_pixels(height: int, width: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    depth = torch.rand(height, width, generator=generator) + 1.0
+    depth[torch.rand(height, width, generator=generator) < 0.7] = NAN
+    known = torch.nonzero(~depth.isnan()).tolist()
+    if not known:
+        return
+    filled = fill_holes(depth[None, None], "nearest")[0, 0]
+    for y in range(height):
+        for x in range(width):
+            best = min((y - i) ** 2 + (x - j) ** 2 for i, j in known)
+            got = min((y - i) ** 2 + (x - j) ** 2 for i, j in known if depth[i, j] == filled[y, x])
+            assert math.sqrt(got) <= math.sqrt(best) + 0.5
+
+
+@pytest.mark.parametrize("fill", ["nearest", "far"])
+def test_map_without_any_depth_is_refused(fill: Any) -> None:
+    with pytest.raises(ValueError, match="no pixel has a depth; check the kind, scale and offset"):
+        fill_holes(torch.full((1, 1, 2, 2), NAN), fill)
+
+
+@pytest.mark.parametrize("fill", ["middle", 0.0, -1.0, NAN, True])
+def test_unknown_fill_is_refused(fill: Any) -> None:
+    with pytest.raises(ValueError, match="fill"):
+        fill_holes(row(1.0, NAN), fill)
+
+
+def test_holes_are_counted_and_refused_unless_a_fill_is_asked_for(tmp_path: Path) -> None:
+    np.save(tmp_path / "d.npy", np.array([[1.0, 0.0], [np.nan, 2.0]]))
+    with pytest.raises(ValueError, match=r"d\.npy: 2 pixels \(50\.0 %\) have no depth"):
+        read_depth(tmp_path / "d.npy")
+    assert read_depth(tmp_path / "d.npy", fill="far").flatten().tolist() == [1.0, 2.0, 2.0, 2.0]

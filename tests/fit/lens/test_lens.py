@@ -1,0 +1,157 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchdof.fit.lens.lens import C_UM, D_UM, F_UM, Lens
+
+FACTS = {
+    "double_gauss_50mm": (50.3582, 36.1059),
+    "wide_22mm": (22.0235, 14.3183),
+    "telephoto_250mm": (249.5666, 105.0704),
+}
+SINGLET = "50 5 1.5168/64.17 20\n0 1 0 18\n-50 0 1 20\n"
+
+
+def lens_from(tmp_path: Path, text: str) -> Lens:
+    path = tmp_path / "lens.txt"
+    path.write_text(text, encoding="utf-8")
+    return Lens.read(path)
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_paraxial_focal_length_and_back_focal_distance_are_the_designs(name: str) -> None:
+    first = Lens.read(name).paraxial()
+    assert (first.focal_length, first.back_focal) == pytest.approx(FACTS[name], abs=1e-4)
+
+
+def test_principal_planes_and_focal_points_are_a_focal_length_apart() -> None:
+    for name in FACTS:
+        first = Lens.read(name).paraxial()
+        assert first.back_focal - first.rear_principal == pytest.approx(first.focal_length, rel=1e-12)
+        assert first.front_principal - first.front_focal == pytest.approx(first.focal_length, rel=1e-12)
+
+
+def test_thick_lens_agrees_with_the_lensmakers_equation(tmp_path: Path) -> None:
+    lens = lens_from(tmp_path, "0 0 0 18\n60 8 1.6 20\n-90 0 1 20\n")
+    power = 0.6 * (1 / 60 + 1 / 90 - 0.6 * 8 / (1.6 * 60 * 90))
+    first = lens.paraxial()
+    assert first.focal_length == pytest.approx(1 / power, rel=1e-12)
+    assert first.back_focal == pytest.approx((1 - 0.6 * 8 / (1.6 * 60)) / power, rel=1e-12)
+    # a stop before all glass is its own entrance pupil
+    assert (first.entrance_pupil, first.entrance_pupil_diameter) == pytest.approx((0.0, 18.0))
+
+
+def test_pupils_are_images_of_each_other() -> None:
+    for name in FACTS:
+        lens = Lens.read(name)
+        first = lens.paraxial()
+        v = first.exit_pupil - first.rear_principal
+        u = first.front_principal - first.entrance_pupil
+        # object distance u before H, image distance v behind H'
+        assert 1 / u + 1 / v == pytest.approx(1 / first.focal_length, rel=1e-9)
+        magnification = first.exit_pupil_diameter / first.entrance_pupil_diameter
+        assert abs(v / u) == pytest.approx(magnification, rel=1e-9)
+
+
+def test_stop_sets_the_f_number() -> None:
+    lens = Lens.read("double_gauss_50mm")
+    for f_number in (2.8, 8.0):
+        assert lens.with_f_number(f_number).paraxial().f_number == pytest.approx(f_number, rel=1e-12)
+    assert lens.with_stop(lens.diameter[lens.stop] / 2).paraxial().f_number == pytest.approx(
+        2 * lens.paraxial().f_number, rel=1e-12
+    )
+
+
+def test_marked_f_number_means_fully_open_and_a_faster_one_is_refused() -> None:
+    lens = Lens.read("double_gauss_50mm")
+    assert lens.with_f_number(2.0).diameter[lens.stop] == 17.1
+    with pytest.raises(ValueError, match=r"f_number must be at least 2\.03.*got 1\.8"):
+        lens.with_f_number(1.8)
+
+
+def test_scaling_keeps_the_f_number() -> None:
+    lens = Lens.read("double_gauss_50mm")
+    first, scaled = lens.paraxial(), lens.scaled(100.0).paraxial()
+    assert scaled.focal_length == pytest.approx(100.0, rel=1e-12)
+    assert scaled.f_number == pytest.approx(first.f_number, rel=1e-12)
+
+
+def test_abbe_number_is_the_dispersion_between_c_and_f(tmp_path: Path) -> None:
+    lens = lens_from(tmp_path, SINGLET)
+    n_c, n_d, n_f = (lens.indices(at)[1] for at in (C_UM, D_UM, F_UM))
+    assert n_d == pytest.approx(1.5168, abs=1e-12)
+    assert (n_d - 1) / (n_f - n_c) == pytest.approx(64.17, rel=1e-12)
+    # BK7's catalogue has 1.51432 and 1.52238: two terms of Cauchy are good to 2e-4
+    assert (n_c, n_f) == pytest.approx((1.51432, 1.52238), abs=2e-4)
+    assert lens.dispersive and not Lens.read("wide_22mm").dispersive
+
+
+def test_crown_and_flint_bring_red_and_blue_together(tmp_path: Path) -> None:
+    # powers in the ratio of the Abbe numbers: 0.01 V1 / (V1 - V2) and -0.01 V2 / (V1 - V2)
+    text = "44.78 4 1.5168/64.17 20\n-44.78 2 1.6200/36.37 20\n-811 1 1 20\n0 0 0 19\n"
+    doublet, singlet = lens_from(tmp_path, text), lens_from(tmp_path, SINGLET)
+    shift = [(lens.paraxial(C_UM).back_focal - lens.paraxial(F_UM).back_focal) for lens in (doublet, singlet)]
+    assert abs(shift[0]) < 0.1 * shift[1]
+
+
+def test_lines_are_read_back_as_the_same_lens(tmp_path: Path) -> None:
+    for text in (SINGLET, "inf 3 1.5 20\n-40 2 1 20\n0 0 0 10\n"):
+        lens = lens_from(tmp_path, text)
+        again = lens_from(tmp_path, "\n".join(lens.lines()))
+        for name in ("radius", "thickness", "index", "abbe", "diameter"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(lens, name))
+        assert again.stop == lens.stop
+
+
+def test_source_is_kept() -> None:
+    assert "2,673,491" in Lens.read("double_gauss_50mm").source
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("50 5 1.5 20\n0 1 0\n", r"line 2: expected the columns radius thickness index diameter, got 3"),
+        ("50 5 1.5 20\n0 1 0 18\n-50 x 1 20\n", r"line 3, column thickness: expected a number, got 'x'"),
+        ("50 5/2 1.5 20\n", r"line 1, column thickness: expected a number, got '5/2'"),
+        ("50 5 1.5/ 20\n", r"line 1, column index: expected a number or index/V, got '1.5/'"),
+        ("50 5 1.5/-3 20\n", r"line 1, column index: the Abbe number must be positive"),
+        ("50 5 0.9 20\n", r"line 1, column index: index must be between 1 and 5"),
+        ("50 5 0 20\n", r"line 1, column index: index must be between 1 and 5"),
+        ("50 -5 1.5 20\n", r"line 1, column thickness: thickness must be >= 0"),
+        ("# comment\n50 5 1.5 0\n", r"line 2, column diameter: diameter must be positive"),
+        ("nan 5 1.5 20\n", r"line 1, column radius: radius must be a number"),
+        ("0 1 0 18\n0 1 0 18\n", r"line 2, column radius: a second stop"),
+        ("50 5 1.5 20\n0 1 1.7 18\n", r"line 2, column index: the stop does not change the index"),
+        ("50 5 1.5 20\n-50 0 1 20\n", r"no aperture stop among 2 surfaces"),
+        ("", r"no aperture stop among 0 surfaces"),
+        ("50 5 1.5 20\n0 1 0 18\n", r"the index behind the last surface must be 1"),
+    ],
+)
+def test_wrong_prescription_is_refused_with_file_line_and_column(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        lens_from(tmp_path, text)
+    assert "lens.txt" in str(caught.value)
+
+
+def test_unknown_lens_lists_the_shipped_ones() -> None:
+    with pytest.raises(FileNotFoundError, match=r"double_gauss_50mm, telephoto_250mm, wide_22mm"):
+        Lens.read("triplet")
+
+
+def test_diverging_lens_has_no_focal_length(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="does not converge light"):
+        lens_from(tmp_path, "-50 5 1.5 20\n0 1 0 18\n50 0 1 20\n").paraxial()
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_wrong_numbers_are_refused(value: float) -> None:
+    lens = Lens.read("wide_22mm")
+    for change in (lens.with_f_number, lens.scaled):
+        with pytest.raises(ValueError, match="must be positive and finite"):
+            change(value)
+    with pytest.raises(ValueError, match=r"surface 5: diameter must be positive"):
+        lens.with_stop(value)
+    with pytest.raises(ValueError, match="wavelength_um must be in micrometres"):
+        lens.indices(value)

@@ -1,0 +1,171 @@
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from torchdof.fit.lens.lens import F_UM, Lens
+from torchdof.fit.lens.spot import Reference, focus_sensor, point_spread
+from torchdof.fit.lens.trace import signed_coc_mm
+
+
+@pytest.fixture(scope="module")
+def gauss() -> Lens:
+    return Lens.read("double_gauss_50mm")
+
+
+def largest(lens: Lens, reference: Reference) -> float:
+    sensor = focus_sensor(lens, 2.0, "paraxial", reference)
+    return point_spread(lens, 1.0, sensor, reference=reference, meridional=True, rays=20_000).radius
+
+
+def test_spherical_aberration_adds_15_percent_to_the_thin_lens(gauss: Lens) -> None:
+    # stop at 17.1 mm, focus at 2 m, object at 1 m, distances from the entrance pupil, the sensor set to a micrometre
+    sensor = round(focus_sensor(gauss, 2.0, "paraxial", "pupil"), 3)
+    assert sensor == 37.404
+    spot = point_spread(gauss, 1.0, sensor, reference="pupil", meridional=True, rays=20_000)
+    assert spot.radius == pytest.approx(0.3690, abs=1e-4)
+    first = gauss.paraxial()
+    thin = -signed_coc_mm(1.0, first.focal_length, first.f_number, 2.0)
+    assert thin == pytest.approx(0.3204, abs=1e-4)
+    assert spot.radius / thin == pytest.approx(1.15, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("reference", "radius"), [("principal", 0.37052), ("pupil", 0.36889), ("vertex", 0.35927), ("sensor", 0.39485)]
+)
+def test_blur_depends_on_what_distances_are_measured_from(gauss: Lens, reference: Reference, radius: float) -> None:
+    assert largest(gauss, reference) == pytest.approx(radius, abs=2e-5)
+
+
+def over_thin_lens(lens: Lens, f_number: float, focus_m: float, z_m: float) -> float:
+    """Largest blur radius over the thin lens's, less 1; allows for an entrance pupil beside H."""
+    first, stopped = lens.paraxial(), lens.with_f_number(f_number)
+    apart = (first.front_principal - first.entrance_pupil) / 1000.0
+    thin = abs(signed_coc_mm(z_m, first.focal_length, f_number, focus_m)) / (1.0 - apart / z_m)
+    sensor = focus_sensor(stopped, focus_m, "paraxial")
+    return point_spread(stopped, z_m, sensor, meridional=True, rays=20_000).radius / thin - 1.0
+
+
+@pytest.mark.parametrize(("name", "focus_m"), [("double_gauss_50mm", 2.0), ("wide_22mm", 1.0)])
+@pytest.mark.parametrize("z_m", [0.7, 1.5, 5.0, math.inf])
+def test_tiny_aperture_is_the_thin_lens(name: str, focus_m: float, z_m: float) -> None:
+    lens = Lens.read(name)
+    assert abs(over_thin_lens(lens, 400.0, focus_m, z_m)) < 2e-4
+    # what is left is of third order: a quarter for a stop half as wide
+    wide, narrow = (over_thin_lens(lens, f_number, focus_m, z_m) for f_number in (22.0, 44.0))
+    assert abs(wide) > 1e-3
+    assert wide / narrow == pytest.approx(4.0, rel=0.06)
+
+
+def test_best_focus_has_the_least_rms_radius(gauss: Lens) -> None:
+    best = focus_sensor(gauss, 2.0, "best")
+    rms = [point_spread(gauss, 2.0, best + shift, meridional=True).rms for shift in (-0.005, 0.0, 0.005)]
+    assert rms[1] < min(rms[0], rms[2])
+    assert rms[0] == pytest.approx(rms[2], rel=1e-3)  # a parabola's feet
+    assert abs(best - focus_sensor(gauss, 2.0, "paraxial")) < 0.02
+
+
+def test_spot_on_axis_is_round_and_agrees_with_the_fan(gauss: Lens) -> None:
+    sensor = focus_sensor(gauss, 2.0)
+    for z_m in (1.0, 2.0, math.inf):
+        whole = point_spread(gauss, z_m, sensor)
+        fan = point_spread(gauss, z_m, sensor, meridional=True)
+        assert whole.asymmetry < 0.03 and fan.asymmetry == 0.0
+        assert abs(whole.centre) < 1e-9
+        assert whole.rms == pytest.approx(fan.rms, rel=0.005)
+        assert whole.pupil_mm2 == pytest.approx(fan.pupil_mm2, rel=0.02)
+        shares = np.linspace(0.1, 1.0, 10) * fan.radius
+        inside = [[float(s.weight[s.r <= r].sum()) for r in shares] for s in (whole, fan)]
+        np.testing.assert_allclose(inside[0], inside[1], atol=0.01)
+
+
+def test_very_far_is_infinity(gauss: Lens) -> None:
+    sensor = focus_sensor(gauss, 2.0)
+    for meridional in (True, False):
+        far, infinite = (point_spread(gauss, z, sensor, rays=2_500, meridional=meridional) for z in (1e12, math.inf))
+        np.testing.assert_allclose(far.y, infinite.y, atol=1e-9)
+        np.testing.assert_allclose(far.weight, infinite.weight, rtol=1e-9)
+
+
+def test_light_of_a_spot_sums_to_one(gauss: Lens) -> None:
+    sensor = focus_sensor(gauss, 2.0)
+    for field_mm in (0.0, 12.0):
+        spot = point_spread(gauss, 1.0, sensor, field_mm=field_mm, rays=5_000)
+        assert spot.weight.sum() == pytest.approx(1.0, abs=1e-12)
+        assert spot.weight.min() > 0
+        assert abs(spot.weight @ spot.y) < 1e-12  # hits are relative to the centroid
+
+
+def test_vignetting_takes_light_and_roundness_towards_the_corner(gauss: Lens) -> None:
+    sensor = focus_sensor(gauss, 2.0)
+    spots = [point_spread(gauss, 1.0, sensor, field_mm=f) for f in (0.0, 6.0, 12.0, 18.0)]
+    area = [spot.pupil_mm2 for spot in spots]
+    assert area == sorted(area, reverse=True) and area[3] < 0.5 * area[0]
+    asymmetry = [spot.asymmetry for spot in spots]
+    assert asymmetry == sorted(asymmetry) and asymmetry[3] > 0.3
+
+
+def test_field_is_where_a_pinhole_would_image_the_point(gauss: Lens) -> None:
+    lens = gauss.with_f_number(16.0)
+    for z_m in (2.0, math.inf):
+        sensor = focus_sensor(lens, z_m)
+        for field_mm, distortion in ((0.1, 1e-4), (3.0, 1e-3), (10.0, 0.008)):  # grows with the square of the field
+            centre = point_spread(lens, z_m, sensor, field_mm=field_mm, rays=5_000).centre
+            assert centre == pytest.approx(field_mm, rel=distortion)
+
+
+def test_focus_is_sharp_and_the_same_plane_from_every_reference(gauss: Lens) -> None:
+    lens = gauss.with_f_number(16.0)
+    for reference in ("principal", "pupil", "vertex", "sensor"):
+        sensor = focus_sensor(lens, 2.0, reference=reference)
+        assert point_spread(lens, 2.0, sensor, reference=reference, meridional=True).radius < 1e-3
+    first = gauss.paraxial()
+    sensor = focus_sensor(gauss, 2.0, "paraxial", "sensor")
+    from_h = 2.0 - (gauss.vertices[-1] + sensor - first.front_principal) / 1000.0
+    assert focus_sensor(gauss, from_h, "paraxial", "principal") == pytest.approx(sensor, abs=1e-9)
+
+
+def test_blue_light_focuses_nearer(tmp_path: Path) -> None:
+    (tmp_path / "single.txt").write_text("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
+    lens = Lens.read(tmp_path / "single.txt")
+    sensor = focus_sensor(lens, math.inf)
+    here = point_spread(lens, math.inf, sensor, meridional=True).rms
+    blue = point_spread(lens, math.inf, sensor, meridional=True, wavelength_um=F_UM).rms
+    nearer = point_spread(lens, math.inf, sensor - 0.5, meridional=True, wavelength_um=F_UM).rms
+    assert blue > here and nearer < blue
+
+
+def test_wrong_arguments_are_refused(gauss: Lens) -> None:
+    unknown: Any = "film"
+    sensor = focus_sensor(gauss, 2.0)
+    for call, message in (
+        (lambda: focus_sensor(gauss, 2.0, unknown), "focus must be one of best, paraxial, got 'film'"),
+        (lambda: focus_sensor(gauss, 2.0, reference=unknown), "reference must be one of principal, pupil"),
+        (lambda: focus_sensor(gauss, 0.04, "paraxial", "vertex"), None),
+        (lambda: focus_sensor(gauss, 0.02), "must lie in front of the lens"),
+        (lambda: focus_sensor(gauss, 0.045), r"farther than the focal length \(50.36 mm\)"),
+        (lambda: focus_sensor(gauss, math.nan), "must lie in front of the lens"),
+        (lambda: point_spread(gauss, 1.0, sensor, rays=3), "rays must be at least 16, got 3"),
+        (lambda: point_spread(gauss, 1.0, sensor, field_mm=1.0, meridional=True), "points on the axis"),
+        (lambda: point_spread(gauss, 1.0, sensor, field_mm=90.0), "no ray of the object point passes"),
+    ):
+        if message is None:
+            call()
+            continue
+        with pytest.raises(ValueError, match=message):
+            call()
+
+
+@pytest.mark.hard
+def test_32_distances_at_5_fields_with_50_000_rays_take_less_than_a_minute(gauss: Lens) -> None:
+    sensor = focus_sensor(gauss, 2.0)
+    start = time.perf_counter()
+    for z_m in 1.0 / np.linspace(1 / 0.7, 1e-3, 32):
+        for field_mm in (0.0, 4.0, 8.0, 12.0, 16.0):
+            point_spread(gauss, float(z_m), sensor, field_mm=field_mm, rays=50_000)
+    seconds = time.perf_counter() - start
+    print(f"32 distances x 5 fields x 50,000 rays: {seconds:.1f} s")
+    assert seconds < 60.0

@@ -1,0 +1,228 @@
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchdof import BlurTable, Camera
+from torchdof.fit import natural_psnr, trace_table
+from torchdof.fit.lens.lens import RGB_UM, Lens
+from torchdof.fit.lens.spot import Spot, focus_sensor, point_spread
+from torchdof.fit.lens.trace import signed_coc_mm
+from torchdof.optics import psf
+
+WIDTH = 1920
+PIXEL = 36.0 / WIDTH
+# lens, f-number, focus, nodes, wanted PSNR between nodes where images are blurred
+SHIPPED = {
+    "double_gauss_50mm_f2": ("double_gauss_50mm", 2.0, 2.0, 33, 50.0),
+    "double_gauss_50mm_f4": ("double_gauss_50mm", 4.0, 2.0, 17, 60.0),
+    "telephoto_250mm_f8": ("telephoto_250mm", 8.0, 10.0, 33, 55.0),
+    "wide_22mm_f4": ("wide_22mm", 4.0, 0.5, 17, 60.0),
+}
+
+
+def distance_m(coc: float, focal: float, f_number: float, focus_m: float) -> float:
+    per_dioptre = signed_coc_mm(math.inf, focal, f_number, focus_m) * focus_m
+    dioptres = 1.0 / focus_m - coc / per_dioptre
+    return 1.0 / dioptres if dioptres > 1e-9 else math.inf
+
+
+def traced_kernel(spot: Spot, least: int = 1) -> np.ndarray:
+    """The spot of a fan turned about the axis and counted in pixels: no kernel code, no fit."""
+    r = np.repeat(spot.r / PIXEL, 128)
+    turn = 2 * math.pi * (np.arange(len(r)) * (math.sqrt(5) - 1) / 2)
+    size = max(least, 2 * math.ceil(r.max() + 0.5) + 1)
+    x, y = (np.floor(r * wave(turn) + size / 2).astype(int) for wave in (np.cos, np.sin))
+    counted = np.bincount(y * size + x, np.repeat(spot.weight, 128), size * size).reshape(size, size)
+    return counted / counted.sum()
+
+
+def interpolated(table: BlurTable, coc_px: float) -> np.ndarray:
+    params = table.params(torch.tensor(coc_px, dtype=torch.float64), WIDTH)
+    return psf.pixel_kernels(table.family, {key: value[0] for key, value in params.items()}).numpy()
+
+
+def between(table: BlurTable, share: float = 0.5) -> np.ndarray:
+    coc = table.coc.numpy()
+    return coc[:-1] + share * np.diff(coc)
+
+
+def psnr(
+    table: BlurTable, places: np.ndarray, lens: Lens, f_number: float, focus_m: float, *, shown: bool
+) -> np.ndarray:
+    """PSNR at signed coc in mm: of what the table shows, or of its kernels without the fade below a pixel."""
+    focal, stopped = lens.paraxial().focal_length, lens.with_f_number(f_number)
+    sensor = focus_sensor(stopped, focus_m)
+    found = []
+    for coc in places:
+        z_m = distance_m(coc, focal, f_number, focus_m)
+        truth = traced_kernel(point_spread(stopped, z_m, sensor, meridional=True, rays=4_000))
+        px = coc / PIXEL
+        made = table.kernels(torch.tensor([px]), WIDTH)[0, 0].numpy() if shown else interpolated(table, px)
+        found.append(natural_psnr(made, truth))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_table_matches_traced_spots_between_its_nodes(name: str) -> None:
+    lens, f_number, focus_m, nodes, wanted = SHIPPED[name]
+    table = BlurTable.load(name)
+    assert len(table.coc) == nodes
+    places = between(table)
+    blurred = places[np.abs(places) >= PIXEL]
+    shown = psnr(table, blurred, Lens.read(lens), f_number, focus_m, shown=True)
+    plain = psnr(table, places, Lens.read(lens), f_number, focus_m, shown=False)
+    print(f"{name}: {shown.min():.1f} dB (median {np.median(shown):.1f}), with focus {plain.min():.1f} dB")
+    assert shown.min() >= wanted
+    assert plain.min() >= 50.0
+
+
+@pytest.mark.parametrize("share", [0.15, 1 / 3, 2 / 3, 0.85])
+def test_match_is_no_special_property_of_the_midpoints(share: float) -> None:
+    # the fit saw spots at 1/4, 1/2 and 3/4 of each interval
+    table = BlurTable.load("double_gauss_50mm_f2")
+    lens = Lens.read("double_gauss_50mm")
+    assert psnr(table, between(table, share), lens, 2.0, 2.0, shown=False).min() >= 50.0
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_table_says_where_it_is_from(name: str) -> None:
+    table = BlurTable.load(name)
+    lens, f_number, focus_m, _, _ = SHIPPED[name]
+    assert table.provenance["prescription"].split("; ") == Lens.read(lens).lines()
+    assert (table.provenance["f_number"], table.provenance["focus_m"]) == (f_number, focus_m)
+    assert "trace_table(" in table.provenance["command"] and re.fullmatch(r"\d{4}-\d\d-\d\d", table.provenance["date"])
+    assert table.residual is not None and float(table.residual.max()) < 0.03
+    size = len(str(table.to_dict()))
+    assert size < 150_000
+
+
+def test_kernels_of_a_shipped_table_keep_all_light_and_stay_positive() -> None:
+    table = BlurTable.load("double_gauss_50mm_f2")
+    kernels = table.kernels(torch.linspace(-40.0, 20.0, 61), WIDTH)
+    assert kernels.min() >= 0
+    torch.testing.assert_close(kernels.sum((-2, -1)), torch.ones(61, 1, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
+def test_kernels_change_smoothly_with_depth() -> None:
+    # the largest step on a fine grid is that of a moving edge, not of a jump from branch to branch
+    table = BlurTable.load("double_gauss_50mm_f2")
+    px = torch.linspace(-7.0, 5.0, 241)
+    kernels = torch.stack(
+        [torch.from_numpy(np.pad(k, (31 - len(k)) // 2)) for k in (interpolated(table, float(p)) for p in px)]
+    )
+    steps = kernels.diff(dim=0).abs().sum((-2, -1))
+    neighbours = torch.maximum(steps[:-2], steps[2:])
+    assert float((steps[1:-1] / neighbours.clamp_min(1e-3)).max()) < 3.0
+
+
+def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = Lens.read("double_gauss_50mm")
+    found = {}
+    for sweeps in (0, 6):
+        monkeypatch.setattr("torchdof.fit.lens.nodes._SWEEPS", sweeps)
+        table = small(lens, f_number=4.0, nodes=9, points=33)
+        places = between(table)
+        found[sweeps] = psnr(table, places[np.abs(places) > PIXEL], lens, 4.0, 2.0, shown=True)
+    assert found[6].min() > found[0].min() + 3.0
+
+
+def test_signed_coc_is_the_cameras() -> None:
+    depth = torch.tensor([0.7, 1.0, 2.0, 3.0, 100.0, math.inf], dtype=torch.float64).reshape(1, 1, 1, -1)
+    camera = Camera(50.3582, 2.8, 2.0, 36.0)
+    expected = camera.coc_px(depth, width=36).flatten().tolist()
+    found = [signed_coc_mm(z, 50.3582, 2.8, 2.0) for z in depth.flatten().tolist()]
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def small(lens: Lens, **changes: Any) -> BlurTable:
+    given = {"f_number": 8.0, "focus_m": 2.0, "nodes": 5, "points": 17, "rays": 300}
+    return trace_table(lens, **{**given, **changes})
+
+
+def test_shut_down_lens_gives_discs_of_the_thin_lens() -> None:
+    table = small(Lens.read("double_gauss_50mm"), f_number=32.0, focus="paraxial")
+    far = psf.disc(float(table.coc[-1]) / PIXEL)
+    made = table.kernels(table.coc[-1:] / PIXEL, WIDTH)[0, 0]
+    assert natural_psnr(made.numpy(), far.numpy()) > 55.0
+
+
+def test_nodes_reach_from_the_nearest_distance_to_infinity() -> None:
+    lens = Lens.read("double_gauss_50mm")
+    focal = lens.paraxial().focal_length
+    table = small(lens, nearest_m=1.0)
+    assert float(table.coc[0]) == pytest.approx(signed_coc_mm(1.0, focal, 8.0, 2.0), rel=1e-6)
+    assert float(table.coc[-1]) == pytest.approx(signed_coc_mm(math.inf, focal, 8.0, 2.0), rel=1e-6)
+    assert 0.0 in table.coc.tolist()
+
+
+def test_focus_at_infinity_has_a_near_side_only() -> None:
+    table = small(Lens.read("double_gauss_50mm"), focus_m=math.inf, nodes=4)
+    assert len(table.coc) == 4 and float(table.coc.max()) == 0.0
+    assert table.provenance["focus_m"] == "inf"
+
+
+def test_dispersion_gives_one_kernel_a_channel(tmp_path: Path) -> None:
+    (tmp_path / "single.txt").write_text("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
+    lens = Lens.read(tmp_path / "single.txt")
+    table = small(lens, focus="paraxial", wavelengths_um=RGB_UM)
+    assert table.channels == 3
+    # behind the focus a singlet's image lies nearer to the lens, in blue even more: the blur is larger
+    red, green, blue = table.node_params["radius"][:, -1].tolist()
+    assert red < green < blue
+    # before it the other way round
+    red, green, blue = table.node_params["radius"][:, 0].tolist()
+    assert red > green > blue
+
+
+def test_off_axis_table_states_its_asymmetry() -> None:
+    lens = Lens.read("double_gauss_50mm")
+    table = small(lens, f_number=2.0, field_mm=12.0, rays=2_000)
+    asymmetry = table.provenance["asymmetry"]
+    assert len(asymmetry) == 5 and max(asymmetry) > 0.2
+    assert small(lens).provenance["asymmetry"] == 0.0
+
+
+@pytest.mark.parametrize(("family", "wanted"), [("softm", 55.0), ("disc", 40.0), ("gaussian", 25.0), ("ring", 35.0)])
+def test_named_shapes_follow_a_stopped_down_lens(family: str, wanted: float) -> None:
+    lens = Lens.read("double_gauss_50mm")
+    table = small(lens, f_number=4.0, family=family, rays=1_000)
+    assert table.family == family
+    ends = table.coc.numpy()[[0, -1]]
+    assert psnr(table, ends, lens, 4.0, 2.0, shown=True).min() > wanted
+
+
+def test_command_in_the_provenance_makes_the_table_again() -> None:
+    table = small(Lens.read("double_gauss_50mm"))
+    command = table.provenance["command"].removeprefix("torchdof.fit.")
+    again = eval(command, {"trace_table": trace_table, "Lens": Lens})
+    assert again.to_dict() == table.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"family": "square"}, "family must be one of gaussian, ring, disc, softm, radial, got 'square'"),
+        ({"nodes": 4}, "nodes must be at least 5"),
+        ({"nodes": 40, "width_px": 20}, "nodes must be at most [0-9]+ for this lens and width_px, got 40"),
+        ({"points": 2}, "points must be at least 3, got 2"),
+        ({"width_px": 0}, "width_px must be a number of pixels > 0"),
+        ({"sensor_width_mm": math.nan}, "sensor_width_mm must be a number > 0"),
+        ({"wavelengths_um": RGB_UM}, "wavelengths_um need a lens with Abbe numbers"),
+        ({"f_number": 1.0}, "f_number must be at least 2.03"),
+        ({"f_number": math.nan}, "f_number must be positive"),
+        ({"focus_m": 0.04}, "farther than the focal length"),
+        ({"focus_m": math.nan}, "focus_m must be a number of metres, got nan"),
+        ({"nearest_m": 3.0}, "nearest_m must be nearer than the focus at 2.0 m, got 3.0"),
+        ({"focus": "sharp"}, "focus must be one of best, paraxial"),
+        ({"reference": "film"}, "reference must be one of principal"),
+        ({"rays": 3}, "rays must be at least 16"),
+    ],
+)
+def test_wrong_arguments_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        small(Lens.read("double_gauss_50mm"), **changes)

@@ -1,0 +1,68 @@
+from pathlib import Path
+
+import pytest
+
+from torchdof.io.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
+
+
+@pytest.mark.parametrize(
+    ("pattern", "frame", "name"),
+    [
+        ("a.####.exr", 7, "a.0007.exr"),
+        ("a.####.exr", 12345, "a.12345.exr"),
+        ("a_%03d.png", 7, "a_007.png"),
+        ("%d.png", 7, "7.png"),
+        ("#.png", 12, "12.png"),
+    ],
+)
+def test_pattern_names_frames(pattern: str, frame: int, name: str) -> None:
+    assert FramePattern(pattern).name(frame) == Path(name)
+
+
+@pytest.mark.parametrize("pattern", ["a.exr", "a.##.##.exr", "shot.##/a.exr", "%d/%d.exr"])
+def test_pattern_needs_one_place_for_the_number(pattern: str) -> None:
+    with pytest.raises(ValueError, match="expected one place for the frame number"):
+        FramePattern(pattern)
+
+
+def test_frames_are_found_in_order_and_only_with_their_padding(tmp_path: Path) -> None:
+    for name in ("a.0010.exr", "a.0002.exr", "a.10000.exr", "a.3.exr", "b.0001.exr", "a.0004.exr.part"):
+        (tmp_path / name).touch()
+    assert FramePattern(tmp_path / "a.####.exr").frames() == [2, 10, 10000]
+    assert FramePattern(tmp_path / "missing" / "a.####.exr").frames() == []
+
+
+def test_dots_and_brackets_of_a_name_are_taken_literally(tmp_path: Path) -> None:
+    for name in ("a+[x].01.exr", "aa[x]x01.exr"):
+        (tmp_path / name).touch()
+    assert FramePattern(tmp_path / "a+[x].##.exr").frames() == [1]
+
+
+@pytest.mark.parametrize(("text", "expected"), [("1-48", (1, 48)), ("7", (7, 7)), (" 3 - 3 ", (3, 3))])
+def test_frame_ranges_are_read(text: str, expected: tuple[int, int]) -> None:
+    assert parse_frames(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "a", "1-", "5-1", "1,2", "1.5"])
+def test_other_frame_ranges_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="--frames"):
+        parse_frames(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "near", "0", "-1", "nan", "1:2,", "1:2,1:3", "1:2,3", "2,3", "1:0", "x:2", "1.5:2", "1:2:3"]
+)
+def test_other_focus_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"--focus-m expects metres \(2.0\) or keyframes"):
+        parse_focus(text)
+
+
+def test_focus_between_keyframes_is_linear_in_dioptres_and_held_outside() -> None:
+    keys = parse_focus("20:4.0,10:2.0")
+    assert [focus_at_frame(keys, n) for n in (0, 10, 20, 99)] == [2.0, 2.0, 4.0, 4.0]
+    assert focus_at_frame(keys, 15) == pytest.approx(1 / 0.375)
+
+
+def test_focus_can_end_at_infinity() -> None:
+    keys = parse_focus("0:1,4:inf,8:inf")
+    assert [focus_at_frame(keys, n) for n in (0, 2, 4, 6)] == [1.0, 2.0, float("inf"), float("inf")]

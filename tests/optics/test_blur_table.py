@@ -1,0 +1,380 @@
+import copy
+import json
+import math
+import stat
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchdof import BlurTable
+from torchdof.optics import psf
+
+
+def at(table: BlurTable, *coc_px: float, width: int = 100) -> dict[str, list[float]]:
+    """Parameters of a one-channel table at these signed coc."""
+    params = table.params(torch.tensor(coc_px, dtype=torch.float64), width)
+    return {name: value[0].tolist() for name, value in params.items()}
+
+
+def example(**changes: Any) -> dict[str, Any]:
+    """A whole table as stored, with fields changed; a field set to None is left out."""
+    data: dict[str, Any] = {
+        "schema": "torchdof/blur-table",
+        "version": 1,
+        "name": "lens",
+        "family": "ring",
+        "unit": "mm",
+        "sensor_width_mm": 36.0,
+        "coc": [-0.2, -0.1, 0.3],
+        "params": {"sigma": [0.1, 0.04, 0.12], "r_c": [0.0, 0.05, 0.1]},
+        "strength": [0.5, 0.6, 0.7],
+        "residual": [0.01, 0.02, 0.03],
+        "provenance": {"camera": "a lens", "focus_m": 2.0},
+    }
+    return {name: value for name, value in {**copy.deepcopy(data), **changes}.items() if value is not None}
+
+
+TWO_SIDES = BlurTable("ring", [-4.0, -2.0, 2.0, 8.0], {"sigma": [1.0, 0.4, 0.5, 3.0], "r_c": [0.0, 1.0, 1.0, 2.0]},
+                      unit="fraction")  # fmt: skip
+
+
+def test_nodes_are_returned_as_given() -> None:
+    params = at(TWO_SIDES, -400.0, -200.0, 200.0, 800.0)
+    assert params["sigma"] == pytest.approx([100.0, 40.0, 50.0, 300.0])
+    assert params["r_c"] == pytest.approx([0.0, 100.0, 100.0, 200.0])
+
+
+def test_parameters_are_linear_between_nodes_and_down_to_zero() -> None:
+    assert at(TWO_SIDES, 500.0, -300.0, 100.0, -50.0)["sigma"] == pytest.approx([175.0, 70.0, 25.0, 10.0])
+    assert at(TWO_SIDES, 0.0) == {"sigma": [0.0], "r_c": [0.0]}
+
+
+def test_lengths_grow_with_the_coc_beyond_the_last_node() -> None:
+    assert at(TWO_SIDES, -800.0, 1600.0)["sigma"] == pytest.approx([200.0, 600.0])
+
+
+def test_a_node_at_focus_keeps_the_blur_of_the_lens_itself() -> None:
+    table = BlurTable("gaussian", [0.0, 0.1], {"sigma": [0.01, 0.05]}, unit="fraction")
+    assert at(table, 0.0, 5.0, 10.0)["sigma"] == pytest.approx([1.0, 3.0, 5.0])
+    assert at(table, -5.0)["sigma"] == pytest.approx([3.0])
+
+
+def test_a_side_without_nodes_mirrors_the_other() -> None:
+    for nodes in ([1.0], [-1.0]):
+        assert at(BlurTable("disc", nodes, {"radius": [1.2]}), -3.0, 3.0)["radius"] == pytest.approx([3.6, 3.6])
+
+
+def test_sides_may_differ() -> None:
+    table = BlurTable("softm", [-1.0, 1.0],
+                      {"radius": [1.0, 1.1], "sigma": [0.1, 0.2], "b": [-0.5, 2.0], "m": [2.0, 4.0]})  # fmt: skip
+    params = at(table, -6.0, 6.0)
+    assert params["radius"] == pytest.approx([6.0, 6.6]) and params["b"] == pytest.approx([-0.5, 2.0])
+
+
+def test_pure_numbers_do_not_scale_with_the_coc() -> None:
+    table = BlurTable("softm", [1.0], {"radius": [1.0], "sigma": [0.1], "b": [0.7], "m": [3.0]})
+    params = at(table, 0.01, 1.0, 500.0)
+    assert params["b"] == [0.7] * 3 and params["m"] == [3.0] * 3
+    assert params["sigma"] == pytest.approx([0.001, 0.1, 50.0])
+
+
+@given(st.floats(-20.0, 20.0), st.floats(-1e-6, 1e-6))
+def test_parameters_never_jump(coc: float, step: float) -> None:
+    first, second = at(TWO_SIDES, coc, width=1), at(TWO_SIDES, coc + step, width=1)
+    for name in first:
+        assert abs(first[name][0] - second[name][0]) <= abs(step) + 1e-12  # no parameter is steeper than the coc
+
+
+def test_a_fraction_scales_with_the_width_of_the_image() -> None:
+    table = BlurTable("disc", [0.01, 0.02], {"radius": [0.01, 0.03]}, unit="fraction")
+    assert at(table, 15.0, width=1000)["radius"] == pytest.approx([20.0])
+    assert at(table, 30.0, width=2000)["radius"] == pytest.approx([40.0])
+
+
+def test_millimetres_scale_with_the_width_of_the_image_over_that_of_the_sensor() -> None:
+    table = BlurTable("disc", [0.1, 0.2], {"radius": [0.1, 0.3]}, unit="mm", sensor_width_mm=24.0)
+    assert at(table, 0.15 * 2400 / 24.0, width=2400)["radius"] == pytest.approx([0.2 * 2400 / 24.0])
+
+
+def test_a_relative_table_does_not_depend_on_the_width() -> None:
+    assert at(BlurTable.disc(), 3.0, width=10) == at(BlurTable.disc(), 3.0, width=10_000) == {"radius": [3.0]}
+
+
+def test_gaussian_has_the_second_moment_of_the_disc_by_default() -> None:
+    r = torch.linspace(0, 20, 200_001, dtype=torch.float64)
+    moments = []
+    for table in (BlurTable.disc(), BlurTable.gaussian()):
+        params = {name: value[0] for name, value in table.params(torch.tensor(2.0), 100).items()}
+        mass = psf.profile(table.family, r, params) * r
+        moments.append(float((mass * r**2).sum() / mass.sum()))
+    assert moments[0] == pytest.approx(2.0, rel=1e-4) and moments[1] == pytest.approx(moments[0], rel=1e-4)
+    assert at(BlurTable.gaussian(0.25), 8.0)["sigma"] == [2.0]
+
+
+def test_parameters_are_differentiable_in_the_coc() -> None:
+    coc = torch.tensor([-500.0, -110.0, 30.0, 350.0, 900.0], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda c: tuple(TWO_SIDES.params(c, 100).values()), coc)
+
+
+def test_kernels_are_differentiable_in_the_coc() -> None:
+    coc = torch.tensor([-1.3, 0.2, 0.7], dtype=torch.float64, requires_grad=True)
+    for table in (BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")):
+        assert torch.autograd.gradcheck(lambda c, table=table: table.kernels(c, 100, size=5), coc)
+
+
+@pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])
+def test_kernels_are_one_pixel_up_to_a_coc_of_half_a_pixel(name: str) -> None:
+    table = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}.get(name, lambda: BlurTable.load(name))()
+    kernels = table.kernels(torch.tensor([-0.5, 0.0, 0.3, 0.5]), 100, size=5)
+    assert_close(kernels[:, 0, 2, 2], torch.ones(4, dtype=torch.float64), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])
+def test_kernels_change_continuously_through_focus(name: str) -> None:
+    table = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}.get(name, lambda: BlurTable.load(name))()
+    coc = torch.arange(-1.6, 1.6, 4e-3, dtype=torch.float64)
+    jumps = table.kernels(coc, 100, size=11).diff(dim=0).abs().sum((-2, -1))
+    assert float(jumps.max()) < 0.03
+
+
+def test_kernels_are_those_of_the_family_at_the_table_s_parameters() -> None:
+    coc = torch.tensor([-300.0, 700.0])
+    kernels = TWO_SIDES.kernels(coc, 1, size=31)
+    params = {name: value[0] for name, value in TWO_SIDES.params(coc, 1).items()}
+    assert_close(kernels[:, 0], psf.pixel_kernels("ring", params, 31))
+    assert kernels.shape == (2, 1, 31, 31) and kernels.dtype == torch.float64
+
+
+def test_channels_have_their_own_kernels() -> None:
+    table = BlurTable("disc", [-1.0, 1.0], {"radius": [[1.0, 1.0], [1.1, 0.9], [1.2, 0.8]]})
+    assert table.channels == 3 and "3 channels" in repr(table)
+    kernels = table.kernels(torch.tensor([-5.0, 5.0]), 100, size=15)
+    assert kernels.shape == (2, 3, 15, 15)
+    assert_close(kernels[0, 2], psf.disc(6.0, size=15))
+    assert_close(kernels[1, 1], psf.disc(4.5, size=15))
+
+
+def test_a_parameter_may_be_shared_by_the_channels() -> None:
+    table = BlurTable("ring", [1.0], {"sigma": [[0.2], [0.3]], "r_c": [0.5]})
+    assert table.params(torch.tensor(4.0), 100)["r_c"].tolist() == [2.0, 2.0]
+
+
+def test_radial_values_are_interpolated_and_scale_only_in_radius() -> None:
+    table = BlurTable("radial", [0.1, 0.2], {"values": [[1.0, 1.0, 0.0], [1.0, 3.0, 1.0]], "radius": [0.1, 0.2]},
+                      unit="fraction")  # fmt: skip
+    params = table.params(torch.tensor(15.0), 100)
+    assert_close(params["values"], torch.tensor([[1.0, 2.0, 0.5]], dtype=torch.float64))
+    assert params["radius"].tolist() == [15.0]
+    assert table.kernels(torch.tensor([15.0, -20.0]), 100).shape == (2, 1, 41, 41)
+
+
+@pytest.mark.parametrize("coc_px", [0.3, 4.0, -11.5])
+def test_reach_holds_the_kernels_of_both_signs(coc_px: float) -> None:
+    width = 2 * math.ceil(TWO_SIDES.reach_px(coc_px, 1) + 20) + 1
+    wide = TWO_SIDES.kernels(torch.tensor([coc_px, -coc_px], dtype=torch.float64), 1, size=width)
+    axis = torch.arange(width) - width // 2
+    beyond = torch.hypot(axis[:, None].double(), axis[None, :].double()) > TWO_SIDES.reach_px(coc_px, 1) + 1
+    assert float(wide[..., beyond].sum(-1).max()) < 1e-4
+
+
+def test_the_shipped_table_is_table_one_of_the_paper() -> None:
+    table = BlurTable.load("sato_j15")
+    params = table.node_params
+    assert table.family == "ring" and table.strength is not None and len(table.coc) == 1
+    assert float(table.strength) == pytest.approx(5.8116e-1)
+    assert float(params["r_c"]) == pytest.approx(4.2853e-4)
+    assert float(params["sigma"]) ** 2 == pytest.approx(5.5114e-6, rel=1e-4)
+    assert table.provenance["source"] and table.unit == "relative"
+
+
+def test_the_shipped_table_blurs_as_much_as_the_disc_of_its_coc() -> None:
+    r = torch.linspace(0.0, 0.03, 300_001, dtype=torch.float64)
+    table = BlurTable.load("sato_j15")
+    mass = psf.profile("ring", r, {k: float(v) for k, v in table.node_params.items()}) * r
+    assert float((mass * r**2).sum() / mass.sum()) == pytest.approx(float(table.coc) ** 2 / 2, rel=1e-4)
+
+
+def test_blur_texture_is_the_fitted_profile_with_its_strength() -> None:
+    table = BlurTable.load("sato_j15")
+    texture = table.blur_texture(10.0, width=512, size=41)
+    sigma, r_c = at(table, 10.0)["sigma"][0], at(table, 10.0)["r_c"][0]
+    expected = 0.58116 * math.exp(-((math.hypot(3, 4) - r_c) ** 2) / (2 * sigma**2))
+    assert texture.shape == (1, 41, 41)
+    assert float(texture[0, 20 + 3, 20 - 4]) == pytest.approx(expected, rel=1e-12)
+
+
+def test_blur_texture_takes_the_strength_of_the_nearest_node() -> None:
+    table = BlurTable.from_dict(example(unit="fraction", sensor_width_mm=None))
+    for coc, strength in ((-19.0, 0.5), (-11.0, 0.6), (28.0, 0.7)):
+        sigma, r_c = at(table, coc)["sigma"][0], at(table, coc)["r_c"][0]
+        centre = float(table.blur_texture(coc, width=100, size=5)[0, 2, 2])
+        assert centre == pytest.approx(strength * math.exp(-(r_c**2) / (2 * sigma**2)))
+
+
+ROUND_TRIPS = [
+    BlurTable.disc(),
+    BlurTable.gaussian(0.4),
+    BlurTable.load("sato_j15"),
+    BlurTable.from_dict(example()),
+    BlurTable("disc", [1.0], {"radius": [[1.0], [1.1], [1.2]]}),
+    BlurTable("radial", [0.1, 0.2], {"values": [[[1.0, 0.3]] * 2] * 3, "radius": [0.1, 0.2]}, unit="fraction"),
+]
+
+
+@pytest.mark.parametrize("table", ROUND_TRIPS, ids=repr)
+def test_a_saved_table_is_read_back_whole(table: BlurTable, tmp_path: Path) -> None:
+    path = tmp_path / "lens.json"
+    table.save(path)
+    back = BlurTable.load(path)
+    assert back.to_dict() == table.to_dict() and repr(back) == repr(table)
+    coc = torch.tensor([-30.0, -0.7, 0.0, 12.0])
+    assert_close(back.kernels(coc, 64, size=15), table.kernels(coc, 64, size=15), rtol=0.0, atol=0.0)
+
+
+def test_saving_writes_plain_json_and_leaves_nothing_else(tmp_path: Path) -> None:
+    BlurTable.from_dict(example()).save(tmp_path / "lens.json")
+    assert json.loads((tmp_path / "lens.json").read_text()) == example()
+    assert [p.name for p in tmp_path.iterdir()] == ["lens.json"]
+    assert stat.S_IMODE((tmp_path / "lens.json").stat().st_mode) == 0o644
+
+
+def test_a_table_that_cannot_be_written_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "lens.json"
+    BlurTable.disc().save(path)
+
+    def full(*_: Any) -> None:
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("os.replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        BlurTable.gaussian().save(path)
+    monkeypatch.undo()
+    assert BlurTable.load(path).family == "disc" and [p.name for p in tmp_path.iterdir()] == ["lens.json"]
+
+
+NOT_FINITE = [1.0, math.nan, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema": None}, "schema must be 'torchdof/blur-table', got None"),
+        ({"schema": "lut"}, "schema must be 'torchdof/blur-table', got 'lut'"),
+        ({"version": 2}, "version must be 1, got 2; update torchdof"),
+        ({"version": None}, "version must be 1, got None"),
+        ({"family": None}, "family is missing"),
+        ({"unit": None}, "unit is missing"),
+        ({"coc": None}, "coc is missing"),
+        ({"params": None}, "params is missing"),
+        ({"lens": "50 mm"}, "lens is not a field of a blur table"),
+        ({"family": 3}, "family must be a str, got int"),
+        ({"family": "box"}, "family must be one of gaussian, ring"),
+        ({"unit": ["mm"]}, "unit must be a str, got list"),
+        ({"unit": "inch"}, "unit must be one of fraction, mm, relative, got 'inch'"),
+        ({"name": 7}, "name must be a str, got int"),
+        ({"provenance": "me"}, "provenance must be a dict, got str"),
+        ({"params": [1.0]}, "params must be a dict, got list"),
+        ({"params": {"sigma": [1.0, 2.0, 3.0]}}, "params of ring must be sigma, r_c, got sigma"),
+        (
+            {"params": {"sigma": [1.0, 2.0, 3.0], "r_c": [1.0]}},
+            r"params.r_c must be \[N\] .* N = 3 nodes",
+        ),
+        ({"params": {"sigma": NOT_FINITE, "r_c": [0.0] * 3}}, "params.sigma must be finite numbers"),
+        ({"params": {"sigma": [1.0] * 3, "r_c": [0.0, -0.1, 0.0]}}, "params.r_c must be >= 0, got -0.1"),
+        ({"params": {"sigma": [1.0] * 3, "r_c": ["a"] * 3}}, "params.r_c must be numbers"),
+        ({"params": {"sigma": [[1.0] * 3] * 3, "r_c": [[1.0] * 3] * 2}}, "params.r_c has 2 channels where other"),
+        ({"coc": [0.1, -0.1, 0.3]}, "coc must be strictly increasing"),
+        ({"coc": [-0.1, -0.1, 0.3]}, "coc must be strictly increasing"),
+        ({"coc": []}, "coc must be strictly increasing"),
+        ({"coc": [0.0]}, "coc must be strictly increasing signed numbers, one a node and not only 0"),
+        ({"coc": NOT_FINITE}, "coc must be finite numbers"),
+        ({"coc": "three"}, "coc must be numbers, got three"),
+        ({"coc": [[-0.2, 0.3]]}, "coc must be strictly increasing"),
+        ({"coc": [True, False]}, "coc must be numbers"),
+        ({"coc": {"a": 1}}, "coc must be numbers"),
+        ({"sensor_width_mm": None}, "sensor_width_mm"),
+        ({"sensor_width_mm": 0.0}, "sensor_width_mm must be positive, got 0"),
+        ({"sensor_width_mm": math.nan}, "sensor_width_mm must be positive"),
+        ({"sensor_width_mm": "36"}, "sensor_width_mm must be a number, got '36'"),
+        ({"sensor_width_mm": True}, "sensor_width_mm must be a number, got True"),
+        ({"unit": "fraction"}, "sensor_width_mm"),
+        ({"unit": "relative", "sensor_width_mm": None}, "unit 'relative' takes one node on each side"),
+        ({"strength": [1.0]}, r"strength must hold one number a node \(3\), got shape \[1\]"),
+        ({"strength": "high"}, "strength must be numbers"),
+        ({"residual": NOT_FINITE}, "residual must be finite numbers"),
+    ],
+)
+def test_a_bad_field_is_refused_by_name(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    data = example(**changes)
+    with pytest.raises(ValueError, match=f"^{message}"):
+        BlurTable.from_dict(data)
+    path = tmp_path / "lens.json"
+    path.write_text(json.dumps(data))
+    with pytest.raises(ValueError, match=f"lens.json: {message}"):
+        BlurTable.load(path)
+
+
+def test_bad_radial_values_are_refused() -> None:
+    for values in ([[1.0]], [[0.0, 0.0]]):
+        with pytest.raises(ValueError, match="params.values must hold at least two values a node, not all of them 0"):
+            BlurTable("radial", [1.0], {"values": values, "radius": [1.0]})
+    with pytest.raises(ValueError, match="params.b must be >= -1, got -2"):
+        BlurTable("softm", [1.0], {"radius": [1.0], "sigma": [0.0], "b": [-2.0], "m": [2.0]})
+
+
+@pytest.mark.parametrize("content", ["", "{", "[1, 2]", "null", "1e999", '"disc"', "[" * 100_000, "\x00\xff"])
+def test_a_file_that_is_no_table_is_refused_with_its_name(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "lens.json"
+    path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(ValueError, match="lens.json: "):
+        BlurTable.load(path)
+
+
+def test_a_name_that_is_not_shipped_lists_those_that_are() -> None:
+    with pytest.raises(FileNotFoundError, match=r"no blur table 'sato': .*sato_j15"):
+        BlurTable.load("sato")
+
+
+def test_a_huge_number_of_the_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lens.json"
+    path.write_text(json.dumps(example()).replace("0.12", "1e999"))
+    with pytest.raises(ValueError, match=r"lens.json: params.sigma must be finite"):
+        BlurTable.load(path)
+    path.write_text(json.dumps(example(version=10**400)))
+    with pytest.raises(ValueError, match=r"lens.json: "):
+        BlurTable.load(path)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(st.sampled_from(sorted(example())), JSON)
+def test_any_value_in_any_field_gives_a_table_or_a_named_error(field: str, value: Any) -> None:
+    try:
+        table = BlurTable.from_dict({**example(), field: value})
+    except ValueError as error:
+        assert str(error)
+    else:
+        assert torch.isfinite(table.kernels(torch.tensor([-3.0, 4.0]), 36, size=5)).all()
+
+
+def test_repr_tells_name_family_and_nodes() -> None:
+    assert repr(BlurTable.from_dict(example())) == "BlurTable('lens', ring, 3 nodes)"
+    assert repr(BlurTable("disc", [1.0], {"radius": [1.0]})) == "BlurTable('unnamed', disc, 1 node)"
+
+
+def test_kernels_sum_to_one_at_any_coc() -> None:
+    coc: Tensor = torch.linspace(-12, 12, 9)
+    for table in ROUND_TRIPS:
+        sums = table.kernels(coc, 100).sum((-2, -1))
+        assert_close(sums, torch.ones_like(sums), rtol=0.0, atol=1e-12)

@@ -1,0 +1,314 @@
+import math
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as functional
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchdof.optics import psf
+
+DISC_ERROR = 2e-5  # of the light
+LENGTH_PX = st.one_of(st.just(0.0), st.floats(1e-9, 1e-2), st.floats(0.01, 12.0))
+PARAMETERS: dict[str, dict[str, Any]] = {
+    "gaussian": {"sigma": LENGTH_PX},
+    "ring": {"sigma": LENGTH_PX, "r_c": LENGTH_PX},
+    "disc": {"radius": LENGTH_PX},
+    "softm": {"radius": LENGTH_PX, "sigma": LENGTH_PX, "b": st.floats(-1.0, 4.0), "m": st.floats(0.5, 8.0)},
+    "radial": {
+        "values": st.lists(st.floats(0.0, 9.0), min_size=2, max_size=6)
+        .filter(lambda v: max(v) > 1e-3)
+        .map(torch.tensor),
+        "radius": LENGTH_PX,
+    },
+}
+EXAMPLES: list[tuple[str, dict[str, Any]]] = [
+    ("gaussian", {"sigma": 0.2}),
+    ("gaussian", {"sigma": 3.3}),
+    ("ring", {"sigma": 0.3, "r_c": 0.5}),
+    ("ring", {"sigma": 1.0, "r_c": 0.0}),
+    ("ring", {"sigma": 0.5, "r_c": 8.0}),
+    ("ring", {"sigma": 3.0, "r_c": 20.0}),
+    ("softm", {"radius": 1.0, "sigma": 0.2, "b": 1.0, "m": 2.0}),
+    ("softm", {"radius": 3.0, "sigma": 0.5, "b": -1.0, "m": 4.0}),
+    ("softm", {"radius": 8.0, "sigma": 0.1, "b": 2.0, "m": 8.0}),
+    ("radial", {"values": torch.tensor([1.0, 0.2, 0.5, 2.0, 0.0]), "radius": 1.0}),
+    ("radial", {"values": torch.tensor([1.0, 0.2, 0.5, 2.0, 0.0]), "radius": 12.0}),
+]
+
+
+def distance(first: Tensor, second: Tensor) -> float:
+    """Light that sits elsewhere: the sum of the absolute differences of two kernels, whatever their sizes."""
+    size = max(first.shape[-1], second.shape[-1])
+    first, second = (functional.pad(k, ((size - k.shape[-1]) // 2,) * 4) for k in (first, second))
+    return float((first - second).abs().sum())
+
+
+def second_moment(kernel: Tensor) -> float:
+    axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
+    return float((kernel * (axis[:, None] ** 2 + axis[None, :] ** 2)).sum())
+
+
+def mass_by_radius(family: str, params: dict[str, Any], cells: int = 400_000) -> tuple[Tensor, Tensor]:
+    """Radii and the light in the thin ring at each, by the midpoint rule."""
+    reach = 1.5 * psf.support(family, params) + 1e-9
+    r = (torch.arange(cells, dtype=torch.float64) + 0.5) / cells * reach
+    return r, psf.profile(family, r, params) * r
+
+
+@pytest.mark.parametrize("family", PARAMETERS)
+@given(data=st.data())
+def test_every_kernel_is_non_negative_sums_to_one_and_is_symmetric(family: str, data: st.DataObject) -> None:
+    kernel = psf.pixel_kernels(family, {name: data.draw(value, name) for name, value in PARAMETERS[family].items()})
+    assert kernel.dtype == torch.float64 and kernel.shape[-1] % 2 == 1
+    assert torch.isfinite(kernel).all() and (kernel >= 0).all()
+    assert_close(float(kernel.sum()), 1.0, rtol=0.0, atol=1e-12)
+    for same in (kernel.flip(0), kernel.flip(1), kernel.mT):
+        assert_close(kernel, same, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("radius", [0.51, 0.7, 1.0, 1.5, 2.2, 5.5, 9.99, 30.3])
+def test_disc_covers_each_pixel_by_the_area_of_the_circle_in_it(radius: float, loops: ModuleType) -> None:
+    kernel = psf.disc(radius)
+    assert distance(kernel, loops.disc_by_columns(radius, kernel.shape[-1])) < DISC_ERROR
+
+
+def test_small_disc_equals_hand_computed_areas() -> None:
+    kernel = psf.disc(1.0, size=3)
+    corner = math.pi / 12 + (1 - math.sqrt(3)) / 4  # of the unit circle beyond x = 1/2, y = 1/2
+    cap = math.pi / 3 - math.sqrt(3) / 4  # of the unit circle beyond x = 1/2
+    pixels = torch.tensor([corner, cap - 2 * corner, corner], dtype=torch.float64)
+    middle = torch.tensor([cap - 2 * corner, 1.0, cap - 2 * corner], dtype=torch.float64)
+    expected = torch.stack([pixels, middle, pixels])
+    expected[1, 1] = math.pi - 4 * corner - 4 * (cap - 2 * corner)
+    assert_close(float(expected[1, 1]), 1.0, rtol=0.0, atol=1e-12)
+    assert distance(kernel, expected / math.pi) < DISC_ERROR
+
+
+@pytest.mark.parametrize(("family", "params"), EXAMPLES)
+def test_kernel_equals_brute_force_supersampling(family: str, params: dict[str, Any], loops: ModuleType) -> None:
+    kernel = psf.pixel_kernels(family, params)
+
+    def profile(r: Tensor) -> Tensor:
+        return psf.profile(family, r.flatten(), params).reshape(r.shape)
+
+    assert distance(kernel, loops.supersampled(profile, kernel.shape[-1])) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("family", "params"),
+    [
+        ("gaussian", {"sigma": 3.3}),
+        ("ring", {"sigma": 1.0, "r_c": 0.0}),
+        ("ring", {"sigma": 3.0, "r_c": 20.0}),
+        ("softm", {"radius": 8.0, "sigma": 1.5, "b": 2.0, "m": 4.0}),
+        ("radial", {"values": torch.tensor([1.0, 0.8, 0.5, 0.1, 0.0]), "radius": 12.0}),
+    ],
+)
+def test_second_moment_is_that_of_the_profile_and_of_the_pixel(family: str, params: dict[str, Any]) -> None:
+    r, mass = mass_by_radius(family, params)
+    expected = float((mass * r**2).sum() / mass.sum()) + 2 / 12  # a square pixel adds 1/12 along each axis
+    kernel = psf.pixel_kernels(family, params, size=2 * psf.half_width(1.2 * psf.support(family, params) + 2) + 1)
+    assert second_moment(kernel) == pytest.approx(expected, rel=1e-3)
+
+
+def test_gaussian_equals_differences_of_the_error_function() -> None:
+    edge = torch.arange(-5.5, 6.0, dtype=torch.float64)
+    line = (torch.erf(edge / (math.sqrt(2) * 1.3)).diff()) / 2
+    expected = line[:, None] * line[None, :]
+    assert_close(psf.gaussian(1.3, size=11), expected / expected.sum(), rtol=1e-10, atol=1e-14)
+
+
+def test_far_tail_of_a_gaussian_keeps_its_digits() -> None:
+    kernel = psf.gaussian(1.0, size=31)
+    ratio = math.erfc(14.5 / math.sqrt(2)) / math.erfc(13.5 / math.sqrt(2))  # the next one out is negligible
+    assert float(kernel[15, 30] / kernel[15, 29]) == pytest.approx(ratio, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("family", "params"),
+    [
+        ("gaussian", {"sigma": 0.0}),
+        ("ring", {"sigma": 0.0, "r_c": 0.0}),
+        ("disc", {"radius": 0.0}),
+        ("softm", {"radius": 0.0, "sigma": 0.0, "b": 1.0, "m": 2.0}),
+        ("radial", {"values": torch.ones(3), "radius": 0.0}),
+    ],
+)
+def test_kernel_of_size_zero_is_one_pixel(family: str, params: dict[str, Any]) -> None:
+    assert psf.pixel_kernels(family, params).tolist() == [[1.0]]
+    expected = torch.zeros(5, 5, dtype=torch.float64)
+    expected[2, 2] = 1.0
+    assert_close(psf.pixel_kernels(family, params, size=5), expected, rtol=0.0, atol=1e-12)
+
+
+def test_disc_up_to_half_a_pixel_is_one_pixel() -> None:
+    assert psf.disc(0.5).tolist() == [[1.0]]
+    assert psf.disc(0.5001).shape == (3, 3)
+
+
+@pytest.mark.parametrize("radius", [300.0, 500.0])
+def test_kernels_reach_hundreds_of_pixels(radius: float) -> None:
+    kernel = psf.disc(radius)
+    inside = kernel[kernel.shape[-1] // 2, kernel.shape[-1] // 2]
+    assert float(inside) == pytest.approx(1 / (math.pi * radius**2), rel=1e-5)
+    assert second_moment(kernel) == pytest.approx(radius**2 / 2 + 2 / 12, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("family", "make"),
+    [
+        ("gaussian", lambda s: {"sigma": s / 2}),
+        ("ring", lambda s: {"sigma": s / 4, "r_c": s / 2}),
+        ("disc", lambda s: {"radius": s}),
+        ("softm", lambda s: {"radius": s, "sigma": s / 8, "b": 0.5, "m": 2.0}),
+        ("radial", lambda s: {"values": torch.tensor([1.0, 2.0, 0.0]), "radius": s}),
+    ],
+)
+def test_kernels_change_continuously_with_their_size(family: str, make: Any) -> None:
+    # every quarter of a pixel, so just below and above where the kernel takes one more pixel or coarser slices
+    for radius in [*(0.25 * i for i in range(1, 56)), 64.5]:
+        step = 1e-4
+        below, above = (psf.pixel_kernels(family, make(r)) for r in (radius - step, radius + step))
+        assert distance(below, above) < 1e-3, radius
+
+
+@pytest.mark.parametrize(
+    ("family", "params"),
+    [
+        ("gaussian", [[0.05, 0.5, 1.5]]),
+        ("disc", [[0.6, 1.3, 2.0, 2.9]]),
+        ("ring", [[0.5, 1.5], [0.1, 2.0]]),
+        ("softm", [[1.3, 2.4], [0.4, 0.1], [0.4, -0.5], [2.0, 3.0]]),
+        ("radial", [[[1.0, 0.5, 2.0], [0.1, 0.2, 0.3]], [1.7, 2.9]]),
+    ],
+)
+def test_kernels_are_differentiable_in_their_parameters(family: str, params: list[Any]) -> None:
+    leaves = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in params]
+    names = psf.FAMILIES[family]
+    assert torch.autograd.gradcheck(
+        lambda *values: psf.pixel_kernels(family, dict(zip(names, values, strict=True)), 7), leaves
+    )
+
+
+@pytest.mark.parametrize("family", psf.FAMILIES)
+@pytest.mark.parametrize("length", [0.0, 1e-12, 1e-3, 0.5, 1.5])
+def test_gradients_are_finite_where_kernels_are_not_smooth(family: str, length: float) -> None:
+    lengths = {
+        name: torch.tensor(length, dtype=torch.float64, requires_grad=True) for name in ("sigma", "r_c", "radius")
+    }
+    others: dict[str, Any] = {"b": 0.5, "m": 2.0, "values": torch.ones(3)}
+    kernel = psf.pixel_kernels(family, {name: ({**others, **lengths})[name] for name in psf.FAMILIES[family]}, 5)
+    grads = torch.autograd.grad(kernel.square().sum(), list(lengths.values()), allow_unused=True)
+    assert any(grad is not None for grad in grads)
+    assert all(torch.isfinite(grad) for grad in grads if grad is not None)
+
+
+def test_softm_holds_disc_and_soft_disc() -> None:
+    assert distance(psf.softm(3.3, 0.0, size=9), psf.disc(3.3, size=9)) < 5e-4
+    assert_close(psf.softm(3.3, 0.4, b=0.0, m=2.0), psf.softm(3.3, 0.4, b=0.0, m=7.0), rtol=0.0, atol=0.0)
+    assert psf.softm(3.3, 0.4, size=9)[4, 8] > psf.disc(3.3, size=9)[4, 8]
+
+
+def test_positive_tilt_brightens_the_rim() -> None:
+    flat, rim = psf.softm(8.0, 0.2), psf.softm(8.0, 0.2, b=2.0, m=4.0)
+    centre = flat.shape[-1] // 2
+    assert rim[centre, centre] < flat[centre, centre] and rim[centre, centre + 7] > flat[centre, centre + 7]
+
+
+def test_ring_without_a_hole_is_a_gaussian(loops: ModuleType) -> None:
+    assert distance(psf.ring(1.7, 0.0), psf.gaussian(1.7)) < 1e-3
+
+
+def test_ring_profile_is_equation_one_of_the_paper() -> None:
+    r = torch.tensor([0.0, 4.2853e-4, 2e-3], dtype=torch.float64)
+    sigma = math.sqrt(5.5114e-6)
+    expected = torch.exp(-((r - 4.2853e-4) ** 2) / (2 * 5.5114e-6))
+    assert_close(psf.profile("ring", r, {"sigma": sigma, "r_c": 4.2853e-4}), expected)
+
+
+def test_radial_table_that_is_flat_is_a_disc() -> None:
+    assert distance(psf.radial(torch.ones(5), 3.3), psf.disc(3.3)) < 5e-4
+
+
+@pytest.mark.parametrize(("family", "params"), [*EXAMPLES, ("disc", {"radius": 4.2})])
+def test_support_holds_all_light_but_a_hundred_thousandth(family: str, params: dict[str, Any]) -> None:
+    r, mass = mass_by_radius(family, params)
+    assert float(mass[r > psf.support(family, params)].sum() / mass.sum()) < 1e-5
+
+
+def test_a_batch_of_parameters_equals_each_alone() -> None:
+    sigma, r_c = torch.tensor([[0.5], [1.0]]), torch.tensor([[0.0, 2.0, 3.0]])
+    together = psf.ring(sigma, r_c, size=15)
+    assert together.shape == (2, 3, 15, 15)
+    for i in range(2):
+        for j in range(3):
+            assert_close(together[i, j], psf.ring(float(sigma[i, 0]), float(r_c[0, j]), size=15))
+
+
+def test_a_smaller_size_cuts_the_kernel_and_keeps_its_sum() -> None:
+    whole, cut = psf.gaussian(2.0, size=21), psf.gaussian(2.0, size=5)
+    assert_close(cut, whole[8:13, 8:13] / whole[8:13, 8:13].sum())
+
+
+@pytest.mark.parametrize(
+    ("family", "params", "message"),
+    [
+        ("box", {"radius": 1.0}, "family must be one of gaussian, ring, disc, softm, radial, got 'box'"),
+        ("disc", {"sigma": 1.0}, "disc takes the parameters radius, got sigma"),
+        ("disc", {"radius": -0.1}, "radius of disc must be finite and >= 0"),
+        ("gaussian", {"sigma": math.nan}, "sigma of gaussian must be finite"),
+        ("ring", {"sigma": 1.0, "r_c": math.inf}, "r_c of ring must be finite"),
+        ("softm", {"radius": 1.0, "sigma": 0.0, "b": -1.5, "m": 2.0}, "b of softm must be finite and >= -1"),
+        ("radial", {"values": torch.tensor([1.0]), "radius": 1.0}, "values must be .* with P >= 2"),
+        ("radial", {"values": torch.tensor([1.0, -1.0]), "radius": 1.0}, "values of radial must be finite and >= 0"),
+    ],
+)
+def test_bad_parameters_are_refused_by_name(family: str, params: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        psf.pixel_kernels(family, params)
+
+
+@pytest.mark.parametrize("size", [0, -1, 4])
+def test_a_size_that_is_not_odd_is_refused(size: int) -> None:
+    with pytest.raises(ValueError, match=f"size must be a positive odd number of pixels, got {size}"):
+        psf.disc(2.0, size=size)
+
+
+LARGE: dict[str, dict[str, Any]] = {
+    "gaussian": {"sigma": 60.0},
+    "ring": {"sigma": 40.0, "r_c": 90.0},
+    "disc": {"radius": 280.3},
+    "softm": {"radius": 220.0, "sigma": 12.0, "b": 0.5, "m": 3.0},
+    "radial": {"values": torch.linspace(1.0, 0.0, 9), "radius": 280.0},
+}
+
+
+@pytest.mark.parametrize(("family", "params"), LARGE.items())
+@pytest.mark.parametrize("window", [1, 41])
+def test_the_window_of_a_large_kernel_is_the_middle_of_the_whole(
+    family: str, params: dict[str, Any], window: int
+) -> None:
+    whole, part = psf.pixel_kernels(family, params), psf.pixel_kernels(family, params, window=window)
+    spare = (whole.shape[-1] - window) // 2
+    assert spare > 200
+    torch.testing.assert_close(part, whole[spare : spare + window, spare : spare + window], rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize(("family", "params"), LARGE.items())
+def test_a_window_computes_no_more_than_itself(family: str, params: dict[str, Any]) -> None:
+    """A kernel of 1e8 pixels a side; its window holds its share of the light, and is flat but for a ring's hole."""
+    huge = {k: v * 1e6 if k in psf.LENGTHS else v for k, v in params.items()}
+    part, smaller = psf.pixel_kernels(family, huge, window=9), psf.pixel_kernels(family, params, window=1)
+    assert part.shape == (9, 9)
+    torch.testing.assert_close(1e12 * part, smaller.expand(9, 9), rtol=3e-2, atol=0.0)
+
+
+def test_a_window_wider_than_the_kernel_is_the_kernel() -> None:
+    assert torch.equal(psf.disc(3.0), psf.pixel_kernels("disc", {"radius": 3.0}, window=99))
+    with pytest.raises(ValueError, match="positive odd number of pixels, got 4"):
+        psf.pixel_kernels("disc", {"radius": 3.0}, window=4)

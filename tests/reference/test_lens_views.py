@@ -1,0 +1,168 @@
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as functional
+
+from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.camera import Camera
+from torchdof.reference import metrics
+from torchdof.reference.lens_views import lens_views, lens_views_by_coc
+from torchdof.reference.scenes import Plane, Scene, camera_of, plane_scene, posts, read_scenes, waves
+
+DATA = Path(__file__).parents[1] / "data" / "scenes"
+CAMERA = camera_of(200.0, 96, aperture_radius_m=0.04, focus_m=2.0)
+
+
+@pytest.fixture(scope="module")
+def crops() -> dict[str, Scene]:
+    return {scene.name: scene for scene in read_scenes(DATA)}
+
+
+@pytest.fixture(scope="module")
+def bars() -> Scene:
+    near, far = Plane(1.0, waves(1, (0.6, 0.3, 0.2)), posts(40, 9)), Plane(2.0, waves(2))
+    planes = [near, far, Plane(1.5, waves(3), posts(61, 20, -0.3, 9))]
+    return plane_scene(planes, CAMERA, (72, 96), samples=1024)
+
+
+def shown_psnr(image: torch.Tensor, scene: Scene, mask: torch.Tensor | None = None) -> float:
+    return metrics.psnr(metrics.display(image), metrics.display(scene.truth), mask)
+
+
+def test_what_is_in_focus_is_returned_bit_exact() -> None:
+    image, depth = torch.rand(2, 3, 20, 30), torch.full((1, 1, 20, 30), 2.0)
+    image[0, :, 7, 9] = 300.0
+    out, known = lens_views(image, depth, CAMERA, views=16)
+    assert torch.equal(out, image)
+    assert torch.equal(known, torch.ones(2, 1, 20, 30))
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        BlurTable.disc(),
+        BlurTable.gaussian(),
+        BlurTable.load("sato_j15"),
+        BlurTable(
+            "radial", [-1.0, 1.0], {"values": [[1.0, 0.2, 0.0, 1.0], [0.0, 1.0, 1.0, 0.0]], "radius": [1.2, 0.8]}
+        ),
+    ],
+    ids=["disc", "gaussian", "ring", "radial"],
+)
+@pytest.mark.parametrize("coc", [-6.0, 4.0])
+def test_a_plane_is_the_convolution_with_the_tables_kernel(table: BlurTable, coc: float) -> None:
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(80.0), indexing="ij")
+    image = waves(5, shortest_px=4.0)(x.double(), y.double()).float()[None]
+    out = lens_views_by_coc(image, torch.full((1, 1, 64, 80), coc), table=table, views=512).image
+    kernel = table.kernels(torch.tensor([coc]), width=80)[0].float()
+    half = kernel.shape[-1] // 2
+    blurred = functional.conv2d(image.transpose(0, 1), kernel[None].flip(-1, -2)).transpose(0, 1)
+    inner = out[..., half:-half, half:-half]
+    assert metrics.psnr(image[..., half:-half, half:-half], blurred) < 32
+    assert metrics.psnr(inner, blurred) > 58
+
+
+def test_channels_are_blurred_by_their_own_kernels() -> None:
+    table = BlurTable("disc", [1.0], {"radius": [[1.0], [0.5]]})
+    image, coc = torch.rand(1, 2, 40, 40), torch.full((1, 1, 40, 40), 5.0)
+    both = lens_views_by_coc(image, coc, table=table, views=64).image
+    for channel, radius in enumerate((5.0, 2.5)):
+        alone = lens_views_by_coc(image[:, channel : channel + 1], torch.full_like(coc, radius), views=64).image
+        # light is split at a multiple of the mean, which is that of all channels or of one
+        assert metrics.psnr(both[:, channel : channel + 1], alone) > 60
+
+
+@pytest.mark.parametrize("depth_m", [1.0, 8.0])
+def test_a_highlight_is_a_disc_of_the_right_radius_and_energy(depth_m: float) -> None:
+    image = torch.full((1, 1, 81, 81), 0.01)
+    image[..., 40, 40] = 500.0
+    depth = torch.full((1, 1, 81, 81), depth_m)
+    camera = camera_of(1000.0, 81, aperture_radius_m=0.03, focus_m=2.0)
+    radius = float(camera.coc_px(depth, 81).abs().max())
+    disc = lens_views(image, depth, camera, views=256).image - 0.01
+    y, x = torch.meshgrid(torch.arange(81.0) - 40, torch.arange(81.0) - 40, indexing="ij")
+    level = 500.0 / (math.pi * radius**2)
+    assert float(disc.sum()) == pytest.approx(500.0, rel=0.01)
+    assert math.sqrt(float((disc > level / 2).sum()) / math.pi) == pytest.approx(radius, abs=0.5)
+    r = torch.hypot(x, y)
+    assert float(disc[0, 0][r > radius + 1.5].abs().max()) < 0.02 * level
+    assert float(disc[0, 0][r < radius - 1.5].std()) < 0.2 * level
+
+
+def test_with_hidden_surfaces_known_it_agrees_with_the_exact_truth(bars: Scene) -> None:
+    alone = lens_views(bars.image, bars.depth, bars.camera, mixed_edges=False)
+    told = lens_views(bars.image, bars.depth, bars.camera, surfaces=bars.surfaces)
+    assert shown_psnr(bars.image, bars, bars.inner) < 32
+    assert shown_psnr(told.image, bars, bars.inner) > 45
+    assert shown_psnr(told.image, bars, bars.inner) > shown_psnr(alone.image, bars, bars.inner) + 3
+    assert bool((told.known[bars.inner] == 1).all())
+    assert 0.3 < float((alone.known[bars.inner] == 1).float().mean()) < 0.95
+
+
+def test_a_stack_of_whole_surfaces_alone_renders_the_scene(bars: Scene) -> None:
+    far = bars.surfaces[0]
+    out = lens_views(far[0][:, :3], far[1], bars.camera, surfaces=bars.surfaces[1:]).image
+    assert shown_psnr(out, bars, bars.inner) > 42
+
+
+@pytest.mark.parametrize("name", ["planes/0", "room/1", "highlights/0"])
+def test_256_views_are_within_half_a_decibel_of_1024(crops: dict[str, Scene], name: str) -> None:
+    scene = crops[name]
+    few, many = (lens_views(scene.image, scene.depth, scene.camera, views=n) for n in (256, 1024))
+    difference = shown_psnr(many.image, scene, scene.inner) - shown_psnr(few.image, scene, scene.inner)
+    assert abs(difference) < 0.5
+
+
+def test_more_views_come_nearer_to_the_limit(crops: dict[str, Scene]) -> None:
+    scene = crops["room/1"]
+    limit = lens_views(scene.image, scene.depth, scene.camera, views=1024).image
+    errors = [
+        metrics.psnr(lens_views(scene.image, scene.depth, scene.camera, views=n).image, limit) for n in (4, 16, 64, 256)
+    ]
+    assert errors == sorted(errors)
+    assert errors[-1] > errors[0] + 12
+
+
+def test_ray_traced_room_is_met_where_nothing_hidden_is_uncovered(crops: dict[str, Scene]) -> None:
+    scene = crops["room/1"]
+    out, known = lens_views(scene.image, scene.depth, scene.camera, mixed_edges=False)
+    assert shown_psnr(scene.image, scene, scene.inner) < 28
+    assert shown_psnr(out, scene, scene.inner & (known == 1)) > 45
+
+
+def test_a_steep_surface_does_not_tear() -> None:
+    coc = torch.linspace(0.0, 40.0, 60).expand(1, 1, 50, 60)  # grows by 0.7 px a pixel
+    out, known = lens_views_by_coc(torch.ones(1, 1, 50, 60), coc, views=64)
+    torch.testing.assert_close(out, torch.ones_like(out))
+    assert float(known[..., 15:35, 10:18].min()) == 1.0
+
+
+def test_a_blurred_bar_does_not_darken_towards_the_frame() -> None:
+    out = lens_views_by_coc(torch.full((1, 1, 20, 20), 0.7), torch.full((1, 1, 20, 20), -8.0), views=64).image
+    torch.testing.assert_close(out, torch.full_like(out, 0.7))
+
+
+def test_half_precision_and_batches() -> None:
+    image, depth = torch.rand(2, 3, 16, 24).half(), torch.rand(2, 1, 16, 24) + 1
+    out, known = lens_views(image, depth, CAMERA, views=8)
+    assert out.dtype == torch.float16
+    assert known.shape == (2, 1, 16, 24)
+    for i in range(2):
+        assert torch.equal(lens_views(image[i : i + 1], depth[i : i + 1], CAMERA, views=8).image, out[i : i + 1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"views": 0}, "views must be a whole number of points"),
+        ({"views": 2.5}, "views must be a whole number of points"),
+        ({"surfaces": [(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8))]}, r"a surface must be \[1, 4, 8, 8\]"),
+        ({"surfaces": [(torch.rand(1, 4, 8, 8), -torch.ones(1, 1, 8, 8))]}, "depth must be > 0"),
+    ],
+)
+def test_bad_arguments_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        lens_views(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), Camera(), **options)

@@ -1,0 +1,99 @@
+import math
+from collections.abc import Callable
+
+import kornia
+import pytest
+import torch
+
+from torchdof.reference import metrics
+
+needs_flip = pytest.mark.skipif(not metrics.has_flip(), reason="flip-evaluator is not installed")
+
+
+def test_display_matches_kornias_srgb_curve() -> None:
+    light = torch.linspace(0, 1, 999, dtype=torch.float64).reshape(1, 3, 9, 37)
+    torch.testing.assert_close(metrics.display(light), kornia.color.linear_rgb_to_rgb(light), rtol=1e-9, atol=1e-9)
+
+
+def test_display_clips() -> None:
+    assert metrics.display(torch.tensor([-3.0, 60.0])).tolist() == [0.0, pytest.approx(1.0, abs=1e-6)]
+
+
+def test_psnr_of_a_known_error() -> None:
+    truth = torch.rand(1, 3, 20, 30, dtype=torch.float64)
+    assert metrics.psnr(truth + 0.01, truth) == pytest.approx(40.0, abs=1e-9)
+    assert metrics.psnr(truth, truth) == math.inf
+
+
+def test_psnr_counts_only_the_masked_pixels() -> None:
+    truth = torch.zeros(2, 3, 8, 8)
+    image = truth.clone()
+    image[..., :4] = 0.1
+    mask = torch.zeros(1, 1, 8, 8, dtype=torch.bool)
+    mask[..., :4] = True
+    assert metrics.psnr(image, truth, mask) == pytest.approx(20.0, abs=1e-5)
+    assert metrics.psnr(image, truth) == pytest.approx(20.0 + 10 * math.log10(2), abs=1e-5)
+    with pytest.raises(ValueError, match="mask is empty"):
+        metrics.psnr(image, truth, torch.zeros(1, 1, 8, 8, dtype=torch.bool))
+
+
+def test_ssim_is_one_for_equal_images_and_falls_with_noise() -> None:
+    truth = torch.rand(1, 3, 32, 32)
+    assert metrics.ssim(truth, truth) == pytest.approx(1.0, abs=1e-9)
+    little, much = (metrics.ssim((truth + s * torch.randn_like(truth)).clamp(0, 1), truth) for s in (0.02, 0.2))
+    assert 1 > little > 0.97 > much
+
+
+@needs_flip
+def test_flip_is_zero_for_equal_images_and_largest_where_they_differ() -> None:
+    truth = torch.full((1, 3, 64, 64), 0.5)
+    image = truth.clone()
+    image[..., 20:30, 40:50] = 0.9
+    assert metrics.flip(truth, truth) == 0.0
+    error = metrics.flip_map(image, truth)
+    row, column = divmod(int(error.argmax()), 64)
+    assert 20 <= row < 30
+    assert 40 <= column < 50
+    assert metrics.flip(image, truth) == pytest.approx(float(error.mean()), rel=1e-5)
+
+
+@pytest.mark.parametrize("measure", [metrics.psnr, metrics.ssim])
+def test_different_shapes_are_refused(measure: Callable[[torch.Tensor, torch.Tensor], float]) -> None:
+    with pytest.raises(ValueError, match=r"same shape and device, got \[1, 3, 9, 8\] on cpu and \[1, 3, 8, 8\]"):
+        measure(torch.zeros(1, 3, 9, 8), torch.zeros(1, 3, 8, 8))
+
+
+@needs_flip
+def test_flip_refuses_what_is_not_one_rgb_image() -> None:
+    with pytest.raises(ValueError, match="one RGB image"):
+        metrics.flip(torch.zeros(2, 3, 8, 8), torch.zeros(2, 3, 8, 8))
+
+
+IMAGE = torch.zeros(1, 3, 8, 8)
+BAD = IMAGE.clone()
+BAD[0, 0, 2, 3] = math.nan
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: metrics.display(3.0), "linear must be a tensor of linear light, got 3.0"),  # type: ignore[arg-type]
+        (lambda: metrics.display(IMAGE.int()), "linear must be a floating-point tensor"),
+        (lambda: metrics.psnr(IMAGE.numpy(), IMAGE), r"image must be a tensor \[B, C, H, W\]"),  # type: ignore[arg-type]
+        (lambda: metrics.psnr(IMAGE, IMAGE.int()), "truth must be a floating-point tensor"),
+        (lambda: metrics.psnr(IMAGE[0], IMAGE[0]), r"image must be \[B, C, H, W\] .*got \[3, 8, 8\]"),
+        (lambda: metrics.psnr(BAD, IMAGE), "image and truth must be finite, got 1 of 64 pixels"),
+        (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[:, :1]), "mask must be a bool tensor"),
+        (lambda: metrics.psnr(IMAGE, IMAGE, IMAGE[0] > 0), r"mask must be \[1 or 1, 1, 8, 8\], got \[3, 8, 8\]"),
+        (lambda: metrics.ssim(IMAGE, BAD), "truth must be finite, got 1 of 192 values"),
+        (lambda: metrics.ssim(IMAGE[..., :5], IMAGE[..., :5]), "SSIM needs at least 6 pixels a side"),
+        (lambda: metrics.flip(BAD, IMAGE), "image must be finite"),
+    ],
+)
+def test_bad_input_is_refused_by_name(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_what_a_mask_leaves_out_may_be_anything() -> None:
+    assert metrics.psnr(BAD, IMAGE, torch.isfinite(BAD).all(1, keepdim=True)) == math.inf

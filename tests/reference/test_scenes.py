@@ -1,0 +1,90 @@
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchdof.optics.camera import Camera
+from torchdof.reference import metrics
+from torchdof.reference.scenes import Plane, camera_of, plane_scene, posts, read_scenes, waves
+
+DATA = Path(__file__).parents[1] / "data" / "scenes"
+CAMERA = camera_of(200.0, 96, aperture_radius_m=0.02, focus_m=1.0)
+
+
+def jinc(x: torch.Tensor) -> torch.Tensor:
+    """Fourier transform of the unit disc, by its definition: the mean of cos(x t) over the disc's chords."""
+    t = (torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000 * 2 - 1
+    chord = (1 - t**2).sqrt()
+    return torch.stack([(torch.cos(v * t) * chord).sum() / chord.sum() for v in x])
+
+
+def test_truth_of_one_plane_is_the_waves_damped_by_disc_and_pixel() -> None:
+    k = torch.tensor([0.6], dtype=torch.float64)
+    scene = plane_scene([Plane(2.0, lambda x, y: (1 + torch.sin(k * x))[None])], CAMERA, (4, 60), samples=4096)
+    coc = float(scene.coc_px[0, 0, 0, 0])
+    x = torch.arange(60, dtype=torch.float64) + 0.5
+    pixel = torch.sinc(k / 2 / math.pi)
+    sharp, blurred = 1 + pixel * torch.sin(k * x), 1 + pixel * jinc(k * coc) * torch.sin(k * x)
+    assert coc == pytest.approx(CAMERA.coc_px(torch.tensor([[[[2.0]]]]), 60).item())
+    assert float((blurred - 1).abs().max()) > 0.1
+    torch.testing.assert_close(scene.image[0, 0, 0], sharp.float(), rtol=0, atol=1e-3)
+    torch.testing.assert_close(scene.truth[0, 0, 0], blurred.float(), rtol=0, atol=2e-3)
+
+
+def test_surfaces_composited_near_over_far_are_the_sharp_image() -> None:
+    planes = [Plane(1.0, waves(1), posts(20, 5)), Plane(3.0, waves(2)), Plane(2.0, waves(3), posts(31, 11, -0.2))]
+    scene = plane_scene(planes, CAMERA, (20, 30), samples=256)
+    out = torch.zeros(1, 3, 20, 30)
+    for rgba, _ in scene.surfaces:
+        out = rgba[:, :3] + (1 - rgba[:, 3:]) * out
+    # hard edges of two planes within one pixel are counted once by the scene and multiplied here
+    assert metrics.psnr(out, scene.image) > 40
+    assert sorted(set(scene.depth.flatten().tolist())) == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(("name", "margin"), [("highlights/0", 24), ("planes/0", 20), ("room/1", 16)])
+def test_shipped_scenes_are_sharp_where_in_focus(name: str, margin: int) -> None:
+    scene = {s.name: s for s in read_scenes(DATA)}[name]
+    assert scene.margin_px == margin
+    assert scene.image.shape == scene.truth.shape == (1, 3, 160, 192)
+    shown, truth = metrics.display(scene.image), metrics.display(scene.truth)
+    sharp = (scene.coc_px.abs() < 0.5) & scene.inner
+    blurred = (scene.coc_px.abs() > 4.0) & scene.inner
+    assert metrics.psnr(shown, truth, sharp) > metrics.psnr(shown, truth, blurred) + 3
+
+
+def test_planes_that_leave_the_frame_open_are_refused() -> None:
+    with pytest.raises(ValueError, match="farthest plane must have no shape"):
+        plane_scene([Plane(1.0, waves(1)), Plane(3.0, waves(2), posts(20, 5))], CAMERA, (4, 4))
+
+
+def test_a_folder_without_scenes_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no scene here"):
+        list(read_scenes(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"F_px": None}, "F_px must be a positive number"),
+        ({"truths": []}, "truths must be a list"),
+        ({"truths": [{"aperture_radius_m": -1, "focus_distance_m": 1}]}, "aperture_radius_m must be a positive number"),
+    ],
+)
+def test_a_bad_scene_names_file_and_field(tmp_path: Path, change: dict[str, object], message: str) -> None:
+    meta = json.loads((DATA / "planes" / "meta.json").read_text())
+    (tmp_path / "meta.json").write_text(json.dumps(meta | change))
+    for name in ("sharp.exr", "depth.exr", "truth_0.exr"):
+        (tmp_path / name).write_bytes((DATA / "planes" / name).read_bytes())
+    with pytest.raises(ValueError, match=message) as error:
+        list(read_scenes(tmp_path))
+    assert str(tmp_path) in str(error.value)
+
+
+def test_camera_of_a_frame_and_of_its_crop_blur_alike() -> None:
+    depth = torch.full((1, 1, 1, 1), 3.0)
+    whole, crop = (camera_of(500.0, w, 0.01, 1.0).coc_px(depth, w) for w in (640, 64))
+    torch.testing.assert_close(whole, crop, rtol=1e-6, atol=0)
+    assert isinstance(camera_of(500.0, 64, 0.01, 1.0), Camera)

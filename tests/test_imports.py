@@ -1,0 +1,182 @@
+"""Who imports whom: rooms import only rooms on lower floors, and what is not asked for is not loaded."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import torchdof
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "export"}
+
+# Room -> what it may import, from the lowest floor up.
+FLOORS = {
+    "validation": set(),
+    "native": set(),
+    "io": {"validation"},
+    "optics": {"validation", "io"},
+    "depth": {"validation", "io", "optics"},
+    "options": {"validation", "optics"},
+    "render": {"validation", "optics", "options"},
+    "reference": {"validation", "io", "optics", "render"},
+    "module": {"validation", "optics", "options", "render", "native"},
+    "fit": {"validation", "io", "optics"},
+    "export": {"validation", "io", "optics", "options", "render", "module"},
+    "bench": {"validation", "io", "optics", "depth", "options", "render", "reference", "module", "export"},
+    "cli": {"validation", "io", "optics", "depth", "options", "module", "reference", "fit", "export", "bench"},
+}
+
+# The engine, until its files stand in the room `render`.
+ENGINE = {
+    *("attention", "background", "coarse", "composite", "frame", "highlights", "layers", "loop"),
+    *("pipeline", "placement", "plan", "pool", "resolution", "spread", "survey"),
+}
+
+
+def modules() -> dict[str, Path]:
+    """Dotted name -> file, of everything that is shipped."""
+    found = {}
+    for package, folder in FOLDERS.items():
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = [package, *path.relative_to(ROOT / folder).with_suffix("").parts]
+            found[".".join(parts).removesuffix(".__init__")] = path
+    return found
+
+
+FILES = modules()
+HOMES = {name: f"torchdof.{home}" for name, home in torchdof._HOMES.items()}
+
+
+def room_of(module: str) -> str:
+    part = (module.split(".") + [""])[1]
+    return "render" if part in ENGINE else part
+
+
+def imports(module: str) -> Iterator[str]:
+    """Modules of ours that a module imports, anywhere in its file but for the type checker alone."""
+    path = FILES[module]
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    checked = {
+        id(node)
+        for branch in ast.walk(tree)
+        if isinstance(branch, ast.If) and isinstance(branch.test, ast.Name) and branch.test.id == "TYPE_CHECKING"
+        for node in ast.walk(branch)
+    }
+    for node in ast.walk(tree):
+        if id(node) in checked:
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in FILES)
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            source = ".".join([*above, *([node.module] if node.module else [])])
+            for alias in node.names:
+                name = f"{source}.{alias.name}"
+                found = name if name in FILES else HOMES.get(alias.name, source) if source == "torchdof" else source
+                if found in FILES:
+                    yield found
+
+
+GRAPH = {module: set(imports(module)) - {module} for module in FILES}
+
+
+def test_floors_hold_only_what_is_below_them() -> None:
+    below: set[str] = set()
+    for room, allowed in FLOORS.items():
+        assert allowed <= below, room
+        below.add(room)
+
+
+def test_every_file_is_in_a_room() -> None:
+    rooms = {room_of(module) for module in FILES} - {"", "__main__"}
+    assert rooms <= set(FLOORS)
+
+
+@pytest.mark.parametrize("room", FLOORS)
+def test_a_room_imports_only_rooms_below_it(room: str) -> None:
+    wrong = [
+        f"{module} imports {target}"
+        for module, targets in GRAPH.items()
+        if room_of(module) == room
+        for target in sorted(targets)
+        if room_of(target) not in {room, *FLOORS[room]}
+    ]
+    assert wrong == []
+
+
+def test_no_file_imports_itself_through_others() -> None:
+    graph = {module: targets & set(GRAPH) for module, targets in GRAPH.items()}
+    while leaves := {module for module, targets in graph.items() if not targets & set(graph)}:
+        graph = {module: targets for module, targets in graph.items() if module not in leaves}
+    assert sorted(graph) == []
+
+
+@pytest.mark.parametrize(("wing", "other"), [("photo", "lens"), ("lens", "photo")])
+def test_the_wings_of_fit_do_not_know_each_other(wing: str, other: str) -> None:
+    wrong = [
+        f"{module} imports {target}"
+        for module, targets in GRAPH.items()
+        if module.startswith(f"torchdof.fit.{wing}")
+        for target in targets
+        if target.startswith(f"torchdof.fit.{other}")
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("module", ["problems", "result", "solve", "validation"])
+def test_what_both_wings_stand_on_knows_neither(module: str) -> None:
+    targets = GRAPH[f"torchdof.fit.{module}"]
+    assert not [target for target in targets if target.startswith(("torchdof.fit.photo", "torchdof.fit.lens"))]
+
+
+def loaded(code: str, *names: str) -> list[str]:
+    """Which of some packages are loaded once code has run in a fresh process."""
+    told = f"import sys\n{code}\nprint([name for name in {names!r} if name in sys.modules])"
+    run = subprocess.run([sys.executable, "-W", "error", "-c", told], capture_output=True, text=True, check=True)
+    return list(ast.literal_eval(run.stdout.splitlines()[-1]))
+
+
+HEAVY = ("scipy", "onnx", "onnxruntime", "onnxscript", "OpenImageIO", "matplotlib", "kornia", "typer", "rich")
+PUBLIC = "import torchdof\nfor name in torchdof.__all__: getattr(torchdof, name)"
+
+
+def test_public_names_load_nothing_heavy() -> None:
+    assert loaded(PUBLIC, *HEAVY) == []
+
+
+@pytest.mark.xfail(strict=True, reason="the engine's plan.py has torch.compiler decorators, which load the compiler")
+def test_public_names_do_not_load_the_compiler() -> None:
+    assert loaded(PUBLIC, "torch._dynamo") == []
+
+
+def test_rooms_below_the_engine_do_not_load_the_compiler() -> None:
+    code = (
+        "import torchdof.options, torchdof.depth, torchdof.io.images, torchdof.reference.metrics, torchdof.fit.result"
+    )
+    assert loaded(code, "torch._dynamo", "kornia", "OpenImageIO") == []
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["no-such-command"]])
+def test_the_command_line_answers_without_pytorch(arguments: list[str]) -> None:
+    code = f"""
+sys.argv = ["torchdof", *{arguments}]
+from torchdof.cli.main import main
+try:
+    main()
+except SystemExit:
+    pass
+"""
+    assert loaded(code, "torch", "kornia", "scipy", "onnx") == []
+
+
+def test_python_m_torchdof_helps_without_pytorch() -> None:
+    run = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "torchdof", "--help"], capture_output=True, text=True, check=True
+    )
+    assert "render" in run.stdout and "bench" in run.stdout
+    assert not [line for line in run.stderr.splitlines() if line.split("|")[-1].strip() == "torch"]

@@ -1,0 +1,1 @@
+"""Speed against error, and accuracy against the truth."""

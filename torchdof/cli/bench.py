@@ -1,0 +1,187 @@
+"""``torchdof bench``: speed against error on a scene; or how close to the truth each renderer comes."""
+
+import dataclasses
+import importlib.util
+import os
+import shutil
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from ..bench import scaling, speed
+from ..bench.accuracy import compare_with_truth
+from ..bench.inputs import Subject, shipped
+from ..bench.report import existing_folder
+from ..depth.holes import resolve_holes
+from ..depth.kinds import depth_from_values
+from ..io.images import read_image, read_values
+from .settings import RenderSettings
+
+__all__ = ["bench", "from_files"]
+
+_SPEED, _ACCURACY = "Speed", "Accuracy"
+
+
+def bench(
+    image: Annotated[
+        Path | None,
+        typer.Argument(metavar="[IMAGE]", help="Image to measure the speed on; without one, a scene that is built in."),
+    ] = None,
+    depth: Annotated[
+        Path | None, typer.Argument(metavar="[DEPTH]", help="Its depth; not needed if IMAGE has a Z channel.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png."),
+    ] = None,
+    repeat: Annotated[int, typer.Option(help="Timed renderings of each setting.", min=1)] = 5,
+    focus_m: Annotated[
+        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=_SPEED)
+    ] = None,
+    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_SPEED)] = None,
+    focal_length_mm: Annotated[float | None, typer.Option(help="Focal length.", rich_help_panel=_SPEED)] = None,
+    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_SPEED)] = None,
+    depth_kind: Annotated[
+        Literal["z", "disparity", "inverse", "coc"],
+        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=_SPEED),
+    ] = "z",
+    depth_scale: Annotated[
+        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_SPEED)
+    ] = None,
+    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_SPEED)] = 0.0,
+    fill_depth: Annotated[
+        Literal["nearest", "far"] | None,
+        typer.Option(help="Fill pixels without depth; else they are refused.", rich_help_panel=_SPEED),
+    ] = None,
+    onnx: Annotated[
+        bool,
+        typer.Option(
+            "--onnx", help="Also export and time the file in onnxruntime; takes minutes.", rich_help_panel=_SPEED
+        ),
+    ] = False,
+    compiled: Annotated[
+        bool,
+        typer.Option("--compile", help="Also time torch.compile; takes minutes.", rich_help_panel=_SPEED),
+    ] = False,
+    scan: Annotated[
+        bool,
+        typer.Option("--scan", help="Also show how cost grows with radius and frame size.", rich_help_panel=_SPEED),
+    ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth",
+            help="Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it.",
+            rich_help_panel=_ACCURACY,
+        ),
+    ] = None,
+    views: Annotated[
+        list[int] | None,
+        typer.Option(
+            help="Points on the lens for the reference renderer; repeat it to see how it converges.",
+            min=1,
+            rich_help_panel=_ACCURACY,
+        ),
+    ] = None,
+    inner: Annotated[
+        bool,
+        typer.Option(
+            "--inner",
+            help="Leave out the border that light from outside the frame reaches.",
+            rich_help_panel=_ACCURACY,
+        ),
+    ] = False,
+) -> None:
+    """Measure speed against error on your own scene, or accuracy where the truth is known.
+
+    Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU; with --onnx also an
+    exported file, with --compile also torch.compile, with --scan also how cost grows with blur and frame:
+
+        torchdof bench photo.png depth.exr --f-number 1.8 --out results
+
+    torchdof and simpler renderers against scenes whose depth of field is known:
+
+        torchdof bench --truth scenes --out results
+
+    The picture of the latter shows, for each scene, the place where torchdof is farthest from the truth: sharp, truth,
+    each renderer with its error below it, four times enlarged.
+    """
+    existing_folder(out)
+    if truth is not None:
+        if image is not None or onnx or compiled or scan:
+            raise ValueError(
+                "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
+            )
+        if out is None:
+            raise ValueError("--truth writes tables and pictures; give a folder with --out")
+        compare_with_truth(truth, out, views, inner)
+        return
+    if views or inner:
+        raise ValueError("--views and --inner compare with a truth; name its folder with --truth")
+    how = RenderSettings(
+        focus=None if focus_m is None else [(0, focus_m)],
+        f_number=f_number,
+        focal_length_mm=focal_length_mm,
+        sensor_width_mm=sensor_width_mm,
+        depth_kind=depth_kind,
+        depth_scale=depth_scale,
+        depth_offset=depth_offset,
+        fill=fill_depth,
+    )
+    if image is None and how != RenderSettings(table=how.table):
+        raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
+    if out is not None and importlib.util.find_spec("matplotlib") is None:  # before the time is spent
+        raise ModuleNotFoundError("no matplotlib", name="matplotlib")
+    if onnx and importlib.util.find_spec("onnxruntime") is None:
+        raise ModuleNotFoundError("no onnxruntime", name="onnxruntime")
+    if compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
+        raise FileNotFoundError(
+            "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
+        )
+    subject = shipped() if image is None else from_files(image, depth, how)
+    console = Console(stderr=True)
+    runtimes: list[speed.Runtime] = []
+    if onnx:
+        runtimes.append("onnxruntime")
+    if compiled:
+        runtimes.append("compiled")
+    rows, unit = speed.measure_all(subject, repeat, console, runtimes)
+    speed.show(rows, subject, unit)
+    grown = scaling.measure_growth(subject, repeat, unit, console) if scan else []
+    growth = [scaling.table_of(grown)] if grown else []
+    for table in growth:
+        table.show()
+    if out is not None:
+        speed.write(out, rows, subject, unit, repeat, growth)
+
+
+def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:
+    """An image and its depth from files; alpha is left out.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        how: Camera and depth as for ``torchdof render``; without a focus it is at the median depth, so that there is
+            blur on both sides.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read.
+    """
+    picture = read_image(image, how.transfer, how.layer)
+    values = picture.depth if depth is None else read_values(depth, how.depth_channel)
+    if values is None:
+        raise ValueError(f"{image}: has no depth channel; name a depth file after it: torchdof bench IMAGE DEPTH")
+    values = depth_from_values(values, how.depth_kind, scale=how.depth_scale, offset=how.depth_offset)
+    values, _ = resolve_holes(values, str(depth or image), how.fill)
+    light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
+    if how.depth_kind == "coc":
+        return Subject(image.name, light, values, "blur as given")
+    focus = "focus as stated"
+    if how.focus is None:
+        focus, how = "focus at the median depth", dataclasses.replace(how, focus=[(0, float(values.median()))])
+    camera, remarks = how.camera(picture.metadata, light.shape[-1], 0)
+    words = f"{camera!r}; {', '.join([focus, *remarks])}"
+    return Subject(image.name, light, camera.coc_px(values, light.shape[-1]), words)

@@ -1,0 +1,51 @@
+"""Whatever is wrong with the input ends in one sentence on standard error and exit code 2."""
+
+import contextlib
+import errno
+import sys
+from collections.abc import Iterator
+
+import typer
+
+__all__ = ["advice", "told_in_one_sentence"]
+
+_EXTRAS = {"scipy": "fit", "onnx": "export", "onnxscript": "export", "onnxruntime": "export", "matplotlib": "plot"}
+
+
+@contextlib.contextmanager
+def told_in_one_sentence() -> Iterator[None]:
+    """Turns errors of the input, of files and of memory into their message and exit code 2; others pass.
+
+    Raises:
+        typer.Exit: After the message.
+    """
+    try:
+        yield
+        return
+    except ModuleNotFoundError as error:
+        message = advice(error)
+    except OSError as error:
+        if error.errno == errno.EPIPE:
+            raise
+        message = str(error)
+    except (ValueError, MemoryError) as error:
+        message = str(error) or "there is too little memory for this image"
+    except RuntimeError as error:
+        torch = sys.modules.get("torch")  # whoever ran out of its memory has imported it
+        if torch is None or not isinstance(error, torch.OutOfMemoryError):
+            raise
+        message = "the device has too little memory for this image; try --device cpu"
+    typer.echo(f"error: {message}", err=True)
+    raise typer.Exit(2)
+
+
+def advice(error: ModuleNotFoundError) -> str:
+    """Which extra brings a package that is missing.
+
+    Raises:
+        ModuleNotFoundError: The same, if none does.
+    """
+    package = (error.name or "").partition(".")[0]
+    if package not in _EXTRAS:
+        raise error
+    return f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"

@@ -1,0 +1,187 @@
+"""`torchdof fit`: photographs of a dot, or a lens prescription, to a blur table."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from torchdof import BlurTable
+from torchdof.fit.photo.manifest import Captures, read_captures
+from torchdof.fit.photo.table import TableFit, fit_captures
+from torchdof.fit.problems import FitError, FitWarning
+
+__all__ = ["fit"]
+
+_CAPTURE, _LENS, _OUT = "From photographs", "From a lens prescription", "Result"
+
+
+def fit(
+    captures: Annotated[
+        Path | None,
+        typer.Argument(help="Folder with photographs of a dot and their capture.toml.", show_default=False),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The table to write (JSON).", rich_help_panel=_OUT)
+    ] = Path("table.json"),
+    family: Annotated[
+        Literal["auto", "gaussian", "ring", "disc", "softm", "radial"],
+        typer.Option(help="Kernel family; auto takes the cheapest that is accurate enough.", rich_help_panel=_CAPTURE),
+    ] = "auto",
+    accuracy_db: Annotated[
+        float, typer.Option(help="PSNR on a natural image that auto asks for.", rich_help_panel=_CAPTURE)
+    ] = 45.0,
+    dots: Annotated[
+        Literal["manifest", "one", "centre", "each"],
+        typer.Option(
+            help="One dot; the centre of a grid; or each dot of it, one table a field position.",
+            rich_help_panel=_CAPTURE,
+        ),
+    ] = "manifest",
+    lens: Annotated[
+        str | None,
+        typer.Option(help="Prescription: a file, or the name of a shipped one.", rich_help_panel=_LENS),
+    ] = None,
+    f_number: Annotated[float, typer.Option(help="Aperture of the lens.", rich_help_panel=_LENS)] = 2.0,
+    focus_m: Annotated[float, typer.Option(help="Focus distance in metres; inf allowed.", rich_help_panel=_LENS)] = 2.0,
+    nodes: Annotated[int, typer.Option(help="Distances traced.", rich_help_panel=_LENS)] = 33,
+    plots: Annotated[
+        Path | None, typer.Option(help="Folder for pictures of the fits and the table.", rich_help_panel=_OUT)
+    ] = None,
+) -> None:
+    """Make a blur table from photographs of a dot, or from a lens prescription.
+
+    Photograph a white dot on black paper in focus and, without refocusing, at other distances; describe the
+    pictures in capture.toml (see docs/measuring.md); then
+
+        torchdof fit my-lens/ -o my-lens.json --plots pictures/
+
+    Or trace a lens:
+
+        torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
+    """
+    console = Console(soft_wrap=True)
+    if (captures is None) == (lens is None):
+        raise FitError("give either a folder of captures or --lens FILE")
+    if output.suffix != ".json":
+        raise FitError(f"the table is written as JSON: name it {output.with_suffix('.json')}", file=str(output))
+    if plots is not None:
+        plots.mkdir(parents=True, exist_ok=True)
+    if lens is not None:
+        table = _trace(lens, f_number, focus_m, nodes, console)
+        _lens_summary(table, console)
+        _write(table, output, console)
+        if plots is not None:
+            _draw_table(table, plots, output.stem, console)
+        return
+    sets = read_captures(str(captures), dots=None if dots == "manifest" else dots)
+    for i, one in enumerate(sets):
+        target = output if len(sets) == 1 else output.with_name(f"{output.stem}_{i:02d}.json")
+        if len(sets) > 1:
+            console.print(f"dot {i} at {one.notes['position_px']} px from the centre")
+        command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
+        result, doubts = _fit_with_progress(one, family, accuracy_db, command, console)
+        _summary(one, result, doubts, console)
+        _write(result.table, target, console)
+        if plots is not None:
+            _draw_fits(one, result, plots, target.stem, console)
+            _draw_table(result.table, plots, target.stem, console)
+
+
+def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Console) -> BlurTable:
+    from torchdof.fit.lens.lens import Lens
+    from torchdof.fit.lens.trace import trace_table
+
+    with console.status(f"tracing {nodes} distances"):
+        return trace_table(Lens.read(lens), f_number=f_number, focus_m=focus_m, nodes=nodes)
+
+
+def _fit_with_progress(
+    one: Captures, family: str, accuracy_db: float, command: str, console: Console
+) -> tuple[TableFit, list[str]]:
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with warnings.catch_warnings(record=True) as caught, Progress(*columns, console=console, transient=True) as bar:
+        warnings.simplefilter("always", FitWarning)
+        job = bar.add_task("fitting", total=None)
+        result = fit_captures(
+            one,
+            family,
+            accuracy_db=accuracy_db,
+            progress=lambda done, total, what: bar.update(job, completed=done, total=total, description=what),
+            command=command,
+        )
+    # "auto" fits a picture several times; what it says twice is said once
+    return result, list(dict.fromkeys(str(w.message) for w in caught))
+
+
+def _summary(one: Captures, result: TableFit, doubts: list[str], console: Console) -> None:
+    shown = Table(
+        title=f"{one.name or 'captures'}: {result.table.family}, focus {one.focus_m:g} m", title_justify="left"
+    )
+    names = [n for n in result.fits[0].params if n != "values"]
+    for column in ("distance m", "coc px", *names, "residual %", "x noise", "magnification"):
+        shown.add_column(column, justify="right")
+    for pair, fitted, coc in zip(one, result.fits, result.coc_px, strict=True):
+        values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
+        ratio = fitted.residual_over_noise
+        shown.add_row(
+            f"{pair.distance_m:g}", f"{coc:+.2f}", *values, f"{100 * fitted.residual:.2f}",
+            "" if math.isnan(ratio) else f"{ratio:.2f}", f"{fitted.magnification:.4f}",
+        )  # fmt: skip
+    console.print(shown)
+    console.print(f"family: {result.why}", markup=False, highlight=False)
+    console.print(
+        "circles of confusion: "
+        + ("from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"),
+        highlight=False,
+    )
+    for doubt in doubts:
+        console.print(f"warning: {doubt}", style="yellow", markup=False, highlight=False)
+
+
+def _lens_summary(table: BlurTable, console: Console) -> None:
+    facts, places = table.provenance, table.coc.tolist()
+    console.print(
+        f"{facts['lens']}: {facts['focal_length_mm']:g} mm, f/{facts['f_number']:g}, focus {facts['focus_m']} m; "
+        f"{len(places)} distances from {facts['nearest_m']:.3g} m to infinity, circles of confusion "
+        f"from {places[0]:+.3f} to {places[-1]:+.3f} mm",
+        markup=False,
+        highlight=False,
+    )
+    if table.residual is not None:
+        middle, most = 100 * float(table.residual.median()), 100 * float(table.residual.max())
+        console.print(f"family: {table.family}, residual {middle:.2f} %, {most:.2f} % at most", highlight=False)
+
+
+def _write(table: BlurTable, target: Path, console: Console) -> None:
+    table.save(target)
+    console.print(f"{target}: {table!r}", markup=False, highlight=False)
+
+
+def _draw_fits(one: Captures, result: TableFit, folder: Path, stem: str, console: Console) -> None:
+    from torchdof.fit.plots import picture_of_fit
+
+    for pair, fitted in zip(one, result.fits, strict=True):
+        target = folder / f"{stem}_{pair.distance_m * 1000:.0f}mm.png"
+        picture_of_fit(fitted).savefig(target)
+        console.print(str(target), markup=False, highlight=False)
+
+
+def _draw_table(table: BlurTable, folder: Path, stem: str, console: Console) -> None:
+    from torchdof.fit.plots import picture_of_table, picture_of_texture
+
+    target = folder / f"{stem}_table.png"
+    picture_of_table(table).savefig(target)
+    console.print(str(target), markup=False, highlight=False)
+    width = 1920
+    largest = float(table.coc[table.coc.abs().argmax()])
+    scale = {"fraction": float(width), "mm": width / (table.sensor_width_mm or 36.0), "relative": 16.0}[table.unit]
+    target = folder / f"{stem}_texture.png"
+    picture_of_texture(table, largest * scale, width).savefig(target)
+    console.print(str(target), markup=False, highlight=False)

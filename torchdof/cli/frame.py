@@ -1,0 +1,170 @@
+"""One frame from files to a file: what ``torchdof render`` does with each image."""
+
+import dataclasses
+import math
+import os
+import time
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..depth.holes import resolve_holes
+from ..depth.kinds import depth_from_values
+from ..io.images import Picture, read_image, read_values, write_image
+from ..io.metadata import camera_facts
+from ..module import blur_by_coc, depth_of_field
+from ..optics.blur_table import BlurTable
+from ..optics.camera import Camera
+from ..options import Options
+from ..validation import image_and_map
+from .settings import RenderSettings
+
+__all__ = ["render_frame", "tint_focus"]
+
+_NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
+
+
+def render_frame(
+    image: str | os.PathLike[str],
+    depth: str | os.PathLike[str] | None,
+    out: str | os.PathLike[str],
+    settings: RenderSettings,
+    frame: int = 0,
+) -> str:
+    """Reads an image and its depth, blurs, and writes the result whole or not at all.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        out: File to write.
+        settings: What the user said.
+        frame: Number of the frame, for focus that moves.
+
+    Returns:
+        One line that says what was done, with what, and how long it took.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read or written.
+    """
+    if any(Path(source).resolve() == Path(out).resolve() for source in (image, depth) if source is not None):
+        raise ValueError(f"{out}: is one of the inputs; write to another file")
+    start = time.perf_counter()
+    picture = read_image(image, settings.transfer, settings.layer)
+    height, width = picture.pixels.shape[-2:]
+    values, holes = _depth(image, depth, picture, settings)
+    values = values.to(settings.device)
+    parts: list[str] = []
+    remarks: list[str] = []
+    if settings.depth_kind == "coc":
+        camera, coc_px = None, values
+    else:
+        camera, remarks = settings.camera(picture.metadata, width, frame)
+        if settings.focus_at is not None:
+            camera = camera.focus_at(values, *settings.focus_at)
+        coc_px = camera.coc_px(values, width)
+        parts.append(_describe(camera))
+    parts.append(f"blur radius up to {float(coc_px.abs().max()):.1f} px")
+    pixels = picture.pixels.to(settings.device)
+    if settings.show_focus:
+        pixels = tint_focus(pixels, coc_px, picture.has_alpha)
+        parts.append("focus shown: near orange, sharp green, far blue")
+        picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
+    else:
+        table = _with_alpha(settings.table) if picture.has_alpha else settings.table
+        options = Options(table, settings.tolerance, settings.occlusion, method=settings.method).arguments()
+        with torch.no_grad():
+            if camera is None:
+                pixels = blur_by_coc(pixels, coc_px, **options)
+            else:
+                pixels = depth_of_field(pixels, values, camera, **options)
+        parts.append(f"{settings.table.name or settings.table.family}, {settings.method}")
+        if not settings.occlusion:
+            parts.append("no occlusion")
+    write_image(out, dataclasses.replace(picture, pixels=pixels), settings.out_transfer, settings.sample)
+    if holes:
+        parts.append(f"{holes} px of depth filled ({settings.fill})")
+    parts += [f"{width} x {height}", f"{time.perf_counter() - start:.2f} s on {settings.device}"]
+    return f"{out}: " + "; ".join(parts) + (f" [{', '.join(remarks)}]" if remarks else "")
+
+
+def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor:
+    """The image with what is in focus (blur radius of at most 1 px) green, nearer orange and farther blue.
+
+    Args:
+        image: ``[B, C, H, W]`` in linear light, C of 1 or 3, one more with alpha (premultiplied).
+        coc_px: ``[B, 1, H, W]``, signed radius in pixels.
+        has_alpha: Whether the last channel is alpha.
+
+    Returns:
+        ``[B, 3, H, W]``, or ``[B, 4, H, W]`` with alpha.
+
+    Raises:
+        ValueError: If shapes or types are not as described.
+
+    Example:
+        >>> tinted = tint_focus(torch.ones(1, 1, 1, 3), torch.tensor([[[[-3.0, 0.2, 5.0]]]]))
+        >>> tinted[0, :, 0].argmax(dim=0)  # red, green and blue are strongest
+        tensor([0, 1, 2])
+    """
+    image_and_map(image, "coc_px", coc_px, "in pixels")
+    if image.shape[1] - has_alpha not in (1, 3):
+        raise ValueError(f"image must have 1 or 3 channels of colour, got {image.shape[1] - has_alpha}")
+    colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
+    grey = colour.mean(dim=1, keepdim=True)
+    tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
+    which = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
+    tint = tints[which[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
+    tinted = 0.35 * colour + 0.65 * grey * tint / tint.mean(dim=1, keepdim=True)
+    return torch.cat([tinted, alpha], dim=1)
+
+
+def _depth(
+    image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, picture: Picture, settings: RenderSettings
+) -> tuple[Tensor, int]:
+    """Depth in metres (or coc) without holes, ``[1, 1, H, W]``, and how many holes there were."""
+    if depth is not None:
+        values = read_values(depth, settings.depth_channel)
+    elif settings.depth_channel is not None:
+        values = read_values(image, settings.depth_channel)
+    elif picture.depth is not None:
+        values = picture.depth
+    else:
+        raise ValueError(
+            f"{image}: has no depth channel; name a depth file after it: torchdof render IMAGE DEPTH -o OUT"
+        )
+    name = str(depth if depth is not None else image)
+    if values.shape[-2:] != picture.pixels.shape[-2:]:
+        (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
+        raise ValueError(f"{name}: depth is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
+    fov_x_deg = settings.fov_x_deg
+    if settings.depth_kind == "distance" and fov_x_deg is None:
+        facts = camera_facts(picture.metadata, values.shape[-1])
+        focal_mm = settings.focal_length_mm or facts.get("focal_length_mm")
+        sensor_mm = settings.sensor_width_mm or facts.get("sensor_width_mm")
+        if focal_mm is None or sensor_mm is None:
+            raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
+        fov_x_deg = 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
+    result = depth_from_values(
+        values,
+        settings.depth_kind,
+        scale=settings.depth_scale,
+        offset=settings.depth_offset,
+        unknown=settings.depth_unknown,
+        fov_x_deg=fov_x_deg,
+    )
+    return resolve_holes(result, name, settings.fill)
+
+
+def _with_alpha(table: BlurTable) -> BlurTable:
+    """A table that blurs colours differently blurs alpha like green."""
+    if table.channels == 1:
+        return table
+    params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
+    return BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
+
+
+def _describe(camera: Camera) -> str:
+    lens = f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm"
+    return f"{lens} on {camera.sensor_width_mm:.4g} mm"

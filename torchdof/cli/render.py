@@ -1,0 +1,271 @@
+"""``torchdof render``: its options, and the frames it goes through."""
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from ..io.sequence import FramePattern, parse_focus, parse_frames
+from ..options import tolerance_of_text
+from .frame import render_frame
+from .settings import RenderSettings, load_table, pick_device
+
+__all__ = ["render"]
+
+_LENS, _DEPTH, _BLUR, _FILES = "Focus and lens", "Depth map", "Blur", "Files and frames"
+
+
+def render(
+    image: Annotated[
+        Path,
+        typer.Argument(metavar="IMAGE", help="All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, or out.####.exr.")],
+    depth: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DEPTH]", help="Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel."
+        ),
+    ] = None,
+    focus_m: Annotated[
+        str | None,
+        typer.Option(
+            help="Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between "
+            "them 1/distance is linear, so that the blur changes evenly.",
+            rich_help_panel=_LENS,
+        ),
+    ] = None,
+    focus_at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y",
+            help="Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame.",
+            rich_help_panel=_LENS,
+        ),
+    ] = None,
+    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_LENS)] = None,
+    focal_length_mm: Annotated[
+        float | None, typer.Option(help="Real focal length, not the 35 mm equivalent.", rich_help_panel=_LENS)
+    ] = None,
+    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_LENS)] = None,
+    fov_deg: Annotated[
+        float | None,
+        typer.Option(help="Horizontal field of view of a rendered image, instead of a lens.", rich_help_panel=_LENS),
+    ] = None,
+    aperture_radius_m: Annotated[
+        float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=_LENS)
+    ] = None,
+    depth_kind: Annotated[
+        Literal["z", "distance", "disparity", "inverse", "coc"],
+        typer.Option(
+            help="What the numbers are: z along the optical axis or distance along the ray, in metres after scale * "
+            "(value + offset); disparity or inverse depth, in metres after scale / (value + offset); or coc, the "
+            "signed blur radius in pixels (negative is near).",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = "z",
+    depth_scale: Annotated[
+        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_DEPTH)
+    ] = None,
+    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_DEPTH)] = 0.0,
+    depth_unknown: Annotated[
+        float | None,
+        typer.Option(help="A value that means 'not measured', such as 0, -1 or inf.", rich_help_panel=_DEPTH),
+    ] = None,
+    fill_depth: Annotated[
+        str | None,
+        typer.Option(
+            metavar="nearest|far|METRES",
+            help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see "
+            "lies behind), or with a distance (inf for a sky). Without this they are refused.",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = None,
+    depth_channel: Annotated[
+        str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=_DEPTH)
+    ] = None,
+    table: Annotated[
+        str,
+        typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=_BLUR),
+    ] = "disc",
+    tolerance: Annotated[
+        str,
+        typer.Option(
+            help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
+            "exact.",
+            rich_help_panel=_BLUR,
+        ),
+    ] = "final",
+    no_occlusion: Annotated[
+        bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=_BLUR)
+    ] = False,
+    method: Annotated[
+        Literal["layered", "fold"],
+        typer.Option(help="fold is the literal scatter: exact, slow.", rich_help_panel=_BLUR),
+    ] = "layered",
+    show_focus: Annotated[
+        bool,
+        typer.Option(
+            "--show-focus", help="Don't blur: tint near orange, in focus green, far blue.", rich_help_panel=_BLUR
+        ),
+    ] = False,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=_BLUR)] = "auto",
+    transfer: Annotated[
+        Literal["linear", "srgb"] | None,
+        typer.Option(help="How IMAGE is encoded. Default: integers srgb, floats linear.", rich_help_panel=_FILES),
+    ] = None,
+    out_transfer: Annotated[
+        Literal["linear", "srgb"] | None,
+        typer.Option(
+            help="How OUT is encoded. Default: as IMAGE, or by type if one is integers and the other floats.",
+            rich_help_panel=_FILES,
+        ),
+    ] = None,
+    bits: Annotated[
+        Literal["8", "16", "half", "float"] | None,
+        typer.Option(help="What OUT stores. Default: as IMAGE, where the type can.", rich_help_panel=_FILES),
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer or part of an EXR that is the image.", rich_help_panel=_FILES)
+    ] = None,
+    frames: Annotated[
+        str | None, typer.Option(metavar="FIRST-LAST", help="Part of a sequence.", rich_help_panel=_FILES)
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Render only the frames that OUT lacks.", rich_help_panel=_FILES)
+    ] = False,
+) -> None:
+    """Blur IMAGE by its DEPTH as a lens would.
+
+    A photograph and its depth in millimetres, focused on what is seen at column 320, row 200:
+
+        torchdof render photo.jpg depth.png -o out.jpg --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
+
+    A rendered image with a Z channel:
+
+        torchdof render shot.exr -o out.exr --fov-deg 40 --aperture-radius-m 0.012 --focus-m 2
+
+    A sequence, its focus pulled from 2 m to 5.5 m; --resume goes on after an interruption:
+
+        torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
+
+    A stereo disparity map with holes (scale: baseline in metres * focal length in pixels):
+
+        torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
+
+    The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
+    that is printed says which. Alpha and metadata are kept. A file is written whole or not at all.
+    """
+    settings = RenderSettings(
+        focus=None if focus_m is None else parse_focus(focus_m),
+        focus_at=None if focus_at is None else _point(focus_at),
+        f_number=f_number,
+        focal_length_mm=focal_length_mm,
+        sensor_width_mm=sensor_width_mm,
+        fov_x_deg=fov_deg,
+        aperture_radius_m=aperture_radius_m,
+        depth_kind=depth_kind,
+        depth_scale=depth_scale,
+        depth_offset=depth_offset,
+        depth_unknown=depth_unknown,
+        depth_channel=depth_channel,
+        fill=None if fill_depth is None else _fill(fill_depth),
+        table=load_table(table),
+        tolerance=tolerance_of_text(tolerance),
+        occlusion=not no_occlusion,
+        method=method,
+        device=pick_device(device),
+        transfer=transfer,
+        out_transfer=out_transfer,
+        sample=bits,
+        layer=layer,
+        show_focus=show_focus,
+    )
+    if FramePattern.matches(image):
+        _render_sequence(image, depth, out, settings, frames, resume)
+        return
+    if FramePattern.matches(out) or (depth is not None and FramePattern.matches(depth)) or frames is not None:
+        raise ValueError(f"{image}: is a single image; for a sequence write it as shot.####.exr")
+    if len(settings.focus or []) > 1:
+        raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
+    if resume and out.exists():
+        typer.echo(f"{out}: is there already")
+        return
+    with _progress() as progress:
+        progress.add_task(f"rendering {out.name}", total=None)
+        line = render_frame(image, depth, out, settings)
+    typer.echo(line)
+
+
+def _render_sequence(
+    image: Path, depth: Path | None, out: Path, settings: RenderSettings, frames: str | None, resume: bool
+) -> None:
+    source, target = FramePattern(image), FramePattern(out)
+    depths = FramePattern(depth) if depth is not None and FramePattern.matches(depth) else None
+    numbers = source.frames()
+    if frames is not None:
+        first, last = parse_frames(frames)
+        existing = set(numbers)
+        numbers = list(range(first, last + 1))
+        absent = [source.name(n) for n in numbers if n not in existing]
+        if absent:
+            raise FileNotFoundError(
+                f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} frames missing)"
+            )
+    if not numbers:
+        raise FileNotFoundError(f"{image}: there are no such files")
+    if depths is not None:
+        absent = [path for n in numbers if not (path := depths.name(n)).is_file()]
+        if absent:
+            raise FileNotFoundError(
+                f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} depths missing)"
+            )
+    todo = [n for n in numbers if not (resume and target.name(n).is_file())]
+    if len(todo) < len(numbers):
+        typer.echo(f"{len(numbers) - len(todo)} of {len(numbers)} frames are there already")
+    with _progress() as progress:
+        task = progress.add_task("rendering", total=len(todo))
+        for n in todo:
+            line = render_frame(source.name(n), depths.name(n) if depths else depth, target.name(n), settings, n)
+            typer.echo(line)
+            progress.advance(task)
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Progress]:
+    """A bar on standard error, where that is a terminal."""
+    columns = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
+    columns += [TimeElapsedColumn(), TimeRemainingColumn()]
+    progress = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True)
+    with contextlib.nullcontext() if progress.disable else progress:
+        yield progress
+
+
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--focus-at expects a pixel X,Y such as 320,200, got {text!r}") from None
+    return x, y
+
+
+def _fill(text: str) -> Literal["nearest", "far"] | float:
+    if text == "nearest" or text == "far":
+        return "nearest" if text == "nearest" else "far"
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"--fill-depth expects nearest, far or metres, got {text!r}") from None

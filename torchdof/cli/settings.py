@@ -1,0 +1,160 @@
+"""What the user of ``torchdof render`` said, checked: lens, depth map, blur and files."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+
+from ..depth.kinds import DepthKind
+from ..io.decode import PixelType
+from ..io.metadata import camera_facts
+from ..io.sequence import focus_at_frame
+from ..io.transfer import Transfer
+from ..optics.blur_table import BlurTable
+from ..optics.camera import Camera
+from ..validation import number, show
+
+__all__ = ["RenderSettings", "load_table", "pick_device"]
+
+_ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderSettings:
+    """What the user said; None where nothing was said.
+
+    Args:
+        focus: Keyframes (frame, metres); a plain distance is one keyframe.
+        focus_at: Pixel (x, y) to focus on.
+        f_number: Focal length over aperture diameter.
+        focal_length_mm: Focal length in millimetres.
+        sensor_width_mm: Width of the sensor in millimetres.
+        fov_x_deg: Horizontal field of view in degrees, of a rendered image.
+        aperture_radius_m: Radius of the aperture in metres, with ``fov_x_deg``.
+        depth_kind: What the numbers of the depth map are, see :func:`torchdof.depth.kinds.depth_from_values`.
+        depth_scale: Factor of the depth values.
+        depth_offset: Added to the depth values first.
+        depth_unknown: Value that means "not measured".
+        depth_channel: Channel or array that holds depth.
+        fill: How to fill holes in the depth; None refuses them.
+        table: Blur table.
+        tolerance: Accepted RMS error, as in :class:`torchdof.DepthOfField`.
+        occlusion: False for the paper's single pass without occlusion.
+        method: "layered" or "fold".
+        device: Where to compute.
+        transfer: How the image is encoded.
+        out_transfer: How the result is encoded.
+        sample: What the result stores a pixel as.
+        layer: Layer of an EXR file.
+        show_focus: Tint the image by what is in focus instead of blurring it.
+
+    Raises:
+        ValueError: If two of these contradict each other.
+    """
+
+    focus: list[tuple[int, float]] | None = None
+    focus_at: tuple[float, float] | None = None
+    f_number: float | None = None
+    focal_length_mm: float | None = None
+    sensor_width_mm: float | None = None
+    fov_x_deg: float | None = None
+    aperture_radius_m: float | None = None
+    depth_kind: DepthKind = "z"
+    depth_scale: float | None = None
+    depth_offset: float = 0.0
+    depth_unknown: float | None = None
+    depth_channel: str | None = None
+    fill: Literal["nearest", "far"] | float | None = None
+    table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
+    tolerance: float = 1 / 255
+    occlusion: bool = True
+    method: Literal["layered", "fold"] = "layered"
+    device: torch.device = torch.device("cpu")
+    transfer: Transfer | None = None
+    out_transfer: Transfer | None = None
+    sample: PixelType | None = None
+    layer: str | None = None
+    show_focus: bool = False
+
+    def __post_init__(self) -> None:
+        if self.focus is not None and self.focus_at is not None:
+            raise ValueError("--focus-m and --focus-at both say where to focus; give one of them")
+        if self.depth_kind == "coc":
+            camera = ("focus", "focus_at", "f_number", "focal_length_mm", "sensor_width_mm", "aperture_radius_m")
+            if any(getattr(self, name) is not None for name in camera):
+                raise ValueError(
+                    "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
+                )
+        if self.fov_x_deg is None:
+            if self.aperture_radius_m is not None:
+                raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
+            return
+        if self.focal_length_mm is not None or self.sensor_width_mm is not None:
+            raise ValueError("--fov-deg and --focal-length-mm with --sensor-width-mm say the same; give one of them")
+        number("--fov-deg", self.fov_x_deg, low=0, high=180, unit="degrees")
+        if self.f_number is not None and self.aperture_radius_m is not None:
+            raise ValueError("--f-number and --aperture-radius-m both say how wide the lens opens; give one of them")
+
+    def camera(self, metadata: Mapping[str, Any], width: int, frame: int) -> tuple[Camera, list[str]]:
+        """The camera of one frame: what the user said, else the file's metadata, else 50 mm, f/2.8 and 36 mm.
+
+        Returns:
+            The camera (at a focus of infinity where that comes from a pixel) and remarks on what was not stated.
+        """
+        facts = camera_facts(metadata, width)
+        remarks = []
+        focus_m = math.inf
+        if self.focus is not None:
+            focus_m = focus_at_frame(self.focus, frame)
+        elif self.focus_at is None:
+            if "focus_m" not in facts:
+                raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
+            focus_m = facts["focus_m"]
+            remarks.append("focus from the file")
+        if self.fov_x_deg is not None:
+            radius_m = self.aperture_radius_m
+            if radius_m is None and self.f_number is not None:  # on the equivalent sensor, 36 mm wide
+                radius_m = 18.0 / math.tan(math.radians(self.fov_x_deg) / 2) / (2000.0 * self.f_number)
+            if radius_m is None:
+                raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
+            return Camera.from_fov(self.fov_x_deg, radius_m, focus_m), remarks
+        lens: dict[str, float] = {}
+        for name, assumed in _ASSUMED.items():
+            said = getattr(self, name)
+            lens[name] = facts.get(name, assumed) if said is None else said
+            if said is None:
+                plain = name.rsplit("_", 1)[0].replace("_", " ") if name != "f_number" else "f-number"
+                remarks.append(f"{plain} {'from the file' if name in facts else 'assumed'}")
+        return Camera(lens["focal_length_mm"], lens["f_number"], focus_m, lens["sensor_width_mm"]), remarks
+
+
+def load_table(name: str) -> BlurTable:
+    """A blur table by name ("disc", "gaussian", a shipped one) or by the path of its JSON file.
+
+    Raises:
+        ValueError: If there is no such table or it is not valid.
+        OSError: If the file cannot be read.
+    """
+    if name in ("disc", "gaussian"):
+        return BlurTable.disc() if name == "disc" else BlurTable.gaussian()
+    return BlurTable.load(name)
+
+
+def pick_device(name: str) -> torch.device:
+    """A device by name; "auto" is CUDA where there is one, else the CPU.
+
+    Raises:
+        ValueError: If there is no such device.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if not isinstance(name, str):
+        raise ValueError(f"--device must be a name such as auto, cpu or cuda:1, got {show(name)}")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device).sum().item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise ValueError(f"--device {name}: there is no such device here; use cpu") from None
+    return device

@@ -1,0 +1,7 @@
+"""Whatever depth people have, as metres along the optical axis: kinds of numbers, holes, files."""
+
+from .holes import fill_holes
+from .kinds import depth_from_values
+from .reading import read_depth
+
+__all__ = ["depth_from_values", "fill_holes", "read_depth"]

@@ -1,0 +1,120 @@
+"""Pixels without depth: counted, refused, or filled from around as asked."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ..validation import show
+from .kinds import number_map
+
+__all__ = ["fill_holes", "resolve_holes"]
+
+
+def fill_holes(depth: Tensor, fill: Literal["nearest", "far"] | float) -> Tensor:
+    """Gives every pixel without depth (NaN) one.
+
+    Args:
+        depth: ``[1, 1, H, W]``.
+        fill: "nearest" takes the nearest pixel that has depth (by jump flooding: now and then one that is a
+            fraction of a pixel farther). "far" takes the farthest of the first pixels with depth to the left, right,
+            above and below: what stereo cannot see lies behind. A number is the depth in metres, for example inf for
+            a sky.
+
+    Returns:
+        ``[1, 1, H, W]`` without NaN; where there was a depth it is unchanged.
+
+    Raises:
+        ValueError: If no pixel has a depth to fill from, or the fill is unknown.
+
+    Example:
+        >>> fill_holes(torch.tensor([[[[1.0, torch.nan, torch.nan, 4.0]]]]), "far")
+        tensor([[[[1., 4., 4., 4.]]]])
+    """
+    number_map("depth", depth)
+    if isinstance(fill, int | float) and not isinstance(fill, bool):
+        if not fill > 0 or torch.finfo(depth.dtype).max < fill < math.inf:
+            raise ValueError(f"the depth to fill with must be positive metres (inf allowed), got {show(fill)}")
+        return torch.where(depth.isnan(), float(fill), depth)
+    if not isinstance(fill, str) or fill not in ("nearest", "far"):
+        raise ValueError(f"fill must be 'nearest', 'far' or metres, got {show(fill)}")
+    if depth.ndim != 4 or depth.shape[:2] != (1, 1):
+        raise ValueError(f"depth must be [1, 1, H, W], got {list(depth.shape)}")
+    if not bool(depth.isnan().any()):
+        return depth
+    if bool(depth.isnan().all()):
+        raise ValueError("no pixel has a depth; check the kind, scale and offset of the depth map")
+    if fill == "nearest":
+        return _nearest(depth[0, 0])[None, None]
+    candidates = torch.stack([_first_along(depth, dim, back) for dim in (-1, -2) for back in (False, True)])
+    farthest = torch.where(candidates.isnan(), -torch.inf, candidates).amax(dim=0)
+    filled = torch.where(depth.isnan() & (farthest > -torch.inf), farthest, depth)
+    return fill_holes(filled, "nearest")  # what has no depth in its row or column
+
+
+def resolve_holes(depth: Tensor, name: str, fill: Literal["nearest", "far"] | float | None) -> tuple[Tensor, int]:
+    """Counts the pixels without depth (NaN), and refuses or fills them.
+
+    Args:
+        depth: ``[1, 1, H, W]``.
+        name: Of the file, for the message.
+        fill: As for :func:`fill_holes`; None refuses.
+
+    Returns:
+        The depth without holes, and how many there were.
+
+    Raises:
+        ValueError: If there are holes and ``fill`` is None, or nothing to fill them from.
+    """
+    holes = int(depth.isnan().sum())
+    if holes == 0:
+        return depth, 0
+    if fill is None:
+        raise ValueError(
+            f"{name}: {holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth (NaN, zero, negative or "
+            "marked unknown); say how to fill them: fill 'nearest' or 'far' (--fill-depth)"
+        )
+    try:
+        return fill_holes(depth, fill), holes
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
+    """The last value that is not NaN at or before each place along a dimension; NaN where there is none."""
+    seen = depth.flip(dim) if back else depth
+    place = torch.arange(seen.shape[dim]).reshape([-1 if d == seen.ndim + dim else 1 for d in range(seen.ndim)])
+    last = torch.where(seen.isnan(), -1, place).cummax(dim=dim).values
+    values = torch.where(last >= 0, seen.gather(dim, last.clamp(min=0)), torch.nan)
+    return values.flip(dim) if back else values
+
+
+def _nearest(depth: Tensor) -> Tensor:
+    """Jump flooding (Rong and Tan 2006), on the holes alone: ``[H, W]`` with NaN to ``[H, W]`` without."""
+    height, width = depth.shape
+    y, x = torch.nonzero(depth.isnan(), as_tuple=True)
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    seed = torch.where(depth.isnan(), -1, rows * width + columns)
+    step = 1 << max(height, width).bit_length()
+    steps = [step]
+    while steps[-1] > 1:
+        steps.append(steps[-1] // 2)
+    for step in [*steps, 2, 1]:
+        best = seed[y, x]
+        best_distance = _squared_distance(best, y, x, width)
+        for dy in (-step, 0, step):
+            for dx in (-step, 0, step):
+                inside = (y + dy >= 0) & (y + dy < height) & (x + dx >= 0) & (x + dx < width)
+                other = seed[(y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)]
+                other = torch.where(inside, other, -1)
+                distance = _squared_distance(other, y, x, width)
+                best = torch.where(distance < best_distance, other, best)
+                best_distance = torch.minimum(best_distance, distance)
+        seed[y, x] = best
+    return depth.flatten()[seed]
+
+
+def _squared_distance(seed: Tensor, y: Tensor, x: Tensor, width: int) -> Tensor:
+    far = torch.iinfo(torch.int64).max
+    return torch.where(seed < 0, far, (seed // width - y) ** 2 + (seed % width - x) ** 2)

@@ -1,0 +1,107 @@
+"""Depth values of any stated kind to metres along the optical axis."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ..validation import number, real_tensor, show
+
+__all__ = ["DepthKind", "depth_from_values", "number_map"]
+
+DepthKind = Literal["z", "distance", "disparity", "inverse", "coc"]
+KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity", "inverse", "coc")
+
+
+def depth_from_values(
+    values: Tensor,
+    kind: DepthKind = "z",
+    *,
+    scale: float | None = None,
+    offset: float = 0.0,
+    unknown: float | None = None,
+    fov_x_deg: float | None = None,
+) -> Tensor:
+    """Numbers of a depth map to metres along the optical axis; pixels without depth become NaN.
+
+    =========== ============================================== ==========================================
+    kind        result                                         for
+    =========== ============================================== ==========================================
+    z           ``scale * (value + offset)``                   renderers; millimetre maps (scale 0.001)
+    distance    the same, as length of the ray, turned into z  path tracers, lidar
+    disparity   ``scale / (value + offset)``                   stereo: scale = baseline [m] * focal [px]
+    inverse     ``scale / (value + offset)``                   inverse depth, learned depth
+    coc         ``scale * (value + offset)``, signed px        ready circles of confusion
+    =========== ============================================== ==========================================
+
+    Args:
+        values: ``[B, 1, H, W]``.
+        kind: What the numbers are.
+        scale: Factor, 1 if None; disparity needs one.
+        offset: Added to the value first.
+        unknown: A value that means "not measured", for example 0, -1 or inf. NaN always does, and so does
+            whatever leads to a depth that is zero, negative or NaN (a disparity of inf among them); for coc, NaN
+            and inf.
+        fov_x_deg: Horizontal field of view in degrees, needed for "distance".
+
+    Returns:
+        ``[B, 1, H, W]`` float32 in metres (pixels for coc), ``> 0`` or ``inf``, NaN where unknown.
+
+    Raises:
+        ValueError: If the kind is unknown or lacks the scale or field of view that it needs.
+
+    Example:
+        >>> depth_from_values(torch.tensor([[[[1500.0, 0.0]]]]), "z", scale=0.001)
+        tensor([[[[1.5000,    nan]]]])
+    """
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise ValueError(f"the kind of depth must be one of {', '.join(KINDS)}, got {show(kind)}")
+    number_map("depth values", values)
+    if values.ndim != 4 or values.shape[1] != 1:
+        raise ValueError(f"depth values must be [B, 1, H, W], got {list(values.shape)}")
+    if kind == "disparity" and scale is None:
+        raise ValueError(
+            "disparity needs a scale (--depth-scale): the baseline in metres times the focal length in pixels"
+        )
+    scale = 1.0 if scale is None else scale
+    for factor in (scale, offset):
+        if isinstance(factor, bool) or not isinstance(factor, int | float) or not abs(factor) < 1e300 or scale == 0.0:
+            told = f"got scale {show(scale)} and offset {show(offset)}"
+            raise ValueError(f"scale must be finite and not 0, offset finite, {told}")
+    if unknown is not None and not math.isnan(unknown if isinstance(unknown, float) else 0.0):
+        unknown = number("unknown", unknown, infinite=True)
+    value = values.double()
+    missing = value.isnan() if unknown is None else value.isnan() | (value == unknown)
+    depth = scale / (value + offset) if kind in ("disparity", "inverse") else scale * (value + offset)
+    if kind == "distance":
+        if fov_x_deg is None:
+            raise ValueError("distance along the ray needs the horizontal field of view (--fov-deg) to become depth")
+        depth = depth / _ray_length(depth, fov_x_deg)
+    missing = missing | (~depth.isfinite() if kind == "coc" else ~(depth > 0))
+    return torch.where(missing, torch.nan, depth).float()
+
+
+def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:
+    """Length of the ray to depth 1 through each pixel's centre, ``[1, 1, H, W]``."""
+    if isinstance(fov_x_deg, bool) or not isinstance(fov_x_deg, int | float) or not 0.0 < fov_x_deg < 180.0:
+        raise ValueError(f"the field of view must be in (0, 180) degrees, got {show(fov_x_deg)}")
+    height, width = like.shape[-2:]
+    focal_px = width / 2 / max(math.tan(math.radians(fov_x_deg) / 2), 1e-300)
+    x = (torch.arange(width, dtype=like.dtype) + 0.5 - width / 2) / focal_px
+    y = (torch.arange(height, dtype=like.dtype) + 0.5 - height / 2) / focal_px
+    return torch.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)[None, None]
+
+
+def number_map(name: str, values: Tensor) -> None:
+    """Refuse what is no map of numbers; whole numbers, which files hold, are as good as others.
+
+    Raises:
+        ValueError: If it is not a tensor of real numbers, or empty.
+    """
+    # integers are what files hold; of the rest only what arithmetic works on
+    if isinstance(values, Tensor) and values.dtype in (torch.uint8, torch.int16, torch.int32, torch.int64):
+        values = values.double()
+    real_tensor(name, values, "[B, 1, H, W]")
+    if not values.numel():
+        raise ValueError(f"{name} must have at least one pixel, got {list(values.shape)}")

@@ -1,0 +1,1 @@
+"""Files in and out: images, their transfer curves and metadata, numbered frames."""

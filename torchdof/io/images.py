@@ -1,0 +1,255 @@
+"""Images in and out of files, in linear light: EXR, PNG, TIFF, JPEG, HDR and PFM, through OpenImageIO.
+
+The transfer curve is stated, never guessed from a tag: files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are taken as
+sRGB and files of floats (EXR, HDR, PFM, TIFF of floats) as linear light, unless the caller says otherwise.
+
+OpenImageIO is imported when a file is read or written, so that ``import torchdof`` stays light.
+"""
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .atomic import whole_file
+from .channels import colour_channels, depth_channel
+from .decode import PixelType, existing, first_line, read_array, read_parts
+from .transfer import Transfer, decode, default_transfer, encode
+
+__all__ = ["Picture", "read_image", "read_values", "write_image"]
+
+_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".hdr", ".pfm")
+_SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hold, its default first
+    ".exr": ("half", "float"),
+    ".png": ("8", "16"),
+    ".tif": ("8", "16", "float"),
+    ".tiff": ("8", "16", "float"),
+    ".jpg": ("8",),
+    ".jpeg": ("8",),
+    ".hdr": ("float",),
+    ".pfm": ("float",),
+}
+_OIIO_SAMPLE = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
+_HOLDS_ALPHA = (".exr", ".png", ".tif", ".tiff")
+_HOLDS_GREY = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
+_LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """An image as the module takes it, with what is needed to write it back.
+
+    Args:
+        pixels: ``[1, C, H, W]`` float32 in linear light. Colour is premultiplied by alpha, where there is one.
+        channels: Names of the channels: ``("R", "G", "B")``, ``("Y",)``, either with ``"A"`` at the end.
+        depth: ``[1, 1, H, W]``, the numbers of the file's own depth channel, or None.
+        metadata: Name -> (OpenImageIO type, value).
+        sample: What a pixel was stored as: "8", "16", "half" or "float".
+        transfer: How the file was encoded, "linear" or "srgb".
+        window: Where the pixels lie in the full frame (EXR data window): x, y, full x, full y, full width, full height.
+    """
+
+    pixels: Tensor
+    channels: tuple[str, ...] = ("R", "G", "B")
+    depth: Tensor | None = None
+    metadata: Mapping[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
+    sample: PixelType = "float"
+    transfer: Transfer = "linear"
+    window: tuple[int, int, int, int, int, int] | None = None
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the last channel is alpha."""
+        return self.channels[-1] == "A"
+
+
+def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, layer: str | None = None) -> Picture:
+    """Reads an image into linear light.
+
+    Args:
+        path: An EXR, PNG, TIFF, JPEG, HDR or PFM file.
+        transfer: "linear" or "srgb"; None takes "srgb" for integers and "linear" for floats, whatever the file's tags
+            say.
+        layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
+
+    Returns:
+        The picture, with its depth channel where the file has one (any part of an EXR file; names like ``Z``, ``depth``
+        or ``ViewLayer.Depth.Z``). Pixels are as stored: the orientation tag of a camera is kept, not applied.
+
+    Raises:
+        OSError: If the file is missing, empty, truncated or not an image.
+        ValueError: If the type is not supported, a channel is missing or colours are not finite.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_image(folder + "/grey.png", Picture(torch.full((1, 3, 2, 4), 0.2159)))
+        ...     round(float(read_image(folder + "/grey.png").pixels.mean()), 3)  # 8 bits, sRGB
+        0.216
+    """
+    path = existing(path, _SUFFIXES, "an image")
+    if transfer not in (None, "linear", "srgb"):
+        raise ValueError(f"transfer must be 'linear' or 'srgb', got {transfer!r}")
+    parts = read_parts(path)
+    try:
+        part, indices, names = colour_channels(
+            [(p.label, p.names) for p in parts], layer, path.suffix.lower() == ".exr"
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    stored = parts[part]
+    array = stored.values[..., indices].astype(np.float32)
+    if not np.isfinite(array).all():
+        bad = int((~np.isfinite(array)).any(axis=-1).sum())
+        raise ValueError(f"{path}: {bad} pixels are not finite (NaN or inf); repair them before blurring spreads them")
+    sample: PixelType = "half" if all(stored.samples[k] == "half" for k in indices) else stored.samples[indices[0]]
+    transfer = transfer or default_transfer(sample)
+    pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]  # [H, W, C] -> [1, C, H, W]
+    pixels = decode(pixels / stored.one, transfer, names[-1] == "A", stored.straight_alpha)
+    depth = None
+    same_size = [p for p in parts if p.values.shape[:2] == stored.values.shape[:2]]
+    where = depth_channel([(p.label, p.names) for p in same_size])
+    if where is not None:
+        depth = torch.from_numpy(same_size[where[0]].values[..., where[1]].astype(np.float32))[None, None]
+    return Picture(pixels, names, depth, stored.metadata, sample, transfer, stored.window)
+
+
+def write_image(
+    path: str | os.PathLike[str], picture: Picture, transfer: Transfer | None = None, sample: PixelType | None = None
+) -> None:
+    """Writes a picture whole or not at all: to a new file in the same folder, renamed once it is complete.
+
+    Args:
+        path: Where to; the type follows from the suffix (.exr .png .tif .tiff .jpg .jpeg .hdr .pfm).
+        picture: Pixels in linear light; its metadata goes into the file, as far as the type can hold it.
+        transfer: "linear" or "srgb"; None takes the picture's own where both it and the new file are integers, or both
+            floats, and otherwise "srgb" for integers and "linear" for floats.
+        sample: "8", "16", "half" or "float"; None takes the picture's own where the type can hold it, and otherwise the
+            type's default (8 bits, or half for EXR).
+
+    Raises:
+        ValueError: If the type cannot hold what is asked (alpha in a JPEG, 16 bits in an HDR, ...).
+        OSError: If the file cannot be written; what was there before is then untouched.
+    """
+    import OpenImageIO as oiio
+
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in _SAMPLES:
+        raise ValueError(f"{path}: cannot write files of type {suffix or 'none'!r}; use one of {' '.join(_SUFFIXES)}")
+    holds = _SAMPLES[suffix]
+    if sample is None:
+        floats = picture.sample in ("half", "float")
+        sample = picture.sample if picture.sample in holds else "float" if floats and suffix[:4] == ".tif" else holds[0]
+    if sample not in holds:
+        raise ValueError(f"{path}: a {suffix} file holds samples of {' or '.join(holds)}, not {sample}")
+    if transfer is None:
+        same_nature = (sample in ("half", "float")) == (picture.sample in ("half", "float"))
+        transfer = picture.transfer if same_nature else default_transfer(sample)
+    pixels, names = picture.pixels.detach().cpu().float(), picture.channels
+    if pixels.ndim != 4 or pixels.shape[0] != 1 or pixels.shape[1] != len(names):
+        raise ValueError(f"{path}: pixels must be [1, {len(names)}, H, W] for {names}, got {list(pixels.shape)}")
+    if picture.has_alpha and suffix not in _HOLDS_ALPHA:
+        if bool((pixels[:, -1] < 1.0).any()):
+            raise ValueError(f"{path}: a {suffix} file cannot hold the alpha channel; write .exr, .png or .tif instead")
+        pixels, names = pixels[:, :-1], names[:-1]
+    if names[0] == "Y" and suffix not in _HOLDS_GREY:
+        pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
+    straight = names[-1] == "A" and suffix != ".exr"
+    pixels = encode(pixels, transfer, names[-1] == "A", straight)
+    if sample == "half":
+        pixels = pixels.clamp(-65504.0, 65504.0)
+    array = np.ascontiguousarray(pixels[0].permute(1, 2, 0).numpy())  # [C, H, W] -> [H, W, C]
+
+    spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
+    spec.channelnames = names
+    spec.alpha_channel = len(names) - 1 if names[-1] == "A" else -1
+    if picture.window is not None:
+        spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = picture.window
+    for name, (kind, value) in picture.metadata.items():
+        if name == "compression":
+            if suffix == ".exr" and value in _LOSSLESS_EXR:
+                spec.attribute(name, value)
+        elif name != "ICCProfile" or transfer == picture.transfer:
+            spec.attribute(name, kind, value)
+    spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
+    if transfer == "linear" and suffix != ".exr":
+        spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
+    if straight:
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+    if suffix in (".jpg", ".jpeg"):
+        spec.attribute("compression", "jpeg:95")
+        spec.attribute("jpeg:subsampling", "4:4:4")
+
+    with whole_file(path) as part:
+        if suffix in (".jpg", ".jpeg"):
+            _reserve(part, array.size + 2**20)
+        output = oiio.ImageOutput.create(str(part))
+        if output is None or not output.open(str(part), spec):
+            problem = (oiio if output is None else output).geterror()
+            raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
+        done = output.write_image(array)
+        done = output.close() and done
+        problem = output.geterror()  # a full disk shows only here
+        if not done or problem or not _is_whole(part):
+            raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
+
+
+def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
+    """Reads the plain numbers of a one-channel map, such as a depth map: no transfer curve, integers as integers.
+
+    Args:
+        path: An image of one channel (or of equal ones), an EXR file with a depth channel, or ``.npy`` / ``.npz``.
+        channel: Channel of an image, or array of an ``.npz`` file, by name; None takes the only one or the depth
+            channel.
+
+    Returns:
+        ``[1, 1, H, W]`` float32; a 16-bit file gives 0 to 65535, an 8-bit file 0 to 255. The scale in the header of
+        a PFM file is not applied.
+
+    Raises:
+        OSError: If the file is missing, empty, truncated or unreadable.
+        ValueError: If the channel is not clear, or the array is not two-dimensional numbers.
+    """
+    path = existing(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
+    if path.suffix.lower() in (".npy", ".npz"):
+        return torch.from_numpy(read_array(path, channel).astype(np.float32))[None, None]
+    parts = read_parts(path)
+    every = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
+    listing = ", ".join(name for _, name, _ in every)
+    if channel is not None:
+        chosen = [plane for label, name, plane in every if channel in (name, f"{label}.{name}")]
+        if not chosen:
+            raise ValueError(f"{path}: no channel {channel!r}; it has {listing}")
+        return torch.from_numpy(chosen[0].astype(np.float32))[None, None]
+    where = depth_channel([(p.label, p.names) for p in parts])
+    if where is not None:
+        plane = parts[where[0]].values[..., where[1]]
+    elif all(np.array_equal(values, every[0][2]) for _, name, values in every if name != "A"):
+        plane = every[0][2]
+    else:
+        raise ValueError(f"{path}: which of the channels {listing} is depth? name it (--depth-channel)")
+    return torch.from_numpy(plane.astype(np.float32))[None, None]
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file that was written can be read: what fails in the last flush of its buffer is reported by nobody."""
+    try:
+        read_parts(path)
+    except (OSError, ValueError):
+        return False
+    with path.open("rb") as file:  # a PNG is read without its last bytes as well
+        file.seek(-8, os.SEEK_END)
+        return path.suffix.lower() != ".png" or file.read() == b"IEND\xaeB`\x82"
+
+
+def _reserve(path: Path, size: int) -> None:
+    """Asks for the room beforehand, because libjpeg ends the process when the disk is full."""
+    if hasattr(os, "posix_fallocate"):
+        with path.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size)

@@ -1,0 +1,135 @@
+"""Numbered frames: file names such as ``shot.####.exr``, and focus that moves between keyframes."""
+
+import math
+import re
+from pathlib import Path
+
+from ..validation import number
+
+__all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
+
+_PLACEHOLDER = re.compile(r"#+|%0?(\d*)d")
+
+
+class FramePattern:
+    """A file name with a place for the frame's number: ``####`` or ``%04d``, zero-padded to that many digits.
+
+    Args:
+        path: The name; the number stands in its last component.
+
+    Raises:
+        ValueError: If there is no place for a number, or more than one.
+
+    Example:
+        >>> FramePattern("out/shot.####.exr").name(7)
+        PosixPath('out/shot.0007.exr')
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        places = list(_PLACEHOLDER.finditer(self.path.name))
+        if len(places) != 1 or _PLACEHOLDER.search(str(self.path.parent)):
+            raise ValueError(
+                f"{path}: expected one place for the frame number in the file's name, such as shot.####.exr"
+            )
+        place = places[0]
+        self._before, self._after = self.path.name[: place.start()], self.path.name[place.end() :]
+        text = place.group()
+        self._digits = len(text) if text.startswith("#") else int(place.group(1) or 1)
+
+    @staticmethod
+    def matches(path: str | Path) -> bool:
+        """Whether a path has a place for a frame number."""
+        return _PLACEHOLDER.search(str(path)) is not None
+
+    def name(self, frame: int) -> Path:
+        """The path of one frame."""
+        return self.path.with_name(f"{self._before}{frame:0{self._digits}d}{self._after}")
+
+    def frames(self) -> list[int]:
+        """The numbers of the frames that are there, in order."""
+        if not self.path.parent.is_dir():
+            return []
+        wanted = re.compile(re.escape(self._before) + r"(\d+)" + re.escape(self._after))
+        numbers = [int(m.group(1)) for p in self.path.parent.iterdir() if (m := wanted.fullmatch(p.name))]
+        return sorted({n for n in numbers if self.name(n).is_file()})
+
+
+def parse_frames(text: str) -> tuple[int, int]:
+    """Reads ``first-last`` or a single number.
+
+    Raises:
+        ValueError: If the text is not that, or last comes before first.
+
+    Example:
+        >>> parse_frames("10-24")
+        (10, 24)
+    """
+    match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", text)
+    if match is None:
+        raise ValueError(f"--frames expects first-last, such as 1-48, got {text!r}")
+    first, last = int(match.group(1)), int(match.group(2) or match.group(1))
+    if last < first:
+        raise ValueError(f"--frames must not end before it starts, got {text!r}")
+    return first, last
+
+
+def parse_focus(text: str) -> list[tuple[int, float]]:
+    """Reads a focus distance in metres, ``2.0``, or keyframes ``frame:metres``, ``1:2.0,48:5.5``.
+
+    Returns:
+        Keyframes in order; a plain distance is one keyframe.
+
+    Raises:
+        ValueError: If a part cannot be read, is not positive, or a frame is named twice.
+
+    Example:
+        >>> parse_focus("1:2.0,48:inf")
+        [(1, 2.0), (48, inf)]
+    """
+    keys: dict[int, float] = {}
+    try:
+        for part in text.split(","):
+            frame, colon, metres = part.partition(":")
+            key, distance = (int(frame), float(metres)) if colon else (0, float(part))
+            if not distance > 0 or key in keys or (not colon and "," in text):
+                raise ValueError
+            keys[key] = distance
+    except ValueError:
+        raise ValueError(
+            f"--focus-m expects metres (2.0) or keyframes frame:metres (1:2.0,48:5.5), all positive, got {text!r}"
+        ) from None
+    return sorted(keys.items())
+
+
+def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
+    """Focus distance at a frame: linear in 1/distance between keyframes, held before the first and after the last.
+
+    Blur is proportional to the difference of inverse distances, so a rack of focus that is even in 1/m changes the blur
+    evenly, and can end at infinity.
+
+    Args:
+        keys: Keyframes (frame, metres) in order, at least one.
+        frame: Number of the frame.
+
+    Returns:
+        Metres.
+
+    Raises:
+        ValueError: If there is no keyframe or the frame is not a number.
+
+    Example:
+        >>> focus_at_frame([(0, 1.0), (10, 2.0)], 5)
+        1.3333333333333333
+    """
+    if not keys:
+        raise ValueError("focus needs at least one keyframe (frame, metres), got none")
+    number("frame", frame)
+    if frame <= keys[0][0]:
+        return keys[0][1]
+    for (before, near), (after, far) in zip(keys, keys[1:], strict=False):
+        if frame <= after:
+            share = (frame - before) / (after - before)
+            dioptres = (1.0 - share) / near + share / far
+            return far if frame == after else 1.0 / dioptres if dioptres > 0 else math.inf
+    return keys[-1][1]

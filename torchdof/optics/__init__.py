@@ -1,0 +1,1 @@
+"""From depth in metres to a signed circle of confusion in pixels, and from that to a point spread function."""

@@ -1,0 +1,370 @@
+"""Blur tables: signed circle of confusion to kernel parameters, as measured from a camera or a lens."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..validation import number, pixels_wide, real_tensor, show
+from . import psf, table_file
+
+__all__ = ["BlurTable"]
+
+UNITS = ("fraction", "mm", "relative")
+
+
+class BlurTable:
+    """Kernel parameters at nodes of signed circle of confusion, and the rule between them.
+
+    Between nodes the parameters are linear in the signed coc, on each side of focus by itself; lengths shrink to 0 at a
+    coc of 0 unless a node sits there. Beyond the last node of a side the lengths grow with ``|coc|`` and the pure
+    numbers stay. A side without nodes mirrors the other. A table of one node is thus a lens whose blur keeps its shape
+    and scales with the circle of confusion, as the thin lens has it.
+
+    Args:
+        family: A key of :data:`torchdof.optics.psf.FAMILIES`.
+        coc: Signed coc of the nodes ``[N]``, strictly increasing, not only 0; in ``unit``.
+        params: Parameters of the family by name: ``[N]``, or ``[channels, N]`` for a lens that blurs its colours
+            differently (``values`` of ``radial``: one more axis ``P``). Lengths are in ``unit``.
+        unit: ``"fraction"`` of the image's width, ``"mm"`` on a sensor of ``sensor_width_mm``, or ``"relative"`` for a
+            table of which only the ratio of lengths to coc counts (one node a side).
+        sensor_width_mm: Width of the sensor the millimetres were measured on; with ``unit="mm"`` only.
+        strength: The fitted strength N at the nodes ``[N]``, kept as measured. It does not enter rendering: kernels
+            conserve energy.
+        name: Short name.
+        provenance: Where the numbers are from (camera, source, date, command): a JSON-like dict.
+        residual: Relative residual of the fit at each node ``[N]``.
+
+    Raises:
+        ValueError: If a field is not as described; the message names it.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 2 (the table from f(r), one blur texture a depth).
+
+    Example:
+        >>> table = BlurTable("gaussian", coc=[0.01], params={"sigma": [0.005]}, unit="fraction")
+        >>> float(table.params(torch.tensor(-8.0), width=1000)["sigma"])
+        4.0
+    """
+
+    def __init__(
+        self,
+        family: str,
+        coc: Sequence[float] | Tensor,
+        params: Mapping[str, Any],
+        *,
+        unit: str = "relative",
+        sensor_width_mm: float | None = None,
+        strength: Sequence[float] | Tensor | None = None,
+        name: str = "",
+        provenance: Mapping[str, Any] | None = None,
+        residual: Sequence[float] | Tensor | None = None,
+    ) -> None:
+        if not isinstance(family, str) or family not in psf.FAMILIES:
+            raise ValueError(f"family must be one of {', '.join(psf.FAMILIES)}, got {show(family)}")
+        if not isinstance(unit, str) or unit not in UNITS:
+            raise ValueError(f"unit must be one of {', '.join(UNITS)}, got {show(unit)}")
+        if not isinstance(name, str):
+            raise ValueError(f"name must be a text, got {show(name)}")
+        if provenance is not None and not isinstance(provenance, Mapping):
+            raise ValueError(f"provenance must be a dict, got {show(provenance)}")
+        self.family, self.unit, self.name = family, unit, str(name)
+        self.coc = _numbers("coc", coc)
+        if self.coc.ndim != 1 or not len(self.coc) or bool((self.coc.diff() <= 0).any()) or not self.coc.any():
+            raise ValueError(
+                f"coc must be strictly increasing signed numbers, one a node and not only 0, got {_short(self.coc)}"
+            )
+        if unit == "relative" and max(int((self.coc > 0).sum()), int((self.coc < 0).sum())) > 1:
+            raise ValueError(
+                f"unit 'relative' takes one node on each side of focus at most, got {len(self.coc)}; "
+                "state the unit as 'fraction' (of the image's width) or 'mm'"
+            )
+        if (unit == "mm") != (sensor_width_mm is not None):
+            raise ValueError(
+                f"sensor_width_mm goes with unit 'mm' and only with it, got {show(sensor_width_mm)} with {unit!r}"
+            )
+        if sensor_width_mm is not None and not isinstance(sensor_width_mm, bool | int | float):
+            raise ValueError(f"sensor_width_mm must be a number, got {show(sensor_width_mm)}")
+        if sensor_width_mm is not None and not 0 < sensor_width_mm < 1e300:
+            raise ValueError(f"sensor_width_mm must be positive, got {show(sensor_width_mm)}")
+        self.sensor_width_mm = None if sensor_width_mm is None else float(sensor_width_mm)
+        self._params = self._check_params(params)
+        self.strength = self._per_node("strength", strength)
+        self.residual = self._per_node("residual", residual)
+        self.provenance = dict(provenance or {})
+        self._sides = {sign: self._side(sign) for sign in (-1, 1)}
+        for sign in (-1, 1):
+            self._sides[sign] = self._sides[sign] or self._sides[-sign]
+
+    @classmethod
+    def disc(cls) -> "BlurTable":
+        """A perfect lens with a round aperture: a uniform disc whose radius is the circle of confusion.
+
+        Example:
+            >>> BlurTable.disc()
+            BlurTable('disc', disc, 1 node)
+        """
+        return cls("disc", [1.0], {"radius": [1.0]}, name="disc")
+
+    @classmethod
+    def gaussian(cls, sigma_per_coc: float = 0.5) -> "BlurTable":
+        """Gaussian blur with ``sigma = sigma_per_coc * |coc|``; 0.5 has the second moment of the disc.
+
+        Example:
+            >>> BlurTable.gaussian()
+            BlurTable('gaussian', gaussian, 1 node)
+        """
+        return cls("gaussian", [1.0], {"sigma": [sigma_per_coc]}, name="gaussian")
+
+    @property
+    def channels(self) -> int:
+        """Kernels at a node: 1, or the number of image channels that are blurred differently."""
+        return next(iter(self._params.values())).shape[0]
+
+    @property
+    def node_params(self) -> dict[str, Tensor]:
+        """Parameters at the nodes, ``[channels, N]`` (``values``: ``[channels, N, P]``), in the table's unit."""
+        return dict(self._params)
+
+    def params(self, coc_px: Tensor, width: float) -> dict[str, Tensor]:
+        """Kernel parameters at a signed coc.
+
+        Args:
+            coc_px: Signed coc in pixels, any shape ``[...]``.
+            width: Width in pixels of the image the coc is meant for.
+
+        Returns:
+            Parameters by name, lengths in pixels: ``[channels, ...]`` (``values``: ``[channels, ..., P]``), float64.
+            Continuous in ``coc_px`` and differentiable wherever it lies between nodes.
+        """
+        pixels_wide(width)
+        scale = self._px_per_unit(width)
+        signed = real_tensor("coc_px", coc_px, "[...] in pixels").to(torch.float64) / scale
+        near, far = (self._side_params(sign, signed.abs()) for sign in (-1, 1))
+        mixed = {}
+        for name in self._params:
+            behind = signed >= 0
+            behind = behind.unsqueeze(-1) if name == "values" else behind
+            mixed[name] = torch.where(behind, far[name], near[name])
+            if name in psf.LENGTHS:
+                mixed[name] = mixed[name] * scale
+        return mixed
+
+    def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
+        """Pixel-integrated kernels at a signed coc.
+
+        A blur below the resolution of a pixel passes light through unchanged: for ``|coc_px| <= 0.5`` the kernel is a
+        single pixel. A kernel that is wider than that there fades in until ``|coc_px| = 1``.
+
+        Args:
+            coc_px: Signed coc in pixels ``[n]``.
+            width: Width in pixels of the image.
+            size: Odd width of the kernels; None takes the smallest that holds them all.
+            window: Odd width of the middle part that is wanted, which then holds its share of the light; None is all.
+
+        Returns:
+            ``[n, channels, size, size]``, float64, non-negative, each summing to 1. Differentiable in ``coc_px``.
+
+        Example:
+            >>> BlurTable.disc().kernels(torch.tensor([-2.0, 0.0, 2.0]), width=100).shape
+            torch.Size([3, 1, 5, 5])
+        """
+        params = self.params(coc_px, width)
+        if coc_px.ndim != 1 or not coc_px.numel():
+            raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
+        kernels = psf.pixel_kernels(self.family, params, size, window).transpose(0, 1)
+        if self.family == "disc" and self.reach_px(0.5, width) <= 0.5 + 1e-9:
+            return kernels
+        share = (2 * coc_px.to(torch.float64).abs() - 1).clamp(0.0, 1.0)[:, None, None, None]
+        centre = torch.zeros_like(kernels)
+        centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
+        return torch.lerp(centre, kernels, share)
+
+    def reach_px(self, coc_px: float, width: float) -> float:
+        """Radius in pixels that holds the kernels at ``+-coc_px``."""
+        number("coc_px", coc_px, unit="pixels")
+        both = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
+        return psf.support(self.family, self.params(both, width))
+
+    def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
+        """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
+
+        Args:
+            coc_px: Signed coc in pixels.
+            width: Width in pixels of the image.
+            size: Odd width of the texture; None takes the smallest that holds the kernel.
+
+        Returns:
+            ``[channels, size, size]``, float64; not normalised.
+
+        Reference:
+            Sato, Dobashi, Yamamoto, Fig. 3.
+
+        Example:
+            >>> texture = BlurTable.load("sato_j15").blur_texture(10.0, width=512)
+            >>> round(float(texture.max()), 3)
+            0.581
+        """
+        signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64)
+        params = self.params(signed, width)
+        size = psf.width_of(self.family, params, size)
+        axis = torch.arange(size, dtype=torch.float64) - size // 2
+        r = torch.hypot(axis[:, None], axis[None, :])
+        texture = psf.profile(self.family, r.flatten(), params).unflatten(-1, (size, size))
+        if self.strength is None:
+            return texture
+        nearest = (self.coc - signed / self._px_per_unit(width)).abs().argmin()
+        return texture * self.strength[nearest]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the table as JSON, whole or not at all.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        table_file.write(self.to_dict(), path)
+
+    @classmethod
+    def load(cls, source: str | os.PathLike[str]) -> "BlurTable":
+        """Read a table from a JSON file, or a shipped one by its name.
+
+        Args:
+            source: Path of a file, or the name of a shipped table such as ``"sato_j15"``.
+
+        Raises:
+            ValueError: If the content is not a valid table; the message names the file and the field.
+            FileNotFoundError: If there is neither such a file nor such a shipped table.
+
+        Example:
+            >>> BlurTable.load("sato_j15").family
+            'ring'
+        """
+        path = table_file.find(source)
+        try:
+            return cls.from_dict(table_file.read(path))
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    def to_dict(self) -> dict[str, Any]:
+        """The table as JSON-like data, the inverse of :meth:`from_dict`."""
+        shared = self.channels == 1
+        fields = {
+            "name": self.name,
+            "family": self.family,
+            "unit": self.unit,
+            "sensor_width_mm": self.sensor_width_mm,
+            "coc": self.coc.tolist(),
+            "params": {k: (v[0] if shared else v).tolist() for k, v in self._params.items()},
+            "strength": None if self.strength is None else self.strength.tolist(),
+            "residual": None if self.residual is None else self.residual.tolist(),
+            "provenance": self.provenance,
+        }
+        return table_file.stamped({k: v for k, v in fields.items() if v is not None})
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "BlurTable":
+        """Build a table from :meth:`to_dict`'s data.
+
+        Raises:
+            ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
+        """
+        return cls(**table_file.fields_of(data))
+
+    def __repr__(self) -> str:
+        nodes = f"{len(self.coc)} node{'s' if len(self.coc) > 1 else ''}"
+        colours = f", {self.channels} channels" if self.channels > 1 else ""
+        return f"BlurTable({self.name or 'unnamed'!r}, {self.family}, {nodes}{colours})"
+
+    def _px_per_unit(self, width: float) -> float:
+        if self.unit == "relative":
+            return 1.0
+        return float(width) if self.sensor_width_mm is None else width / self.sensor_width_mm
+
+    def _check_params(self, params: Mapping[str, Any]) -> dict[str, Tensor]:
+        names = psf.FAMILIES[self.family]
+        if not isinstance(params, Mapping) or set(params) != set(names):
+            got = ", ".join(map(str, params)) if isinstance(params, Mapping) else type(params).__name__
+            raise ValueError(f"params of {self.family} must be {', '.join(names)}, got {got}")
+        checked = {}
+        for name in names:
+            value = _numbers(f"params.{name}", params[name])
+            value = value.unsqueeze(0) if value.ndim == (2 if name == "values" else 1) else value
+            if value.ndim != (3 if name == "values" else 2) or value.shape[1] != len(self.coc) or not value.numel():
+                shape = "[N, P] or [channels, N, P]" if name == "values" else "[N] or [channels, N]"
+                raise ValueError(
+                    f"params.{name} must be {shape} with N = {len(self.coc)} nodes, got {list(value.shape)}"
+                )
+            low = -1.0 if name == "b" else 0.0
+            if bool((value < low).any()):
+                raise ValueError(f"params.{name} must be >= {low:g}, got {float(value.min()):g}")
+            if name == "values" and (value.shape[-1] < 2 or bool((value.sum(-1) == 0).any())):
+                raise ValueError("params.values must hold at least two values a node, not all of them 0")
+            checked[name] = value
+        channels = max(v.shape[0] for v in checked.values())
+        for name, value in checked.items():
+            if value.shape[0] not in (1, channels):
+                raise ValueError(f"params.{name} has {value.shape[0]} channels where other parameters have {channels}")
+            checked[name] = value.expand(channels, *value.shape[1:]).contiguous()
+        return checked
+
+    def _per_node(self, name: str, value: Sequence[float] | Tensor | None) -> Tensor | None:
+        if value is None:
+            return None
+        numbers = _numbers(name, value)
+        if numbers.shape != self.coc.shape:
+            raise ValueError(f"{name} must hold one number a node ({len(self.coc)}), got shape {list(numbers.shape)}")
+        return numbers
+
+    def _side(self, sign: int) -> tuple[Tensor, dict[str, Tensor]] | None:
+        """Nodes of one side of focus by growing ``|coc|``, starting at 0."""
+        chosen = self.coc * sign >= 0
+        if not bool((self.coc * sign > 0).any()):
+            return None
+        order = torch.argsort(self.coc[chosen].abs())
+        where = self.coc[chosen].abs()[order]
+        nodes = {k: v[:, chosen][:, order] for k, v in self._params.items()}
+        if where[0] > 0:
+            where = torch.cat([where.new_zeros(1), where])
+            for name, value in nodes.items():
+                first = torch.zeros_like(value[:, :1]) if name in psf.LENGTHS else value[:, :1]
+                nodes[name] = torch.cat([first, value], 1)
+        return where, nodes
+
+    def _side_params(self, sign: int, distance: Tensor) -> dict[str, Tensor]:
+        side = self._sides[sign]
+        if side is None:
+            raise AssertionError("a table has nodes on at least one side")
+        where, nodes = side[0].to(distance.device), {k: v.to(distance.device) for k, v in side[1].items()}
+        upper = torch.searchsorted(where, distance.detach().contiguous()).clamp(1, len(where) - 1)
+        lower = upper - 1
+        part = ((distance - where[lower]) / (where[upper] - where[lower])).clamp(max=1.0)
+        beyond = (distance / where[-1]).clamp_min(1.0)
+        mixed = {}
+        for name, value in nodes.items():
+            share = part.unsqueeze(-1) if name == "values" else part
+            mixed[name] = torch.lerp(value[:, lower], value[:, upper], share)
+            if name in psf.LENGTHS:
+                mixed[name] = mixed[name] * beyond
+        return mixed
+
+
+def _numbers(name: str, value: Any) -> Tensor:
+    try:
+        numbers = torch.as_tensor(value)
+        if numbers.dtype == torch.bool or numbers.is_complex() or numbers.layout != torch.strided:
+            raise TypeError
+        if not isinstance(value, Tensor):
+            numbers = torch.as_tensor(value, dtype=torch.float64)  # a list would have come as float32
+        numbers = numbers.detach().to("cpu", torch.float64)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise ValueError(f"{name} must be numbers, got {str(value)[:60]}") from None
+    if not bool(torch.isfinite(numbers).all()):
+        raise ValueError(f"{name} must be finite numbers, got {_short(numbers)}")
+    return numbers
+
+
+def _short(numbers: Tensor) -> str:
+    shown = ", ".join(f"{x:g}" for x in numbers.flatten()[:6].tolist())
+    return f"[{shown}{', ...' if numbers.numel() > 6 else ''}] of shape {list(numbers.shape)}"

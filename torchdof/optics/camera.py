@@ -1,0 +1,288 @@
+"""Depth in metres to the signed circle of confusion in pixels: the thin lens.
+
+Sign and axis conventions are stated here once; every other module links to this one.
+
+* Depth ``z`` is measured along the optical axis (not along the ray), in metres, ``> 0``; ``+inf`` is allowed.
+* The circle of confusion (coc) is a signed **radius** in pixels of the image at hand: negative in front of the focus
+  plane, 0 on it, positive behind it.
+* ``coc_px = (A / 2) * F * (1/s - 1/z)`` with ``A`` the aperture diameter [m], ``s`` the focus distance [m] and ``F``
+  the image distance over the pixel pitch [px]. For a camera of focal length ``f``, f-number ``n`` and sensor width
+  ``w``: ``A = f / n``, image distance ``s f / (s - f)``, pitch ``w / width``.
+
+Reference: Potmesil and Chakravarty, "A lens and aperture camera model for synthetic image generation", SIGGRAPH 1981.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..validation import is_traced, pixels_wide, real_tensor, show, whole
+
+__all__ = ["Camera"]
+
+Number = float | Tensor
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Camera:
+    """A thin lens in front of a sensor. Every number may be a float or a tensor ``[B]``, one value a batch item.
+
+    Args:
+        focal_length_mm: Focal length in millimetres, > 0.
+        f_number: Focal length over aperture diameter, > 0.
+        focus_m: Distance of the focus plane in metres, longer than the focal length; ``inf`` focuses at infinity.
+        sensor_width_mm: Width of the part of the sensor that the image shows, in millimetres, > 0.
+        focus_breathing: True for a real lens, whose image distance ``s f / (s - f)`` grows (and whose field of view
+            narrows) as it focuses nearer. False for the convention of computer graphics, which keeps the field of view.
+
+    Raises:
+        ValueError: If a number is not positive, or the focus is not beyond the focal length of a breathing lens.
+
+    Example:
+        >>> camera = Camera(focal_length_mm=50.0, f_number=1.8, focus_m=2.0)
+        >>> depth = torch.tensor([1.0, 2.0, float("inf")]).reshape(1, 1, 1, 3)
+        >>> [round(x, 2) for x in camera.coc_px(depth, width=1920).flatten().tolist()]
+        [-18.99, 0.0, 18.99]
+    """
+
+    focal_length_mm: Number = 50.0
+    f_number: Number = 2.8
+    focus_m: Number = 2.0
+    sensor_width_mm: Number = 36.0
+    focus_breathing: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm"):
+            value = getattr(self, name)
+            _check_number(name, value)
+        if not isinstance(self.focus_breathing, bool):
+            raise ValueError(f"focus_breathing must be True or False, got {show(self.focus_breathing)}")
+        if self.focus_breathing and not is_traced():
+            focal_m = _largest(self.focal_length_mm / 1000.0 / self.focus_m)
+            if focal_m >= 1.0:
+                raise ValueError(
+                    f"focus_m must be longer than the focal length ({_show(self.focal_length_mm)} mm), got "
+                    f"{_show(self.focus_m)} m; nothing nearer than the focal length can be in focus"
+                )
+
+    @classmethod
+    def from_fov(cls, fov_x_deg: Number, aperture_radius_m: Number, focus_m: Number) -> "Camera":
+        """Camera of a rendered image: ``F = (width / 2) / tan(fov_x / 2)`` whatever the focus.
+
+        The focal length is the equivalent one on a sensor 36 mm wide, so that the f-number is defined.
+
+        Args:
+            fov_x_deg: Horizontal field of view in degrees, in (0, 180).
+            aperture_radius_m: Radius of the aperture in metres, > 0.
+            focus_m: Distance of the focus plane in metres, > 0; ``inf`` allowed.
+
+        Raises:
+            ValueError: If a number is outside its range.
+
+        Example:
+            >>> round(Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0).focal_px(768), 6)
+            1055.031329
+        """
+        _check_number("fov_x_deg", fov_x_deg)
+        _check_number("aperture_radius_m", aperture_radius_m)
+        if not is_traced() and _largest(fov_x_deg) >= 180.0:
+            raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}")
+        half = torch.tan(torch.deg2rad(fov_x_deg) / 2) if isinstance(fov_x_deg, Tensor) else _tan_half_deg(fov_x_deg)
+        if not isinstance(half, Tensor) and half < 1e-300:
+            raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}, which is none")
+        focal_length_mm = 18.0 / half
+        f_number = focal_length_mm / (2000.0 * aperture_radius_m)
+        return cls(focal_length_mm, f_number, focus_m, 36.0, focus_breathing=False)
+
+    @property
+    def aperture_radius_m(self) -> Number:
+        """Radius of the aperture, ``f / (2 n)``, in metres."""
+        return self.focal_length_mm / (2000.0 * self.f_number)
+
+    def focal_px(self, width: int) -> Number:
+        """Image distance over pixel pitch, in pixels of an image ``width`` pixels wide (``F`` of the convention)."""
+        pixels_wide(width)
+        focal_px = self.focal_length_mm * (width / self.sensor_width_mm)
+        if self.focus_breathing:
+            focal_px = focal_px / (1.0 - self.focal_length_mm / 1000.0 / self.focus_m)
+        return focal_px
+
+    def coc_px(self, depth: Tensor, width: int) -> Tensor:
+        """Signed radius of the circle of confusion.
+
+        Differences of inverse depths are taken as ``(z - s) / (z s)``, which neither cancels near focus nor loses
+        ``z = inf`` or ``s = inf``: exactly 0 at ``z = s`` and exactly ``(A / 2) F / s`` at infinity.
+
+        Args:
+            depth: ``[B, 1, H, W]`` (or ``[1, 1, H, W]``, broadcast over the camera's batch), metres, > 0, ``inf``
+                allowed. Half precision is computed in float32. Other values are not refused here.
+            width: Width in pixels of the image the coc is meant for.
+
+        Returns:
+            ``[B, 1, H, W]`` in pixels; negative in front of the focus plane, positive behind it, NaN where the depth is
+            not > 0. Differentiable with respect to depth and to every tensor of the camera, without what is NaN.
+
+        Raises:
+            ValueError: If the depth is not a floating-point tensor, or its batch does not fit the camera's.
+        """
+        if not isinstance(depth, Tensor) or not depth.is_floating_point():
+            got = f"{depth.dtype} tensor" if isinstance(depth, Tensor) else type(depth).__name__
+            raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
+        if depth.layout != torch.strided:
+            raise ValueError(f"depth must be a dense tensor in metres, got {depth.layout}; convert it with .to_dense()")
+        z = depth if depth.dtype in (torch.float32, torch.float64) else depth.float()
+        known = z > 0
+        z = torch.where(known, z, 1.0)
+        scale = _column(self.aperture_radius_m * self.focal_px(width), z)
+        s = _column(self.focus_m, z)
+        both_finite = torch.isfinite(z) & torch.isfinite(s)
+        z_safe = torch.where(both_finite, z, 1.0)
+        s_safe = torch.where(both_finite, s, 1.0)
+        dioptres = torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
+        return torch.where(known, scale * dioptres, torch.nan)
+
+    def replace(self, **changes: Any) -> "Camera":
+        """The same camera with some numbers changed; names are those of the constructor.
+
+        Raises:
+            ValueError: If a new number is outside its range.
+            TypeError: If a name is unknown.
+        """
+        return dataclasses.replace(self, **changes)
+
+    def focus_at(self, depth: Tensor, x: float, y: float, patch: int = 5) -> "Camera":
+        """This camera focused on what is seen at a pixel.
+
+        Args:
+            depth: ``[B, 1, H, W]``, metres.
+            x: Column, in pixels from the left edge (pixel centres lie at half-integers), in [0, W).
+            y: Row, in pixels from the top edge, in [0, H).
+            patch: Side of the square patch around the pixel, whose median counts. Zero, negative and NaN depths are
+                left out; infinite ones count.
+
+        Returns:
+            A camera whose ``focus_m`` is the median of each item's patch: a float for one item, else ``[B]``.
+
+        Raises:
+            ValueError: If the pixel lies outside the frame or the patch holds no valid depth.
+        """
+        real_tensor("depth", depth, "[B, 1, H, W] in metres")
+        if depth.ndim != 4 or depth.shape[1] != 1 or not depth.numel():
+            raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
+        whole("patch", patch, 1, 2**31)
+        for value in (x, y):
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"focus point must be two numbers (x, y) in pixels, got {show(value)}")
+        height, width = depth.shape[-2:]
+        if not (0 <= x < width and 0 <= y < height):
+            raise ValueError(f"focus point ({x}, {y}) must lie in the frame of {width} x {height} pixels (x, y)")
+        column, row, reach = int(x), int(y), patch // 2
+        window = depth[
+            :, 0, max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1
+        ].flatten(1)
+        medians = []
+        for values in window:
+            valid = values[values > 0]
+            if valid.numel() == 0:
+                raise ValueError(f"no valid depth within {reach} pixels of ({x}, {y}); choose another focus point")
+            medians.append(valid.median())
+        return self.replace(focus_m=float(medians[0]) if len(medians) == 1 else torch.stack(medians))
+
+    def hyperfocal_m(self, coc_px: float, width: int) -> Number:
+        """Nearest focus distance at which infinity is still acceptably sharp.
+
+        ``f^2 / (n c) + f`` for a lens with an acceptable circle of *diameter* ``c`` on the sensor.
+
+        Args:
+            coc_px: Acceptable radius of the circle of confusion, in pixels, > 0.
+            width: Width of the image in pixels.
+
+        Returns:
+            Metres, a float or ``[B]``.
+        """
+        _check_number("coc_px", coc_px)
+        far = self.replace(focus_m=math.inf)
+        hyperfocal = far.aperture_radius_m * far.focal_px(width) / coc_px
+        return hyperfocal + self.focal_length_mm / 1000.0 if self.focus_breathing else hyperfocal
+
+    def sharp_limits_m(self, coc_px: float, width: int) -> tuple[Number, Number]:
+        """Nearest and farthest depth that is acceptably sharp.
+
+        Args:
+            coc_px: Acceptable radius of the circle of confusion, in pixels, > 0.
+            width: Width of the image in pixels.
+
+        Returns:
+            ``(near, far)`` in metres, floats or ``[B]``; far is ``inf`` at and beyond the hyperfocal distance.
+        """
+        _check_number("coc_px", coc_px)
+        scale = self.aperture_radius_m * self.focal_px(width)
+        dioptres = coc_px / scale if isinstance(scale, Tensor) or scale > 0 else math.inf
+        near, far = 1.0 / (1.0 / self.focus_m + dioptres), 1.0 / self.focus_m - dioptres
+        if isinstance(far, Tensor):
+            return near, torch.where(far > 0, 1.0 / far, torch.inf)
+        return near, 1.0 / far if far > 0 else math.inf
+
+    def __repr__(self) -> str:
+        numbers = [f"{_show(self.focal_length_mm)} mm", f"f/{_show(self.f_number)}", f"focus {_show(self.focus_m)} m"]
+        numbers.append(f"sensor {_show(self.sensor_width_mm)} mm")
+        if not self.focus_breathing:
+            numbers.append("fixed field of view")
+        return f"Camera({', '.join(numbers)})"
+
+
+def _tan_half_deg(degrees: float) -> float:
+    return math.tan(math.radians(degrees) / 2)
+
+
+def _largest(value: Number) -> float:
+    return float(value.detach().max()) if isinstance(value, Tensor) else float(value)
+
+
+def _show(value: Number) -> str:
+    if isinstance(value, Tensor):
+        values = [f"{x:.6g}" for x in value.detach().flatten().tolist()]
+        return values[0] if len(values) == 1 else "[" + ", ".join(values) + "]"
+    return f"{value:.6g}"
+
+
+def _check_number(name: str, value: Number) -> None:
+    if isinstance(value, Tensor):
+        if value.ndim > 1 or not value.is_floating_point() or value.layout != torch.strided or not value.numel():
+            raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {_describe(value)}")
+        if is_traced():
+            return
+        if value.device.type == "meta":
+            raise ValueError(f"{name} must be a float or a tensor [B] that holds data, got one on the meta device")
+        good = bool((value.detach() > 0).all())
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        good = value > 0 and (isinstance(value, float) or value <= 1e300)
+    else:
+        raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {type(value).__name__}")
+    if not good and not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {show(value)}")
+    # compared, not asked for: in compiled code a number that differs between two cameras is a variable
+    if not good or (name != "focus_m" and (_largest(value) if isinstance(value, Tensor) else value) == math.inf):
+        raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {_show(value)}")
+
+
+def _describe(value: Tensor) -> str:
+    return f"{value.dtype} tensor of shape {list(value.shape)}"
+
+
+def _column(value: Number, like: Tensor) -> Tensor:
+    """A camera number as ``[B, 1, 1, 1]`` (or a scalar) in the type of ``like``, checked against its batch."""
+    if not isinstance(value, Tensor):
+        return torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    value = value.to(dtype=like.dtype, device=like.device)
+    if value.ndim == 0 or value.numel() == 1:
+        return value.reshape(())
+    if like.ndim != 4 or (like.shape[0] != value.shape[0] and like.shape[0] != 1):
+        raise ValueError(
+            f"depth must be [{value.shape[0]}, 1, H, W] (or [1, 1, H, W]) for a camera whose numbers are "
+            f"[{value.shape[0]}], got {list(like.shape)}"
+        )
+    return value.reshape(-1, 1, 1, 1)

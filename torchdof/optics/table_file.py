@@ -1,0 +1,90 @@
+"""Blur tables as JSON files: the schema, the shipped ones, and what is wrong with a file."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..io.atomic import whole_file
+from ..validation import show
+
+__all__ = ["fields_of", "find", "read", "stamped", "write"]
+
+SCHEMA = "torchdof/blur-table"
+VERSION = 1
+_SHIPPED = Path(__file__).parent / "tables"
+_REQUIRED = ("family", "unit", "coc", "params")
+_KNOWN = {*_REQUIRED, "schema", "version", "name", "sensor_width_mm", "strength", "residual", "provenance"}
+_KINDS = {"family": str, "unit": str, "params": dict, "name": str, "provenance": dict}
+
+
+def find(source: str | os.PathLike[str]) -> Path:
+    """The file of a table: a path, or the name of a shipped table such as ``"sato_j15"``.
+
+    Raises:
+        ValueError: If it is neither a text nor a path.
+        FileNotFoundError: If there is neither such a file nor such a shipped table.
+    """
+    if not isinstance(source, str | os.PathLike):
+        raise ValueError(f"source must be the name or the path of a blur table, got {show(source)}")
+    path = Path(source)
+    if not path.suffix and not path.exists():
+        path = _SHIPPED / f"{path}.json"
+    if not path.is_file():
+        shipped = ", ".join(sorted(p.stem for p in _SHIPPED.glob("*.json")))
+        raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({shipped})")
+    return path
+
+
+def read(path: Path) -> Any:
+    """The JSON in a file.
+
+    Raises:
+        ValueError: If it is none.
+        RecursionError: If it is nested too deep.
+    """
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def write(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
+    """Writes a table's data as JSON, whole or not at all.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    text = json.dumps(data, indent=1) + "\n"
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def stamped(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """A table's fields with the schema and its version in front."""
+    return {"schema": SCHEMA, "version": VERSION, **fields}
+
+
+def fields_of(data: Any) -> dict[str, Any]:
+    """The fields in a file's data, as arguments of :class:`torchdof.BlurTable`.
+
+    Raises:
+        ValueError: If one is missing, unknown or of the wrong kind; the message names it.
+    """
+    if not isinstance(data, dict):
+        raise ValueError(f"a blur table must be a JSON object, got {type(data).__name__}")
+    if not isinstance(data.get("schema"), str) or data["schema"] != SCHEMA:
+        raise ValueError(f"schema must be {SCHEMA!r}, got {show(data.get('schema'))}; is this a blur table?")
+    if not isinstance(data.get("version"), int) or data["version"] != VERSION:
+        raise ValueError(f"version must be {VERSION}, got {show(data.get('version'))}; update torchdof to read it")
+    for field in _REQUIRED:
+        if field not in data:
+            raise ValueError(f"{field} is missing")
+    unknown = sorted(str(field) for field in set(data) - _KNOWN)
+    if unknown:
+        raise ValueError(f"{unknown[0]} is not a field of a blur table; known are {', '.join(sorted(_KNOWN))}")
+    for field, kind in _KINDS.items():
+        if field in data and not isinstance(data[field], kind):
+            raise ValueError(f"{field} must be a {kind.__name__}, got {type(data[field]).__name__}")
+    sensor = data.get("sensor_width_mm")
+    if sensor is not None and (isinstance(sensor, bool) or not isinstance(sensor, int | float)):
+        raise ValueError(f"sensor_width_mm must be a number, got {show(sensor)}")
+    return {name: value for name, value in data.items() if name not in ("schema", "version")}

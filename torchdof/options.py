@@ -1,0 +1,228 @@
+"""The options of a rendering, spelled once: names, types, defaults, meaning, and what is wrong with them."""
+
+import dataclasses
+import inspect
+import textwrap
+from collections.abc import Mapping
+from typing import Any, Literal, TypedDict, TypeVar, Unpack
+
+from .optics.blur_table import BlurTable
+from .optics.camera import Camera
+from .validation import show
+
+__all__ = [
+    "NAMED",
+    "Border",
+    "Method",
+    "OptionArguments",
+    "Options",
+    "Tolerance",
+    "read_state",
+    "spells_options",
+    "tolerance_of",
+    "tolerance_of_text",
+]
+
+Method = Literal["layered", "fold"]
+Border = Literal["normalize", "extend"]
+Tolerance = float | Literal["draft", "preview", "final"]
+"""RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and full resolution."""
+
+NAMED = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
+"""For looking around, for judging a picture, and one that differs by less than a display shows."""
+
+_DISC = BlurTable.disc()  # one for all: what was computed of a table is kept with it
+_Spelled = TypeVar("_Spelled")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How a picture is rendered.
+
+    Args:
+        table: Blur measured from a lens; None takes the ideal disc.
+        tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
+            and full resolution. 0 asks for that rendering itself; ``"draft"`` is 8/255, ``"preview"`` 4/255 and
+            ``"final"`` 1/255.
+        occlusion: True composites layers far to near, so that blurred foregrounds cover what is behind and sharp ones
+            are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
+        normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.
+        method: ``"layered"`` spreads layers by convolution (fast); ``"fold"`` by the paper's literal scatter.
+        border: ``"normalize"`` counts only light that was seen: what is outside the frame is unknown and weighs
+            nothing. ``"extend"`` continues the light at the frame's border outwards, as if it were known.
+        max_coc_px: Largest radius that a static plan (compiled, exported) covers; larger ones are rendered with it.
+        check: Look for NaN and non-positive depths and non-finite light before rendering, and refuse them. False skips
+            that (and its cost); a pixel with a bad depth then passes through sharp and touches nothing else.
+
+    Raises:
+        ValueError: Naming the option that makes no sense.
+
+    Example:
+        >>> Options().tolerance == 1 / 255
+        True
+    """
+
+    table: BlurTable = _DISC
+    tolerance: float = 1 / 255
+    occlusion: bool = True
+    normalize: bool = True
+    method: Method = "layered"
+    border: Border = "normalize"
+    max_coc_px: float = 64.0
+    check: bool = True
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.table, BlurTable):
+            got = type(self.table).__name__
+            raise ValueError(f"table must be a torchdof.BlurTable, got {got}; read a file with BlurTable.load()")
+        tolerance_of(self.tolerance)
+        for name in ("occlusion", "normalize", "check"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
+        if not isinstance(self.method, str) or self.method not in ("layered", "fold"):
+            raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
+        if not isinstance(self.border, str) or self.border not in ("normalize", "extend"):
+            raise ValueError(f"border must be 'normalize' or 'extend', got {show(self.border)}")
+        if self.occlusion and not self.normalize:
+            raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
+        reach = self.max_coc_px
+        if isinstance(reach, bool) or not isinstance(reach, int | float) or not 0.5 < reach < 1e300:
+            raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(reach)}")
+
+    @classmethod
+    def of(cls, **arguments: Unpack["OptionArguments"]) -> "Options":
+        """The options that a caller's arguments mean: no table is the disc, a tolerance's name its number.
+
+        Raises:
+            ValueError: Naming the option that makes no sense.
+
+        Example:
+            >>> Options.of(table=None, tolerance="preview") == Options(tolerance=4 / 255)
+            True
+        """
+        given: dict[str, Any] = dict(arguments)
+        if given.get("table", _DISC) is None:
+            given["table"] = _DISC
+        if "tolerance" in given:
+            given["tolerance"] = tolerance_of(given["tolerance"])
+        return cls(**given)
+
+    def arguments(self) -> "OptionArguments":
+        """These options as keyword arguments of :class:`torchdof.DepthOfField` or :func:`torchdof.blur_by_coc`."""
+        values: Any = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return values  # type: ignore[no-any-return]
+
+
+class OptionArguments(TypedDict, total=False):
+    """What a caller may write for each of :class:`Options`; only where the types are wider do they differ."""
+
+    table: BlurTable | None
+    tolerance: Tolerance
+    occlusion: bool
+    normalize: bool
+    method: Method
+    border: Border
+    max_coc_px: float
+    check: bool
+
+
+def spells_options(function: _Spelled) -> _Spelled:
+    """Have ``help`` and editors show each option where a function or class takes ``**options``.
+
+    The signature gets the names and defaults of :class:`Options`, the docstring's line ``**options`` their meaning.
+    """
+    called: Any = function.__init__ if inspect.isclass(function) else function  # type: ignore[misc]
+    signature = inspect.signature(called)
+    kept = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    own = {p.name for p in kept}
+    kinds = OptionArguments.__annotations__
+    spelled = [
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=kinds[f.name])
+        for f in dataclasses.fields(Options)
+        if f.name not in own
+    ]
+    called.__signature__ = signature.replace(parameters=[*kept, *spelled])
+    if function.__doc__ and Options.__doc__:
+        meanings = inspect.cleandoc(Options.__doc__).partition("Args:\n")[2].partition("\n\n")[0]
+        lines = [line for line in textwrap.dedent(meanings).splitlines() if line.partition(":")[0] not in own]
+        shown = []
+        for line in function.__doc__.splitlines():
+            if line.lstrip().startswith("**options:"):
+                indent = line[: len(line) - len(line.lstrip())]
+                shown += [indent + meaning for meaning in lines]
+            else:
+                shown.append(line)
+        function.__doc__ = "\n".join(shown)
+    return function
+
+
+def tolerance_of(value: Any) -> float:
+    """The number behind a tolerance.
+
+    Raises:
+        ValueError: If it is neither a name nor a number from 0 to below 1.
+
+    Example:
+        >>> tolerance_of("preview") == 4 / 255
+        True
+    """
+    if isinstance(value, str) and value in NAMED:
+        return NAMED[value]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
+        names = ", ".join(repr(name) for name in NAMED)
+        raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, or one of {names}, got {show(value)}")
+    return value
+
+
+def tolerance_of_text(text: str) -> float:
+    """The tolerance that a command line's words mean: a number or a name.
+
+    Raises:
+        ValueError: As :func:`tolerance_of`.
+
+    Example:
+        >>> tolerance_of_text("0.01"), tolerance_of_text("final") == 1 / 255
+        (0.01, True)
+    """
+    try:
+        return tolerance_of(float(text))
+    except ValueError:
+        return tolerance_of(text)
+
+
+def read_state(given: Any) -> tuple[Camera, Options]:
+    """What a module's state describes.
+
+    Returns:
+        The camera, and the options with the table.
+
+    Raises:
+        ValueError: Naming the field that is missing, unknown or makes no sense.
+    """
+    names = ["camera", *(field.name for field in dataclasses.fields(Options))]
+    if not isinstance(given, Mapping):
+        raise ValueError(f"the state of a DepthOfField must be a dict, as state_dict() gives, got {show(given)}")
+    _fields("the state of a DepthOfField", given, names)
+    camera = given["camera"]
+    if not isinstance(camera, Mapping):
+        raise ValueError(f"camera of the state must be a dict, got {show(camera)}")
+    _fields("camera of the state", camera, list(Camera.__dataclass_fields__))
+    try:
+        made = Camera(**camera)
+    except ValueError as error:
+        raise ValueError(f"camera of the state: {error}") from error
+    try:
+        table = BlurTable.from_dict(given["table"])
+    except ValueError as error:
+        raise ValueError(f"table of the state: {error}") from error
+    try:
+        return made, Options(**{**{name: given[name] for name in names[1:]}, "table": table})
+    except ValueError as error:
+        raise ValueError(f"the state of a DepthOfField: {error}") from error
+
+
+def _fields(what: str, given: Mapping[str, Any], names: list[str]) -> None:
+    missing, unknown = [n for n in names if n not in given], [n for n in given if n not in names]
+    if missing or unknown:
+        wrong = f"{missing[0]!r} is missing" if missing else f"{show(unknown[0])} is not one of them"
+        raise ValueError(f"{what} must have the fields {', '.join(names)}; {wrong}")

@@ -1,0 +1,1 @@
+"""What is compared with: many views through the lens, scenes whose truth is known, and measures of difference."""

@@ -1,0 +1,147 @@
+"""How far a rendering is from the truth: PSNR in linear light and as displayed, SSIM, FLIP."""
+
+import importlib
+import importlib.util
+import math
+
+import torch
+from torch import Tensor
+
+from ..io.transfer import encode
+from ..validation import real_tensor, show
+
+__all__ = ["display", "flip", "flip_map", "has_flip", "psnr", "ssim"]
+
+
+def display(linear: Tensor) -> Tensor:
+    """Linear light as a display shows it: clipped to [0, 1], then the sRGB curve.
+
+    Args:
+        linear: Any shape, linear light.
+
+    Returns:
+        The same shape, in [0, 1].
+
+    Raises:
+        ValueError: If it is not a floating-point tensor.
+
+    Reference:
+        IEC 61966-2-1.
+
+    Example:
+        >>> [round(x, 3) for x in display(torch.tensor([-1.0, 0.0, 0.214, 7.0])).tolist()]
+        [0.0, 0.0, 0.5, 1.0]
+    """
+    real_tensor("linear", linear, "of linear light")
+    return encode(linear.clamp(0.0, 1.0), "srgb", has_alpha=False, straight=False)
+
+
+def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
+    """Peak signal to noise ratio for a peak of 1, in dB, over all items and channels.
+
+    Args:
+        image: ``[B, C, H, W]``; pass both through :func:`display` for display-encoded values.
+        truth: ``[B, C, H, W]``.
+        mask: ``[B or 1, 1, H, W]``, bool: pixels that count; None counts them all.
+
+    Returns:
+        dB; ``inf`` where both are equal.
+
+    Raises:
+        ValueError: If shapes or types are not as described, no pixel counts, or one that counts is not finite.
+
+    Example:
+        >>> round(psnr(torch.zeros(1, 3, 4, 4), torch.full((1, 3, 4, 4), 0.1)), 6)
+        20.0
+    """
+    _alike(image, truth)
+    squared = (image.double() - truth.double()).square().mean(1, keepdim=True)
+    if mask is not None:
+        batch, _, height, width = image.shape
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.device != image.device:
+            raise ValueError(f"mask must be a bool tensor on the image's device {image.device}, got {show(mask)}")
+        if mask.ndim != 4 or mask.shape[0] not in (1, batch) or mask.shape[1:] != (1, height, width):
+            raise ValueError(f"mask must be [{batch} or 1, 1, {height}, {width}], got {list(mask.shape)}")
+        squared = squared[mask.expand_as(squared)]
+    if not squared.numel():
+        raise ValueError("no pixel counts: the mask is empty")
+    error = float(squared.mean())
+    if not math.isfinite(error):
+        bad = squared.numel() - int(torch.isfinite(squared).sum())
+        raise ValueError(f"image and truth must be finite, got {bad} of {squared.numel()} pixels that are not")
+    return -10.0 * math.log10(error) if error > 0 else math.inf
+
+
+def ssim(image: Tensor, truth: Tensor) -> float:
+    """Structural similarity of values in [0, 1]: Gaussian window of 11 pixels, sigma 1.5.
+
+    Args:
+        image: ``[B, C, H, W]``, display-encoded, at least 6 pixels a side.
+        truth: ``[B, C, H, W]``.
+
+    Returns:
+        Mean over pixels and channels, at most 1.
+
+    Raises:
+        ValueError: If shapes or types are not as described, or a value is not finite.
+
+    Reference:
+        Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment", IEEE TIP 2004; computed by kornia.
+    """
+    from kornia.metrics import ssim as kornia_ssim
+
+    _alike(image, truth, finite=True)
+    if min(image.shape[-2:]) < 6:
+        raise ValueError(f"SSIM needs at least 6 pixels a side, got {list(image.shape)}")
+    return float(kornia_ssim(image.double(), truth.double(), window_size=11).mean())
+
+
+def has_flip() -> bool:
+    """Whether FLIP can be computed: whether the package ``flip-evaluator`` is installed."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
+def flip(image: Tensor, truth: Tensor) -> float:
+    """Mean FLIP error of display-encoded images; arguments as in :func:`flip_map`."""
+    return float(flip_map(image, truth).double().mean())
+
+
+def flip_map(image: Tensor, truth: Tensor) -> Tensor:
+    """Difference that a viewer notices when flipping between two images on a display (67 pixels a degree).
+
+    Args:
+        image: ``[1, 3, H, W]``, display-encoded, in [0, 1].
+        truth: ``[1, 3, H, W]``.
+
+    Returns:
+        ``[1, 1, H, W]``, in [0, 1].
+
+    Raises:
+        ValueError: If shapes differ or are not one RGB image, or a value is not finite.
+        ModuleNotFoundError: If ``flip-evaluator`` is not installed.
+
+    Reference:
+        Andersson et al., "FLIP: a difference evaluator for alternating images", HPG 2020.
+    """
+    _alike(image, truth, finite=True)
+    if image.shape[:2] != (1, 3):
+        raise ValueError(f"FLIP compares one RGB image, [1, 3, H, W], got {list(image.shape)}")
+    flip_evaluator = importlib.import_module("flip_evaluator")
+    arrays = [x.detach().float().cpu()[0].permute(1, 2, 0).contiguous().numpy() for x in (truth, image)]
+    error, _, _ = flip_evaluator.evaluate(*arrays, "LDR", applyMagma=False)
+    return torch.from_numpy(error).reshape(1, 1, *image.shape[-2:])
+
+
+def _alike(image: Tensor, truth: Tensor, finite: bool = False) -> None:
+    for name, value in (("image", image), ("truth", truth)):
+        real_tensor(name, value, "[B, C, H, W]")
+        if value.ndim != 4 or not value.numel():
+            raise ValueError(f"{name} must be [B, C, H, W] with at least one pixel, got {list(value.shape)}")
+        bad = value.numel() - int(torch.isfinite(value).sum()) if finite else 0
+        if bad:
+            raise ValueError(f"{name} must be finite, got {bad} of {value.numel()} values that are NaN or infinite")
+    if image.shape != truth.shape or image.device != truth.device:
+        raise ValueError(
+            f"image and truth must have the same shape and device, got {list(image.shape)} on {image.device} and "
+            f"{list(truth.shape)} on {truth.device}"
+        )

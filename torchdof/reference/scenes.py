@@ -1,0 +1,250 @@
+"""Scenes whose depth of field is known: read from a folder, or made of textured planes and computed.
+
+A folder holds ``sharp.exr`` (all in focus, linear light), ``depth.exr`` (metres along the optical axis), one
+``truth_K.exr`` for each setting of the lens, and ``meta.json``::
+
+    {"name": "planes", "F_px": 1055.03,
+     "truths": [{"file": "truth_0.exr", "aperture_radius_m": 0.02, "focus_distance_m": 8.0, "margin_px": 20}]}
+
+``F_px`` is the image distance in pixels, whatever part of the frame the files show. ``margin_px`` may be left out:
+it is the largest circle of confusion, where that one lies outside what the files show.
+"""
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..optics.camera import Camera
+from .lens_samples import spread_points
+
+__all__ = ["Plane", "Scene", "camera_of", "plane_scene", "posts", "read_scenes", "waves"]
+
+Light = Callable[[Tensor, Tensor], Tensor]
+"""Linear light ``[C, ...]`` at places x, y ``[...]``, in pixels of the frame."""
+
+Shape = Callable[[Tensor, Tensor], Tensor]
+"""Whether a surface is there (bool ``[...]``) at places x, y ``[...]``, in pixels of the frame."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A sharp image with its depth, and the truth for one setting of the lens.
+
+    Args:
+        name: Name of the scene and setting, such as ``planes/0``.
+        image: ``[1, C, H, W]``, linear light, all in focus.
+        depth: ``[1, 1, H, W]``, metres.
+        camera: The setting of the lens.
+        truth: ``[1, C, H, W]``, linear light.
+        margin_px: Width of the border that light from outside the frame reaches: the largest circle of confusion.
+        surfaces: What is known of further surfaces, as :func:`torchdof.reference.lens_views.lens_views` takes them.
+    """
+
+    name: str
+    image: Tensor
+    depth: Tensor
+    camera: Camera
+    truth: Tensor
+    margin_px: int = 0
+    surfaces: tuple[tuple[Tensor, Tensor], ...] = ()
+
+    @property
+    def coc_px(self) -> Tensor:
+        """Signed circle of confusion, ``[1, 1, H, W]``."""
+        return self.camera.coc_px(self.depth, self.image.shape[-1])
+
+    @property
+    def inner(self) -> Tensor:
+        """Mask of the pixels inside the margin, ``[1, 1, H, W]``, bool."""
+        mask, m = torch.zeros_like(self.depth, dtype=torch.bool), self.margin_px
+        mask[..., m : mask.shape[-2] - m, m : mask.shape[-1] - m] = True
+        return mask
+
+
+def read_scenes(folder: str | os.PathLike[str]) -> Iterator[Scene]:
+    """Every setting of every scene below a folder, by name.
+
+    Raises:
+        OSError: If the folder has no scene, or a file of one is missing.
+        ValueError: If a file is not as described; the message names it.
+    """
+    folder = Path(folder)
+    metas = sorted(folder.rglob("meta.json"))
+    if not metas:
+        raise FileNotFoundError(f"{folder}: there is no scene here; a scene is a folder with meta.json and sharp.exr")
+    for meta in metas:
+        yield from _read_scene(meta)
+
+
+def _read_scene(meta: Path) -> Iterator[Scene]:
+    from ..io.images import read_image, read_values
+
+    try:
+        data = json.loads(meta.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{meta}: is not JSON ({error})") from None
+    focal_px = _number(meta, data, "F_px")
+    truths = data.get("truths") if isinstance(data, Mapping) else None
+    if not isinstance(truths, list) or not truths:
+        raise ValueError(f"{meta}: truths must be a list of lens settings, got {str(truths)[:60]}")
+    image = read_image(meta.with_name("sharp.exr")).pixels
+    depth = read_values(meta.with_name("depth.exr"))
+    for index, entry in enumerate(truths):
+        radius, focus = _number(meta, entry, "aperture_radius_m"), _number(meta, entry, "focus_distance_m")
+        truth = read_image(meta.with_name(str(entry.get("file", f"truth_{index}.exr")))).pixels
+        if truth.shape != image.shape:
+            raise ValueError(f"{meta}: truth {index} is {list(truth.shape)}, the sharp image {list(image.shape)}")
+        name = f"{data.get('name', meta.parent.name)}/{entry.get('index', index)}"
+        camera = camera_of(focal_px, image.shape[-1], radius, focus)
+        widest = math.ceil(float(camera.coc_px(depth, image.shape[-1]).abs().max()))
+        yield Scene(name, image, depth, camera, truth, max(widest, int(entry.get("margin_px", 0))))
+
+
+def _number(meta: Path, data: Any, field: str) -> float:
+    value = data.get(field) if isinstance(data, Mapping) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+        raise ValueError(f"{meta}: {field} must be a positive number, got {value!r}")
+    return float(value)
+
+
+def camera_of(focal_px: float, width: int, aperture_radius_m: float, focus_m: float) -> Camera:
+    """Camera of a rendered frame ``width`` pixels wide (or a part of one) whose image distance is ``focal_px`` pixels.
+
+    Example:
+        >>> camera = camera_of(1055.0, 768, aperture_radius_m=0.02, focus_m=2.0)
+        >>> round(float(camera.coc_px(torch.tensor([[[[1.0]]]]), 768)), 6)
+        -10.55
+    """
+    fov = 2 * math.degrees(math.atan(width / (2 * focal_px)))
+    return Camera.from_fov(fov_x_deg=fov, aperture_radius_m=aperture_radius_m, focus_m=focus_m)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plane:
+    """A plane that faces the camera and reaches beyond the frame.
+
+    Args:
+        depth_m: Its distance.
+        light: Its texture, seen from the middle of the lens.
+        shape: Where it is; None: everywhere.
+    """
+
+    depth_m: float
+    light: Light
+    shape: Shape | None = None
+
+
+def plane_scene(
+    planes: Sequence[Plane],
+    camera: Camera,
+    size: tuple[int, int],
+    samples: int = 1024,
+    name: str = "planes",
+) -> Scene:
+    """Renders planes exactly, but for the number of samples: the truth for textures and shapes known everywhere.
+
+    A plane at circle of confusion ``c`` shows in a pixel at ``x``, from the point ``u`` of a round lens, what lies at
+    ``x - c u`` as seen from the lens's middle. Pixels are box-filtered.
+
+    Args:
+        planes: In any order; the farthest must have no shape, so that it covers the frame.
+        camera: The setting of the lens.
+        size: Height and width in pixels.
+        samples: Points on lens and pixel for each pixel; the sharp image takes as many on the pixel alone.
+        name: Name of the scene.
+
+    Returns:
+        The scene; its ``surfaces`` hold each whole plane, far to near, including what is hidden.
+
+    Raises:
+        ValueError: If the farthest plane has a shape.
+    """
+    height, width = size
+    if not planes or max(planes, key=lambda plane: plane.depth_m).shape is not None:
+        raise ValueError("the farthest plane must have no shape: it has to cover the frame")
+    planes = sorted(planes, key=lambda plane: -plane.depth_m)  # far to near
+    depths = torch.tensor([p.depth_m for p in planes], dtype=torch.float64).reshape(-1, 1, 1, 1)
+    cocs = camera.coc_px(depths, width).flatten().tolist()
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in size), indexing="ij")
+    rho, angle = spread_points(samples)
+    points = torch.stack([rho * angle.cos(), rho * angle.sin()], -1).tolist()
+    index = torch.arange(samples, dtype=torch.float64)
+    # Additive recurrences keep place in the pixel and point of the lens apart.
+    places = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1).tolist()
+    sharp, covers = _average(planes, x, y, places, [(0.0, 0.0)] * samples, cocs)
+    truth, _ = _average(planes, x, y, places, points, cocs)
+    depth = torch.full((height, width), math.inf, dtype=torch.float64)
+    surfaces = []
+    for plane, cover in zip(planes, covers, strict=True):
+        is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(x, y)
+        depth = torch.where(is_covered, plane.depth_m, depth)
+        surfaces.append((cover.float()[None], torch.full((1, 1, height, width), plane.depth_m)))
+    margin_px = math.ceil(max(abs(c) for c in cocs))
+    images = (sharp.float()[None], depth.float()[None, None], camera, truth.float()[None])
+    return Scene(name, *images, margin_px, tuple(surfaces))
+
+
+def _average(
+    planes: Sequence[Plane],
+    x: Tensor,
+    y: Tensor,
+    places: Sequence[Sequence[float]],
+    points: Sequence[Sequence[float]],
+    cocs: Sequence[float],
+) -> tuple[Tensor, list[Tensor]]:
+    """Mean light ``[C, H, W]`` of what is seen, and premultiplied light and cover of each plane ``[C + 1, H, W]``."""
+    total, wholes = torch.zeros(()), [torch.zeros(()) for _ in planes]
+    for (px, py), (ux, uy) in zip(places, points, strict=True):
+        seen = torch.zeros(())
+        for k, (plane, coc) in enumerate(zip(planes, cocs, strict=True)):
+            place = (x + px - coc * ux, y + py - coc * uy)
+            light = plane.light(*place)
+            is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*place)
+            seen = torch.where(is_covered, light, seen)
+            wholes[k] = wholes[k] + torch.cat([light * is_covered, is_covered[None]])
+        total = total + seen
+    return total / len(places), [whole / len(places) for whole in wholes]
+
+
+def waves(seed: int, mean: Sequence[float] = (0.4, 0.4, 0.4), contrast: float = 0.8, shortest_px: float = 6.0) -> Light:
+    """An endless texture of waves of random direction, none shorter than ``shortest_px``.
+
+    Example:
+        >>> waves(0)(torch.zeros(2, 5), torch.zeros(2, 5)).shape
+        torch.Size([3, 2, 5])
+    """
+    dice = torch.Generator().manual_seed(seed)
+    count = 12
+    length = shortest_px * 8 ** torch.rand(count, generator=dice, dtype=torch.float64)
+    angle, phase = 2 * math.pi * torch.rand(2, count, generator=dice, dtype=torch.float64)
+    weight = torch.rand(len(mean), count, generator=dice, dtype=torch.float64)
+    weight = contrast * weight / weight.sum(1, keepdim=True)
+    kx, ky = 2 * math.pi / length * angle.cos(), 2 * math.pi / length * angle.sin()
+
+    def light(x: Tensor, y: Tensor) -> Tensor:
+        wave = torch.sin(x[..., None] * kx + y[..., None] * ky + phase)  # [..., count]
+        return torch.stack([m * (1 + (wave * w).sum(-1)) for m, w in zip(mean, weight, strict=True)])
+
+    return light
+
+
+def posts(pitch_px: float, width_px: float, slant: float = 0.1, start_px: float = 0.0) -> Shape:
+    """Upright bars with hard edges, slanted so that their edges cross the pixels everywhere.
+
+    Example:
+        >>> x = torch.tensor([0.5, 4.5, 9.5])
+        >>> posts(pitch_px=8.0, width_px=3.0)(x, torch.zeros(3)).tolist()
+        [True, False, True]
+    """
+
+    def shape(x: Tensor, y: Tensor) -> Tensor:
+        return (x + slant * y - start_px) % pitch_px < width_px
+
+    return shape

@@ -1,0 +1,282 @@
+"""Tensors and numbers at the public boundary: taken as they are, or refused, saying what was expected and what came."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "background",
+    "both_or_none",
+    "image_and_coc",
+    "image_and_depth",
+    "image_and_map",
+    "is_traced",
+    "number",
+    "pixels_wide",
+    "real_tensor",
+    "show",
+    "stack",
+    "whole",
+]
+
+
+def is_traced() -> bool:
+    """Whether this code is being compiled or exported: tensors then have no numbers that could be looked at."""
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
+
+
+def number(
+    name: str, value: Any, low: float = -math.inf, high: float = math.inf, unit: str = "", infinite: bool = False
+) -> float:
+    """A number in the open interval ``(low, high)``.
+
+    Args:
+        name: Of the argument.
+        value: What came.
+        low: Below what is allowed.
+        high: Above what is allowed.
+        unit: For the message, such as ``"metres"``.
+        infinite: Whether an infinite number counts as one.
+
+    Raises:
+        ValueError: If it is not a number (a truth value is none), NaN, or outside.
+
+    Example:
+        >>> number("f_number", 2, low=0)
+        2.0
+    """
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    if plain and (low < value < high or (infinite and abs(value) == math.inf and low <= value <= high)):
+        try:
+            return float(value)
+        except OverflowError:
+            pass
+    bounds = [f"> {low:g}"] * (low > -math.inf) + [f"< {high:g}"] * (high < math.inf)
+    wanted = " ".join(["a number", *([f"of {unit}"] * bool(unit)), " and ".join(bounds)]).rstrip()
+    raise ValueError(f"{name} must be {wanted}{' (inf allowed)' if infinite else ''}, got {show(value)}")
+
+
+def whole(name: str, value: Any, low: int, high: int) -> int:
+    """A whole number from ``low`` to ``high``.
+
+    Raises:
+        ValueError: If it is none, or outside.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise ValueError(f"{name} must be a whole number from {low} to {high}, got {show(value)}")
+    return value
+
+
+def pixels_wide(width: Any) -> None:
+    """Refuse a width in pixels that is none; the symbols and tensors of a traced program pass.
+
+    Raises:
+        ValueError: If it is not a positive finite number, or a tensor of one.
+    """
+    if is_traced() or isinstance(width, torch.SymInt):
+        return
+    if isinstance(width, Tensor):
+        if width.ndim or width.is_complex() or width.layout != torch.strided or width.device.type == "meta":
+            raise ValueError(f"width must be one number of pixels, got {show(width)}")
+        width = width.item()
+    number("width", width, low=0, unit="pixels")
+
+
+def real_tensor(name: str, value: Any, what: str) -> Tensor:
+    """A dense tensor of floating-point numbers that are there.
+
+    Args:
+        name: Of the argument.
+        value: What came.
+        what: What is expected, such as ``"[B, 1, H, W] in metres"``.
+
+    Raises:
+        ValueError: If it is something else: another kind of object or number, sparse, or without data ("meta").
+    """
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
+    if not value.is_floating_point():
+        raise ValueError(f"{name} must be a floating-point tensor {what}, got {value.dtype}; convert it with .float()")
+    if value.layout != torch.strided:
+        raise ValueError(f"{name} must be a dense tensor {what}, got {value.layout}; convert it with .to_dense()")
+    if value.device.type == "meta":
+        raise ValueError(f"{name} must be a tensor {what} that holds data, got one on the meta device")
+    return value
+
+
+def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
+    """Refuse an image and a depth map that do not belong together.
+
+    Raises:
+        ValueError: If shapes or types are wrong, or, with ``values``, a depth is NaN or not positive.
+    """
+    image_and_map(image, "depth", depth, "in metres")
+    if values and not is_traced():
+        bad = int((~(depth > 0)).sum())
+        if bad:
+            raise ValueError(
+                f"depth must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or negative; "
+                "fill the holes, or pass check=False to let these pixels through sharp"
+            )
+
+
+def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:
+    """Refuse an image and a map of the circle of confusion that do not belong together.
+
+    Args:
+        image: ``[B, C, H, W]``.
+        coc_px: Its signed circle of confusion, in pixels.
+        channels: How many kernels the table has at a node: 1, or one for each channel of the image.
+        values: Whether to look at the numbers too; a traced program has none to look at.
+
+    Raises:
+        ValueError: If shapes or types are wrong, the table has other channels than the image, or, with ``values``, a
+            coc or a pixel is not finite.
+    """
+    image_and_map(image, "coc_px", coc_px, "in pixels")
+    if channels not in (1, image.shape[1]):
+        raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
+    if values and not is_traced():
+        for name, tensor in (("coc_px", coc_px), ("image", image)):
+            if bool(torch.isfinite(tensor.sum())):  # one look at each value; a sum that overflows tells nothing
+                continue
+            bad = tensor.numel() - int(torch.isfinite(tensor).sum())
+            if bad:
+                raise ValueError(
+                    f"{name} must be finite, got {bad} of {tensor.numel()} values that are NaN or infinite; "
+                    "mend them, or pass check=False"
+                )
+
+
+def both_or_none(background: Tensor | None, where: Tensor | None) -> None:
+    """Refuse a background without its place, or a place without its background.
+
+    Raises:
+        ValueError: Saying which is missing.
+    """
+    if (background is None) != (where is None):
+        missing = "background" if background is None else "background_depth (or background_coc_px)"
+        raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
+
+
+def background(
+    image: Tensor, hidden: Tensor | None, coc_px: Tensor | None, channels: int, values: bool
+) -> tuple[Tensor, Tensor] | None:
+    """Refuse a background that does not belong to an image.
+
+    Args:
+        image: ``[B, C, H, W]``.
+        hidden: What lies behind it, of the same shape; None if nothing is known.
+        coc_px: Signed circle of confusion of ``hidden``, in pixels.
+        channels: As for :func:`image_and_coc`.
+        values: As for :func:`image_and_coc`.
+
+    Returns:
+        The background and its circle of confusion; None if there is none.
+
+    Raises:
+        ValueError: If one of both is missing, or shapes or types are wrong.
+    """
+    both_or_none(hidden, coc_px)
+    if hidden is None or coc_px is None:
+        return None
+    if (
+        not isinstance(hidden, Tensor)
+        or not isinstance(coc_px, Tensor)
+        or hidden.shape != image.shape
+        or hidden.dtype != image.dtype
+    ):
+        got = f"{hidden.dtype} {list(hidden.shape)}" if isinstance(hidden, Tensor) else type(hidden).__name__
+        raise ValueError(f"background must be as the image is, {image.dtype} {list(image.shape)}, got {got}")
+    image_and_coc(hidden, coc_px, channels, values=values)
+    return hidden, coc_px
+
+
+def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
+    """Refuse a stack of layers and depths that do not belong together.
+
+    Returns:
+        The depths as ``[B, N, 1, H, W]``, each axis but N of its size or 1.
+
+    Raises:
+        ValueError: If shapes or types are wrong, or, with ``values``, a coverage is outside [0, 1].
+    """
+    for name, value in (("rgba", rgba), ("depth_m", depth_m)):
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"{name} must be a floating-point tensor, got {got}")
+    if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
+        raise ValueError(f"rgba must be [B, N, C + 1, H, W], premultiplied, got {list(rgba.shape)}")
+    batch, count, _, height, width = rgba.shape
+    depth = depth_m
+    if depth.ndim in (1, 2) and depth.shape[-1] == count:
+        depth = depth.reshape(-1, count, 1, 1, 1)
+    if depth.ndim != 5 or depth.shape[0] not in (1, batch) or depth.shape[1:3] != (count, 1):
+        raise ValueError(
+            f"depth_m must be [{count}], [{batch}, {count}] or [B, {count}, 1, H, W], got {[*depth_m.shape]}"
+        )
+    if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
+        raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
+    if values and not is_traced():
+        real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
+        real_tensor("depth_m", depth_m, "in metres")
+        cover = rgba[:, :, -1]
+        bad = int((~((cover >= 0) & (cover <= 1))).sum())
+        if bad:
+            raise ValueError(
+                f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
+            )
+    return depth
+
+
+def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
+    """Refuse an image and a map of one number a pixel whose kinds, sizes or devices do not fit.
+
+    Raises:
+        ValueError: Naming the one that is wrong.
+    """
+    _image(image)
+    _map(name, unit, value, image)
+    if not is_traced():  # there a tensor has no data yet
+        real_tensor("image", image, "[B, C, H, W]")
+        real_tensor(name, value, f"[B, 1, H, W] {unit}")
+
+
+def _image(image: Tensor) -> None:
+    if not isinstance(image, Tensor):
+        raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {type(image).__name__}")
+    if not image.is_floating_point():
+        raise ValueError(f"image must be floating point in linear light, got {image.dtype}; decode it first")
+    if image.ndim != 4:
+        hint = "; did you forget the batch dimension? use image[None]" if image.ndim == 3 else ""
+        raise ValueError(f"image must be [B, C, H, W] in linear light, got {list(image.shape)}{hint}")
+    if 0 in image.shape:
+        raise ValueError(f"image must have at least one pixel, channel and item, got {list(image.shape)}")
+
+
+def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
+    batch, _, height, width = image.shape
+    expected = f"{name} must be [{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit}"
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
+        raise ValueError(f"{expected} and floating point, got {got}")
+    if value.ndim != 4:
+        hint = "; did you forget the channel dimension?" if value.ndim == 3 else ""
+        raise ValueError(f"{expected}, got {list(value.shape)}{hint}")
+    if value.shape[1:] != (1, height, width) or value.shape[0] not in (1, batch):
+        raise ValueError(f"{expected} as the image is {list(image.shape)}, got {list(value.shape)}")
+    if value.device != image.device:
+        raise ValueError(f"{name} must be on the image's device {image.device}, got {value.device}")
+
+
+def show(value: Any) -> str:
+    """A value for a message: short, and never an error of its own."""
+    if isinstance(value, Tensor):
+        return f"a {value.dtype} tensor of shape {list(value.shape)}"
+    try:
+        text = repr(value)
+    except Exception:  # an integer of more digits than Python prints, or a foreign object's own trouble
+        text = ""
+    return text if 0 < len(text) <= 60 else f"{type(value).__name__} {text[:40]}...".replace(" ...", "")
