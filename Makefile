@@ -1,13 +1,20 @@
-# make demo   render a real photograph focused near, middle and far; pictures go to out/
-# make test   run the tests
-# Both need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
+# make demo       render a real photograph focused near, middle and far; pictures go to out/
+# make test       run the tests
+# make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
+# make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
+# All need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
+# Where there is a C++ compiler the engine is compiled too.
 
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test install check clean
+# For what is installed, and for what builds it.
+export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
+export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
+
+.PHONY: demo test install check wheel sanitize clean
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
@@ -22,16 +29,28 @@ install: $(INSTALLED)
 check: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	rm -rf build/typecheck build/lib build/bdist.*
+	rm -rf build/typecheck
 	$(BIN)/pip install --quiet --no-deps --target build/typecheck .
 	MYPYPATH=build/typecheck $(BIN)/mypy -p torchdof
 	MYPYPATH=build/typecheck $(BIN)/mypy tests examples
 
-$(INSTALLED): pyproject.toml constraints.txt
+wheel: $(INSTALLED)
+	tests/packaging/wheel.sh $(BIN)/python
+
+sanitize: $(INSTALLED)
+	tests/native/sanitize.sh $(BIN)/python
+
+$(INSTALLED): pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
 	@echo "installing into $(VENV); the first time this takes a minute or two"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/pip install --quiet --editable '.[dev]'
 	touch $@
 
+# An editable installation knows where each module lies: after one has moved it must be made again.
+build/modules: always
+	@mkdir -p $(@D); find torchdof fit export -name '*.py' | sort >$@.new; cmp -s $@.new $@ || cp $@.new $@
+
+.PHONY: always
+
 clean:
-	rm -rf build out *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist out *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -7,8 +7,10 @@ import pkgutil
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import torchdof
+from torchdof.cli.main import app
 
 MODULES = sorted(
     module.name
@@ -38,3 +40,9 @@ def test_command_is_installed() -> None:
     (entry,) = importlib.metadata.entry_points(group="console_scripts", name="torchdof")
     assert entry.value == "torchdof.cli.main:main"
     assert callable(entry.load())
+
+
+def test_version_tells_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    printed = CliRunner().invoke(app, ["--version"]).output
+    assert printed == f"torchdof {importlib.metadata.version('torchdof')}, engine torch (TORCHDOF_ENGINE=torch)\n"

@@ -2,9 +2,10 @@
 
 import ast
 import importlib
+import importlib.metadata
 import importlib.util
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -46,9 +47,16 @@ class _Commands(TyperGroup):
 app = typer.Typer(cls=_Commands, no_args_is_help=True, pretty_exceptions_enable=False)
 
 
-@app.callback()
-def _torchdof() -> None:
+@app.callback(invoke_without_command=True)
+def _torchdof(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and the engine in use.")] = False,
+) -> None:
     """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
+    if version:
+        from .. import native  # takes PyTorch
+
+        print(f"torchdof {importlib.metadata.version('torchdof')}, engine {native.describe()}")
+        raise typer.Exit()
 
 
 def _source(name: str) -> Path | None:

@@ -65,8 +65,7 @@ def chosen() -> bool:
     """Whether the compiled engine serves.
 
     Raises:
-        RuntimeError: If ``TORCHDOF_ENGINE`` is ``native`` and it is missing.
-        ValueError: If ``TORCHDOF_ENGINE`` names no engine.
+        ValueError: If ``TORCHDOF_ENGINE`` names no engine, or is ``native`` and it is missing.
     """
     wanted = os.environ.get("TORCHDOF_ENGINE", "auto")
     if wanted not in ("auto", "native", "torch"):
@@ -75,7 +74,7 @@ def chosen() -> bool:
         return False
     library, missing = _library()
     if library is None and wanted == "native":
-        raise RuntimeError(f"TORCHDOF_ENGINE is native, but {missing}; install torchdof where there is a C++ compiler")
+        raise ValueError(f"TORCHDOF_ENGINE is native, but {missing}; install torchdof where there is a C++ compiler")
     return library is not None
 
 

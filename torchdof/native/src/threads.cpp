@@ -29,7 +29,7 @@ struct Task {
     const int worker = workers++;
     try {
       for (int i; (i = next++) < count;) {
-        if (cancelled && *cancelled) throw Cancelled();
+        if (cancelled && __atomic_load_n(cancelled, __ATOMIC_RELAXED)) throw Cancelled();
         (*body)(i, worker);
       }
     } catch (...) {

@@ -1,0 +1,198 @@
+// Renders random scenes through the C interface, for the sanitizers: `make sanitize`.
+//
+// Each scene is rendered by one thread first. Then several callers at once, each with threads of its own, must get the
+// same bits, and one that is cancelled must come back. What a picture should look like is for the tests in Python.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <limits>
+#include <random>
+#include <thread>
+#include <vector>
+
+#include "api.h"
+
+namespace {
+
+[[noreturn]] void fail(const char *claim, int scene) {
+  std::fprintf(stderr, "driver: scene %d: %s\n", scene, claim);
+  std::exit(1);
+}
+
+// A disc of a radius in pixels, with a soft rim, once for each colour; it sums to 1.
+std::vector<float> disc(double radius, int half, int colours) {
+  const int size = 2 * half + 1;
+  std::vector<float> kernel;
+  for (int y = -half; y <= half; y++)
+    for (int x = -half; x <= half; x++)
+      kernel.push_back(float(std::clamp(radius + 0.5 - std::hypot(x, y), 0.0, 1.0)));
+  kernel[half * size + half] += 1e-3f;
+  double sum = 0;
+  for (float value : kernel) sum += value;
+  for (float &value : kernel) value = float(value / sum);
+  std::vector<float> repeated;
+  for (int c = 0; c < colours; c++) repeated.insert(repeated.end(), kernel.begin(), kernel.end());
+  return repeated;
+}
+
+// A scene and the memory that it points to.
+struct Scene {
+  torchdof_scene scene{};
+  std::vector<std::vector<float>> light, coc, weight;
+  std::vector<const float *> light_at, coc_at, weight_at;
+  std::vector<double> nodes;
+  std::vector<int32_t> scales, halves;
+  std::vector<float> kernels;
+
+  explicit Scene(unsigned seed) {
+    std::mt19937 random(seed);
+    const auto integer = [&](int low, int high) { return std::uniform_int_distribution<int>(low, high)(random); };
+    const auto number = [&](double low, double high) { return std::uniform_real_distribution<>(low, high)(random); };
+    scene.height = integer(1, 4) == 1 ? integer(1, 7) : integer(8, 200);
+    scene.width = integer(1, 4) == 1 ? integer(1, 7) : integer(8, 300);
+    scene.channels = integer(1, 5);
+    scene.kind = integer(TORCHDOF_IMAGE, TORCHDOF_STACK);
+    scene.surfaces = scene.kind == TORCHDOF_IMAGE ? 1 : scene.kind == TORCHDOF_BACKGROUND ? 2 : integer(1, 4);
+    scene.occlusion = integer(0, 3) > 0;
+    scene.extend = integer(0, 1);
+    scene.normalize = integer(0, 3) > 0;
+    scene.masked = integer(0, 1);
+    scene.highlights = integer(0, 3) > 0;
+    scene.crisp_px = float(number(0.5, 4.0));
+    const double largest = number(1.0, 24.0);
+    surfaces(integer, number, largest);
+    layers(integer(0, 3) ? 1 : scene.channels, largest);
+  }
+
+ private:
+  // Rectangles of one blur each before a slope, with specks of light, and where they are allowed NaN and infinities.
+  template <typename Integer, typename Number>
+  void surfaces(const Integer &integer, const Number &number, double largest) {
+    const size_t pixels = size_t(scene.height) * scene.width;
+    for (int s = 0; s < scene.surfaces; s++) {
+      std::vector<float> colours(pixels * scene.channels), blur(pixels), cover(pixels);
+      const double slope = number(-largest, largest) / scene.height;
+      const double start = s ? number(0.0, largest) : number(-largest, 0.0);
+      for (size_t i = 0; i < pixels; i++)
+        blur[i] = float(std::clamp(start + slope * double(i / scene.width), -largest, largest));
+      for (int r = integer(0, 5); r > 0; r--) {
+        const int top = integer(0, scene.height - 1), bottom = integer(top, scene.height - 1);
+        const int left = integer(0, scene.width - 1), right = integer(left, scene.width - 1);
+        const float value = float(number(-largest, largest));
+        for (int y = top; y <= bottom; y++)
+          for (int x = left; x <= right; x++) blur[size_t(y) * scene.width + x] = value;
+      }
+      for (float &value : colours) value = float(number(0.0, 1.0));
+      for (float &value : cover) value = float(std::clamp(number(-0.5, 1.5), 0.0, 1.0));
+      for (int r = integer(0, 20); r > 0; r--)
+        for (int c = 0, i = integer(0, int(pixels) - 1); c < scene.channels; c++) colours[pixels * c + i] = 500.0f;
+      if (scene.masked)
+        for (int r = integer(0, 20); r > 0; r--) {
+          const float odd[] = {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()};
+          std::vector<float> &hit = integer(0, 1) ? colours : blur;
+          hit[integer(0, int(hit.size()) - 1)] = odd[integer(0, 1)];
+        }
+      light.push_back(colours);
+      coc.push_back(blur);
+      weight.push_back(cover);
+    }
+    for (int s = 0; s < scene.surfaces; s++) {
+      light_at.push_back(light[s].data());
+      coc_at.push_back(coc[s].data());
+      weight_at.push_back(scene.kind == TORCHDOF_STACK && s + 1 < scene.surfaces ? weight[s].data() : nullptr);
+    }
+    scene.light = light_at.data();
+    scene.coc = coc_at.data();
+    scene.weight = weight_at.data();
+  }
+
+  void layers(int colours, double largest) {
+    std::vector<double> radii{0.0};
+    for (double radius = 1.0; radius < largest * 1.35 + 1.0; radius *= 1.35) radii.push_back(radius);
+    for (size_t i = radii.size(); i-- > 1;) nodes.push_back(-radii[i]);
+    nodes.insert(nodes.end(), radii.begin(), radii.end());
+    for (double node : nodes) {
+      const double radius = std::abs(node);
+      scales.push_back(radius < 8.0 ? 1 : radius < 16.0 ? 2 : 4);
+      halves.push_back(radius == 0.0 ? 0 : int(std::ceil(radius / scales.back() + 0.5)));
+      const std::vector<float> kernel = disc(radius / scales.back(), halves.back(), colours);
+      kernels.insert(kernels.end(), kernel.begin(), kernel.end());
+    }
+    scene.layers = int32_t(nodes.size());
+    scene.nodes = nodes.data();
+    scene.scales = scales.data();
+    scene.halves = halves.data();
+    scene.kernel_colours = colours;
+    scene.kernels = kernels.data();
+  }
+};
+
+// What came of it, and the picture if that is TORCHDOF_OK.
+int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vector<float> &picture) {
+  scene.threads = threads;
+  scene.cancelled = cancelled;
+  torchdof_job *job = nullptr;
+  const int begun = torchdof_begin(&scene, &job);
+  if (begun != TORCHDOF_OK) return begun;
+  const int32_t *steps = nullptr;
+  const int64_t count = torchdof_radii(job, &steps);
+  std::vector<std::vector<float>> kernels;
+  std::vector<const float *> kernels_at;
+  std::vector<int32_t> halves;
+  for (int64_t i = 0; i < count; i++) {
+    const double radius = std::abs(steps[i]) / 32.0;
+    halves.push_back(int32_t(std::ceil(radius + 0.5)));
+    kernels.push_back(disc(radius, halves.back(), scene.kernel_colours));
+  }
+  for (const std::vector<float> &kernel : kernels) kernels_at.push_back(kernel.data());
+  picture.assign(size_t(scene.channels) * scene.height * scene.width, -1.0f);
+  const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), picture.data());
+  torchdof_free(job);
+  return finished;
+}
+
+bool same_bits(const std::vector<float> &a, const std::vector<float> &b) {
+  return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0;
+}
+
+void check(unsigned seed) {
+  const int number = int(seed);
+  const Scene scene(seed);
+  const int32_t never = 0;
+  std::vector<float> alone;
+  if (render(scene.scene, 1, &never, alone) != TORCHDOF_OK) fail("one thread cannot render it", number);
+  if (!scene.scene.masked)
+    for (float value : alone)
+      if (!std::isfinite(value)) fail("finite light gives a picture that is not", number);
+
+  std::vector<std::thread> callers;
+  for (int threads : {2, 3, 8})
+    callers.emplace_back([&, threads] {
+      std::vector<float> picture;
+      if (render(scene.scene, threads, &never, picture) != TORCHDOF_OK) fail("several threads cannot render it", number);
+      if (!same_bits(alone, picture)) fail("the number of threads changes the picture", number);
+    });
+  int32_t cancelled = 0;
+  callers.emplace_back([&] {
+    std::vector<float> picture;
+    const int result = render(scene.scene, 2, &cancelled, picture);
+    if (result != TORCHDOF_CANCELLED && result != TORCHDOF_OK) fail("cancelling is an error", number);
+    if (result == TORCHDOF_OK && !same_bits(alone, picture)) fail("cancelling too late changes the picture", number);
+  });
+  __atomic_store_n(&cancelled, 1, __ATOMIC_RELAXED);
+  for (std::thread &caller : callers) caller.join();
+}
+
+}  // namespace
+
+int main(int count, char **arguments) {
+  const int scenes = count > 1 ? std::atoi(arguments[1]) : 40;
+  for (const char *instructions : {"baseline", "avx2"}) {
+    if (!torchdof_use(instructions)) continue;
+    for (int seed = 0; seed < scenes; seed++) check(unsigned(seed));
+    std::printf("driver: %d scenes, %s\n", scenes, instructions);
+  }
+}
