@@ -45,4 +45,4 @@ def test_command_is_installed() -> None:
 def test_version_tells_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     printed = CliRunner().invoke(app, ["--version"]).output
-    assert printed == f"torchdof {importlib.metadata.version('torchdof')}, engine torch (TORCHDOF_ENGINE=torch)\n"
+    assert printed.startswith(f"torchdof {importlib.metadata.version('torchdof')}, engine torch (")
