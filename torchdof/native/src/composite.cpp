@@ -296,6 +296,19 @@ class Composite {
             }
           }
         }
+        if (CHANNELS && inside && count == 1 && one_interval(y0, x0, s)) {
+          const int k = intervals_[0][(size_t)y0 * W_ + x0];
+          if (k + 1 < run.first) continue;
+          if (k > run.last) {
+            b.rest[place] = 1.0f;
+            continue;
+          }
+          p.at.push_back(place);
+          p.node.push_back(k - run.first + 1);
+          p.values.resize(p.values.size() + stride);
+          sum_block<CHANNELS>(y0, x0, s, k, p.values.data() + p.values.size() - stride);
+          continue;
+        }
         for (int i = 0; i < count; i++) {
           int node = -1;
           auto flush = [&] {
@@ -356,6 +369,68 @@ class Composite {
     for (int i = 0; i <= L; i++) p.order[i + 1] += p.order[i];
     std::vector<int> next(p.order.begin(), p.order.begin() + L + 1);
     for (int i = 0; i < pieces; i++) p.order[L + 2 + next[p.node[i]]++] = i;
+  }
+
+  bool one_interval(int y0, int x0, int s) const {
+    const uint16_t *at = &intervals_[0][(size_t)y0 * W_ + x0];
+    const uint16_t first = at[0];
+    unsigned differs = 0;
+    for (int y = 0; y < s; y++, at += W_)
+      for (int x = 0; x < s; x++) differs |= at[x] ^ first;
+    return !differs;
+  }
+
+  // The sums of a block that shows one surface, all of it between two nodes.
+  template <int CHANNELS>
+  void sum_block(int y0, int x0, int s, int k, float *out) const {
+    typedef float f4 __attribute__((vector_size(16)));
+    const float *light[CHANNELS ? CHANNELS : 1], *coc, *weight;
+    const float node = layers_[k].at, per_after = layers_[k].per_after;
+    f4 part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
+    s_.row(0, y0, x0, light, coc, weight);
+    const size_t coc_step = W_, light_step = weight ? BLOCK : W_;  // a block has weights
+    for (int y = 0; y < s; y++) {
+      if (s == 2) {
+        const f4 at = {coc[0], coc[1], 0, 0};
+        f4 part = (axis4(at) - node) * per_after;
+        part[2] = part[3] = 0;
+        part_sum += part;
+        for (int c = 0; c < CHANNELS; c++) {
+          const f4 v = {light[c][0], light[c][1], 0, 0};
+          one[c] += v;
+          two[c] += v * part;
+        }
+      } else {
+        for (int x = 0; x < s; x += 4) {
+          const f4 part = (axis4(load<f4>(coc + x)) - node) * per_after;
+          part_sum += part;
+          for (int c = 0; c < CHANNELS; c++) {
+            const f4 v = load<f4>(light[c] + x);
+            one[c] += v;
+            two[c] += v * part;
+          }
+        }
+      }
+      coc += coc_step;
+      for (int c = 0; c < CHANNELS; c++) light[c] += light_step;
+    }
+    auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
+    out[0] = out[1] = (float)(s * s);
+    out[CHANNELS + 2] = out[CHANNELS + 3] = sum(part_sum);
+    for (int c = 0; c < CHANNELS; c++) {
+      out[2 + c] = sum(one[c]);
+      out[CHANNELS + 4 + c] = sum(two[c]);
+    }
+  }
+
+  template <typename F4>
+  F4 axis4(F4 coc) const {
+    const F4 zero = {}, half = zero + 0.5f, low = zero + low_, high = zero + high_;
+    F4 middle = coc > -half ? coc : -half;
+    middle = middle < half ? middle : half;
+    F4 x = coc - middle;
+    x = x > low ? x : low;
+    return x < high ? x : high;
   }
 
   static uint64_t below(int k, int word) {  // bits of layers before layer k

@@ -142,7 +142,6 @@ class Filling {
   void finest(int band) {
     const int H = job_.height, W = job_.width, C = C_, y_end = std::min(area_height_, (band + 1) * BLOCK);
     const Level &level = pyramid_[0];
-    const size_t area = s_.area();
     for (int y = band * BLOCK; y < y_end; y++)
       if (y % cell_ == 0)
         for (int x = 0; x < cell_columns_; x++) {
@@ -168,6 +167,7 @@ class Filling {
           }
         continue;
       }
+      const float limit = least_threshold(job_, std::min(band * BLOCK, H - 1) / BLOCK * BLOCK, std::min(bx * BLOCK, W - 1) / BLOCK * BLOCK);
       for (int y = band * BLOCK; y < y_end; y += 2)
         for (int x = bx * BLOCK; x < x_end; x += 2) {
           float *out = level.at(y / 2, x / 2);
@@ -175,7 +175,7 @@ class Filling {
           for (int i = 0; i < 4; i++) {
             const int py = std::min(y + i / 2, H - 1), px = std::min(x + i % 2, W - 1);
             float *v = children.data() + i * stride_;
-            pixel(py, px, v);
+            pixel(py, px, limit, v);
             const float coc = s_.coc[(size_t)py * W + px];
             near = std::min(near, coc);
             blur = std::max(blur, std::fabs(coc));
@@ -208,7 +208,7 @@ class Filling {
   }
 
   // Light, coc and weight of the surface that a pixel gives to the pyramid: of two the farther one.
-  void pixel(int y, int x, float *out) const {
+  void pixel(int y, int x, float least_limit, float *out) const {
     const size_t at = (size_t)y * job_.width + x, area = s_.area();
     const int which = y / BLOCK * s_.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK, C = C_;
     out[C] = s_.coc[at];
@@ -226,6 +226,7 @@ class Filling {
     }
     float most = out[0];
     for (int c = 1; c < C; c++) most = std::max(most, out[c]);
+    if (!(most > least_limit)) return;
     float limit, step;
     threshold_row(job_, y, x, limit, step);
     if (most > limit)  // what is hidden beside a highlight is none

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "api.h"
+#include "memory.h"
 #include "threads.h"
 
 namespace torchdof {
@@ -51,12 +52,15 @@ template <typename T>
 class Buffer {
  public:
   Buffer() = default;
-  explicit Buffer(size_t size) : data_(new T[size]) {}
+  explicit Buffer(size_t size) : data_(static_cast<T *>(take_memory(size * sizeof(T)))) {}
   T *data() const { return data_.get(); }
-  T &operator[](size_t i) const { return data_[i]; }
+  T &operator[](size_t i) const { return data_.get()[i]; }
 
  private:
-  std::unique_ptr<T[]> data_;
+  struct Give {
+    void operator()(T *data) const { give_memory(data); }
+  };
+  std::unique_ptr<T, Give> data_;
 };
 
 constexpr int BLOCK = 16;  // pixels a side in which second surfaces are kept
@@ -83,13 +87,13 @@ class Surfaces {
   const float *light = nullptr, *coc = nullptr, *valid = nullptr;  // of the image
   std::vector<const float *> lights, cocs, weights;                // of whole surfaces
   int block_rows, block_columns;
-  std::vector<std::unique_ptr<float[]>> blocks;  // null where the image says all
+  std::vector<float *> blocks;  // null where the image says all
 
   bool whole() const { return !lights.empty(); }
   size_t area() const { return (size_t)height * width; }
-  bool has_block(int i) const { return (bool)blocks[i]; }
+  bool has_block(int i) const { return blocks[i]; }
   Block block(int i) const {
-    float *p = blocks[i].get();
+    float *p = blocks[i];
     return {p, p + channels * BLOCK_PIXELS, p + 2 * channels * BLOCK_PIXELS, p + (2 * channels + 1) * BLOCK_PIXELS,
             p + (2 * channels + 2) * BLOCK_PIXELS};
   }
@@ -98,6 +102,12 @@ class Surfaces {
   // Surface i in a row, from column x on, n pixels within one block column: pointers to light of each channel, coc and
   // weight (null: 1, and for a second surface 0).
   bool row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const;
+
+ private:
+  static constexpr int BLOCKS_AT_ONCE = 64;
+  std::mutex mutex_;
+  std::vector<Buffer<float>> memory_;  // of blocks, so many at once
+  int blocks_left_ = 0;
 };
 
 struct Ray {

@@ -180,7 +180,16 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
 
 Block Surfaces::make_block(int i) {
   if (blocks[i]) return block(i);
-  blocks[i].reset(new float[(2 * channels + 3) * BLOCK_PIXELS]());
+  const size_t size = (size_t)(2 * channels + 3) * BLOCK_PIXELS;
+  {
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (!blocks_left_) {
+      memory_.emplace_back(BLOCKS_AT_ONCE * size);
+      blocks_left_ = BLOCKS_AT_ONCE;
+    }
+    blocks[i] = memory_.back().data() + --blocks_left_ * size;
+  }
+  memset(blocks[i], 0, size * sizeof(float));
   const Block made = block(i);
   const int y0 = i / block_columns * BLOCK, x0 = i % block_columns * BLOCK;
   const int rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
