@@ -11,7 +11,7 @@ from . import pipeline, validation
 from .attention import Attention
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
-from .options import OptionArguments, Options, read_state, spells_options
+from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .plan import Plan
 from .survey import survey
 
@@ -50,7 +50,7 @@ class DepthOfField(nn.Module):
     @property
     def options(self) -> Options:
         """The options of the next rendering; each is an attribute of the module too, and may be set."""
-        values: Any = {field.name: getattr(self, field.name) for field in dataclasses.fields(Options)}
+        values: Any = {name: getattr(self, name) for name in OPTION_NAMES}
         return Options.of(**values)
 
     @options.setter

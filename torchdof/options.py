@@ -12,6 +12,7 @@ from .validation import show
 
 __all__ = [
     "NAMED",
+    "OPTION_NAMES",
     "Border",
     "Method",
     "OptionArguments",
@@ -107,7 +108,10 @@ class Options:
 
     def arguments(self) -> dict[str, Any]:
         """These options as keyword arguments of :class:`torchdof.DepthOfField` or :func:`torchdof.blur_by_coc`."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: getattr(self, name) for name in OPTION_NAMES}
+
+
+OPTION_NAMES = tuple(field.name for field in dataclasses.fields(Options))  # a compiler cannot ask for fields
 
 
 class OptionArguments(TypedDict, total=False):
