@@ -1,6 +1,7 @@
 """What is exported: the module with its static plan, tensors in and tensors out."""
 
 import copy
+import dataclasses
 
 import torch
 from torch import Tensor, nn
@@ -45,8 +46,7 @@ class Portable(nn.Module):
                 )
         self.inputs, self.width = inputs, width
         self.dof = copy.copy(dof)
-        self.dof.table = pinned(dof.options.table, width)
-        self.dof.check = False
+        self.dof.options = dataclasses.replace(dof.options, table=pinned(dof.options.table, width), check=False)
         self.eval()
 
     def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:

@@ -149,8 +149,8 @@ def _prefixed(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
 def _write(joint: onnx.ModelProto, parts: Sequence[onnx.ModelProto], size: tuple[int, int], path: Path) -> None:
     with whole_file(path) as part:
         onnx.save_model(joint, part, format="protobuf")
-        check_format(joint, part)
-        _compare(joint, part, parts, size)
+        check_format(joint, str(part))
+        _compare(joint, str(part), parts, size)
 
 
 def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto], size: tuple[int, int]) -> None:

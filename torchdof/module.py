@@ -11,7 +11,7 @@ from . import pipeline, validation
 from .attention import Attention
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
-from .options import OptionArguments, Options, read_state, spells_options
+from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .plan import Plan
 from .survey import survey
 
@@ -45,17 +45,18 @@ class DepthOfField(nn.Module):
         if not isinstance(camera, Camera):
             raise ValueError(f"camera must be a torchdof.Camera, got {type(camera).__name__}")
         self.camera = camera
-        self._set(Options.of(**{"table": table, **options}))
-
-    def _set(self, options: Options) -> None:
-        for name, value in options.arguments().items():
-            setattr(self, name, value)
+        self.options = Options.of(table, **options)
 
     @property
     def options(self) -> Options:
         """The options of the next rendering; each is an attribute of the module too, and may be set."""
-        values: Any = {field.name: getattr(self, field.name) for field in dataclasses.fields(Options)}
+        values: Any = {name: getattr(self, name) for name in OPTION_NAMES}
         return Options.of(**values)
+
+    @options.setter
+    def options(self, options: Options) -> None:
+        for name, value in options.arguments().items():
+            setattr(self, name, value)
 
     def forward(
         self,
@@ -188,8 +189,7 @@ class DepthOfField(nn.Module):
         Raises:
             ValueError: Naming the field that is missing, unknown or makes no sense.
         """
-        self.camera, options = read_state(state)
-        self._set(options)
+        self.camera, self.options = read_state(state)
 
     def extra_repr(self) -> str:
         """Camera, table and options, as ``repr`` shows them."""
@@ -204,6 +204,7 @@ def depth_of_field(
     depth: Tensor,
     camera: Camera,
     *,
+    table: BlurTable | None = None,
     focus_m: float | Tensor | None = None,
     f_number: float | Tensor | None = None,
     plan: Plan | None = None,
@@ -216,6 +217,7 @@ def depth_of_field(
         image: ``[B, C, H, W]``, linear light.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres.
         camera: The camera.
+        table: Blur measured from a lens; None takes the ideal disc.
         focus_m: Overrides the camera's focus distance, float or ``[B]``.
         f_number: Overrides the camera's f-number, float or ``[B]``.
         plan: Layers to render with; None plans for this image.
@@ -233,7 +235,7 @@ def depth_of_field(
         >>> depth_of_field(image, depth, Camera(focus_m=1.0)).shape
         torch.Size([1, 3, 8, 12])
     """
-    return DepthOfField(camera, **options)(image, depth, focus_m, f_number, plan, attention=attention)
+    return DepthOfField(camera, table, **options)(image, depth, focus_m, f_number, plan, attention=attention)
 
 
 @spells_options
@@ -241,6 +243,7 @@ def blur_by_coc(
     image: Tensor,
     coc_px: Tensor,
     *,
+    table: BlurTable | None = None,
     plan: Plan | None = None,
     background: Tensor | None = None,
     background_coc_px: Tensor | None = None,
@@ -253,6 +256,7 @@ def blur_by_coc(
         image: ``[B, C, H, W]``, linear light.
         coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane,
             NaN where it is unknown and ``check=False``.
+        table: Blur measured from a lens; None takes the ideal disc.
         plan: Layers to render with; None plans for this image.
         background: As in :meth:`DepthOfField.forward`.
         background_coc_px: Its signed radius in pixels.
@@ -270,7 +274,7 @@ def blur_by_coc(
         >>> blur_by_coc(image, torch.linspace(-2, 2, 12).expand(1, 1, 8, 12)).shape
         torch.Size([1, 3, 8, 12])
     """
-    return _blur(image, coc_px, Options.of(**options), plan, background, background_coc_px, attention)
+    return _blur(image, coc_px, Options.of(table, **options), plan, background, background_coc_px, attention)
 
 
 def _blur(

@@ -12,6 +12,7 @@ from .validation import show
 
 __all__ = [
     "NAMED",
+    "OPTION_NAMES",
     "Border",
     "Method",
     "OptionArguments",
@@ -90,7 +91,7 @@ class Options:
             raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(reach)}")
 
     @classmethod
-    def of(cls, **arguments: Unpack["OptionArguments"]) -> "Options":
+    def of(cls, table: BlurTable | None = None, **arguments: Unpack["OptionArguments"]) -> "Options":
         """The options that a caller's arguments mean: no table is the disc, a tolerance's name its number.
 
         Raises:
@@ -101,22 +102,21 @@ class Options:
             True
         """
         given: dict[str, Any] = dict(arguments)
-        if given.get("table", _DISC) is None:
-            given["table"] = _DISC
         if "tolerance" in given:
             given["tolerance"] = tolerance_of(given["tolerance"])
-        return cls(**given)
+        return cls(_DISC if table is None else table, **given)
 
-    def arguments(self) -> "OptionArguments":
+    def arguments(self) -> dict[str, Any]:
         """These options as keyword arguments of :class:`torchdof.DepthOfField` or :func:`torchdof.blur_by_coc`."""
-        values: Any = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return values  # type: ignore[no-any-return]
+        return {name: getattr(self, name) for name in OPTION_NAMES}
+
+
+OPTION_NAMES = tuple(field.name for field in dataclasses.fields(Options))  # a compiler cannot ask for fields
 
 
 class OptionArguments(TypedDict, total=False):
-    """What a caller may write for each of :class:`Options`; only where the types are wider do they differ."""
+    """What a caller may write for each of :class:`Options` beside the table; a tolerance may be a name too."""
 
-    table: BlurTable | None
     tolerance: Tolerance
     occlusion: bool
     normalize: bool
@@ -131,7 +131,7 @@ def spells_options(function: _Spelled) -> _Spelled:
 
     The signature gets the names and defaults of :class:`Options`, the docstring's line ``**options`` their meaning.
     """
-    called: Any = function.__init__ if inspect.isclass(function) else function  # type: ignore[misc]
+    called: Any = function.__init__ if inspect.isclass(function) else function
     signature = inspect.signature(called)
     kept = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     own = {p.name for p in kept}
@@ -139,7 +139,7 @@ def spells_options(function: _Spelled) -> _Spelled:
     spelled = [
         inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=kinds[f.name])
         for f in dataclasses.fields(Options)
-        if f.name not in own
+        if f.name in kinds
     ]
     called.__signature__ = signature.replace(parameters=[*kept, *spelled])
     if function.__doc__ and Options.__doc__:
