@@ -8,7 +8,7 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing is known
-constexpr float COVERED = 1e-5f;  // so little is left uncovered by rounding alone
+constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
 
@@ -77,7 +77,11 @@ class Composite {
         runs_.back().last = k;
         runs_.back().half = std::max(runs_.back().half, l.half);
       } else {
-        runs_.push_back(Run{l.scale, k, k, l.half});
+        Run run;
+        run.scale = l.scale;
+        run.first = run.last = k;
+        run.half = l.half;
+        runs_.push_back(std::move(run));
       }
     }
     window_ = TILE + 2 * half;
@@ -180,18 +184,34 @@ class Composite {
             uint64_t *bits = &cells_[cell * words_];
             const int x0 = column * CELL, n = std::min(CELL, W_ - x0);
             bool single = true;
-            for (int i = 0; i < s_.count; i++)
+            for (int i = 0; i < s_.count; i++) {
+              float places[CELL * CELL], low = NEVER, high = -NEVER;
+              bool there[CELL * CELL], any = false;
+              int count = 0;
               for (int y = row * CELL; y < std::min(H_, (row + 1) * CELL); y++) {
                 if (!s_.row(i, y, x0, light.data(), coc, weight)) break;
                 if (i && !weight) single = false;
-                uint16_t *interval = &intervals_[i][(size_t)y * W_ + x0];
-                for (int x = 0; x < n; x++) {
-                  if (weight && (i ? weight[x] != 0 : weight[x] < 1)) single = false;
-                  if (weight && weight[x] == 0) continue;
-                  const float place = axis(coc[x], low_, high_);
-                  mark(bits, place, interval[x] = (uint16_t)node_before(place));
+                for (int x = 0; x < n; x++, count++) {
+                  const float w = weight ? weight[x] : 1.0f;
+                  if (weight && (i ? w != 0 : w < 1)) single = false;
+                  any |= there[count] = w != 0;
+                  places[count] = axis(coc[x], low_, high_);
+                  low = std::min(low, places[count]);
+                  high = std::max(high, places[count]);
                 }
               }
+              if (!any) continue;
+              const int first = node_before(low), last = node_before(high);
+              for (int j = 0; j < count; j++) {
+                const int k = first == last ? first : node_before(places[j]);
+                intervals_[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = (uint16_t)k;
+                if (first != last && there[j]) mark(bits, places[j], k);
+              }
+              if (first == last) {
+                mark(bits, low, first);
+                mark(bits, high, first);
+              }
+            }
             single_[cell] = single && !s_.independent;
           }
       }
@@ -219,13 +239,13 @@ class Composite {
   // A coarse run in one of its tiles.
   void coarse_tile(Run &run, int which, Scratch &b) {
     const int s = run.scale, tile_y = which / run.tile_columns * TILE, tile_x = which % run.tile_columns * TILE;
-    const int half = run.half, n = TILE + 2 * half;
+    const int rows = std::min(TILE, run.rows - tile_y), columns = std::min(TILE, run.columns - tile_x);
+    const int half = run.half, height = rows + 2 * half, width = columns + 2 * half;
     const int top = tile_y - 1 - half, left = tile_x - 1 - half;  // the first block of the window
-    around(floor_div(top * s, CELL), floor_div((top + n) * s - 1, CELL), floor_div(left * s, CELL),
-           floor_div((left + n) * s - 1, CELL), b.layers.data());
+    around(floor_div(top * s, CELL), floor_div((top + height) * s - 1, CELL), floor_div(left * s, CELL),
+           floor_div((left + width) * s - 1, CELL), b.layers.data());
     bool any = false;
     for (int k = run.first; k <= run.last; k++) any |= has(b.layers.data(), k);
-    const int rows = std::min(TILE, run.rows - tile_y), columns = std::min(TILE, run.columns - tile_x);
     if (!any) {
       for (int c = 0; c < C_ + E_; c++)
         for (int y = 0; y < rows; y++)
@@ -233,24 +253,22 @@ class Composite {
       return;
     }
     run.used[which] = 1;
-    const bool border = !extend_ && (top < 0 || left < 0 || (top + n) * s > H_ || (left + n) * s > W_);
+    const bool border = !extend_ && (top < 0 || left < 0 || (top + height) * s > H_ || (left + width) * s > W_);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
     if (!s_.independent) {
-      if (C_ == 3) gather<3>(run, top, left, n, b); else gather<0>(run, top, left, n, b);
+      if (C_ == 3) gather<3>(run, top, left, height, width, b); else gather<0>(run, top, left, height, width, b);
     }
     for (int k = run.last; k >= run.first; k--) {
       const Layer &l = layers_[k];
       const bool there = s_.independent ? has(b.layers.data(), k) : !(piece_start(b, k - run.first + 2) == piece_start(b, k - run.first));
-      if (!there) {
-        continue;
-      }
-      const int spare = half - l.half, side = TILE + 2 * l.half;
+      if (!there) continue;
+      const int spare = half - l.half;
       const size_t shift = (size_t)spare * pitch_ + spare;
       if (s_.independent)
-        block_means(k, s, top + spare, left + spare, side, shift, b);
+        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, shift, b);
       else
-        add_pieces(run, k, n, b);
-      lay(b, l, side, shift, border);
+        add_pieces(run, k, height, b);
+      lay(b, l, rows, columns, shift, border);
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
@@ -262,7 +280,7 @@ class Composite {
   // What the blocks of a window hold for a run, sorted by node. Pieces between node first - 1 + i and the next one are
   // order[i] to order[i + 1].
   template <int CHANNELS>
-  void gather(const Run &run, int top, int left, int n, Scratch &b) {
+  void gather(const Run &run, int top, int left, int height, int width, Scratch &b) {
     const int C = CHANNELS ? CHANNELS : C_, s = run.scale, stride = 2 * (C + 2), L = run.last - run.first + 2;
     const float each = 1.0f / (s * s);
     Pieces &p = b.pieces;
@@ -270,46 +288,64 @@ class Composite {
     p.node.clear();
     p.values.clear();
     std::vector<float> sums(stride);
-    for (int by = 0; by < n; by++) memset(b.rest + (size_t)by * pitch_, 0, n * sizeof(float));
-    for (int by = 0; by < n; by++)
-      for (int bx = 0; bx < n; bx++) {
+    for (int by = 0; by < height; by++) memset(b.rest + (size_t)by * pitch_, 0, width * sizeof(float));
+    for (int by = 0; by < height; by++)
+      for (int bx = 0; bx < width; bx++) {
         const int y0 = (top + by) * s, x0 = (left + bx) * s, place = by * pitch_ + bx;
         const bool inside = y0 >= 0 && x0 >= 0 && y0 + s <= H_ && x0 + s <= W_;
+        // beyond the frame all rows of a block are alike, or all columns
+        const int rows = y0 + s <= 0 || y0 >= H_ ? 1 : s, columns = x0 + s <= 0 || x0 >= W_ ? 1 : s;
+        const float times = (float)(s / rows * (s / columns));
         int count = s_.count;
-        if (s <= CELL) {
-          const size_t cell = (size_t)(std::clamp(y0, 0, H_ - 1) / CELL) * cell_columns_ + std::clamp(x0, 0, W_ - 1) / CELL;
-          if (inside) {
-            bool before = false, behind = false, here = false;  // layers of the cell relative to the run
-            const uint64_t *bits = &cells_[cell * words_];
-            for (int w = 0; w < words_; w++) {
-              before |= (bits[w] & below(run.first, w)) != 0;
-              behind |= (bits[w] & ~below(run.last + 1, w)) != 0;
-              here |= (bits[w] & ~below(run.first, w) & below(run.last + 1, w)) != 0;
-            }
-            if (!here && !behind) continue;
-            if (single_[cell]) {
-              if (!here && !before) {
-                b.rest[place] = 1.0f;
-                continue;
+        if (inside) {
+          bool before = false, behind = false, here = false, single = true;  // layers of its cells relative to the run
+          for (int row = y0 / CELL; row <= (y0 + s - 1) / CELL; row++)
+            for (int column = x0 / CELL; column <= (x0 + s - 1) / CELL; column++) {
+              const size_t cell = (size_t)row * cell_columns_ + column;
+              const uint64_t *bits = &cells_[cell * words_];
+              for (int w = 0; w < words_; w++) {
+                before |= (bits[w] & below(run.first, w)) != 0;
+                behind |= (bits[w] & ~below(run.last + 1, w)) != 0;
+                here |= (bits[w] & ~below(run.first, w) & below(run.last + 1, w)) != 0;
               }
-              count = 1;
+              single &= (bool)single_[cell];
             }
-          }
-        }
-        if (CHANNELS && inside && count == 1 && one_interval(y0, x0, s)) {
-          const int k = intervals_[0][(size_t)y0 * W_ + x0];
-          if (k + 1 < run.first) continue;
-          if (k > run.last) {
+          if (!here && !behind) continue;
+          if (single && !here && !before) {
             b.rest[place] = 1.0f;
             continue;
           }
-          p.at.push_back(place);
-          p.node.push_back(k - run.first + 1);
-          p.values.resize(p.values.size() + stride);
-          sum_block<CHANNELS>(y0, x0, s, k, p.values.data() + p.values.size() - stride);
-          continue;
+          if (single) count = 1;
         }
         for (int i = 0; i < count; i++) {
+          const float *light_of[CHANNELS ? CHANNELS : 1], *coc, *weight;
+          const float **light = CHANNELS ? light_of : b.pointers.data();
+          if (inside) {
+            if (!s_.row(i, y0, x0, light, coc, weight)) break;
+            const uint16_t *interval = &intervals_[i][(size_t)y0 * W_ + x0];
+            const size_t light_step = s_.whole() || !weight ? W_ : BLOCK, coc_step = i && !s_.whole() ? BLOCK : W_;
+            if (CHANNELS && one_interval(interval, s)) {
+              const int k = *interval;
+              if (k + 1 < run.first) continue;
+              if (k > run.last) {
+                float sum = weight ? 0.0f : s * s;
+                if (weight)
+                  for (int y = 0; y < s; y++)
+                    for (int x = 0; x < s; x++) sum += weight[y * light_step + x];
+                b.rest[place] += sum * each;
+                continue;
+              }
+              p.at.push_back(place);
+              p.node.push_back(k - run.first + 1);
+              p.values.resize(p.values.size() + stride);
+              float *to = p.values.data() + p.values.size() - stride;
+              if (weight)
+                sum_block<CHANNELS, true>(light, light_step, coc, coc_step, weight, s, k, to);
+              else
+                sum_block<CHANNELS, false>(light, light_step, coc, coc_step, weight, s, k, to);
+              continue;
+            }
+          }
           int node = -1;
           auto flush = [&] {
             if (node < 0) return;
@@ -317,13 +353,10 @@ class Composite {
             p.node.push_back(node - run.first + 1);
             p.values.insert(p.values.end(), sums.begin(), sums.end());
           };
-          for (int y = 0; y < s; y++) {
-            const float *light_row[CHANNELS ? CHANNELS : 1];
-            const float **light = CHANNELS ? light_row : b.pointers.data();
-            const float *coc, *weight;
+          for (int y = 0; y < rows; y++) {
             const int at_y = std::clamp(y0 + y, 0, H_ - 1);
-            if (inside && !s_.row(i, at_y, x0, light, coc, weight)) break;
-            for (int x = 0; x < s; x++) {
+            if (inside) s_.row(i, at_y, x0, light, coc, weight);
+            for (int x = 0; x < columns; x++) {
               int at = x, at_x = x0 + x;
               bool known = true;
               if (!inside) {
@@ -332,7 +365,7 @@ class Composite {
                 at = 0;
                 if (!s_.row(i, at_y, at_x, light, coc, weight)) continue;
               }
-              const float w = weight ? weight[at] : 1.0f;
+              const float w = weight ? weight[at] * times : times;
               if (w == 0) continue;
               const int k = intervals_[i][(size_t)at_y * W_ + at_x];
               if (k + 1 < run.first) continue;
@@ -371,8 +404,7 @@ class Composite {
     for (int i = 0; i < pieces; i++) p.order[L + 2 + next[p.node[i]]++] = i;
   }
 
-  bool one_interval(int y0, int x0, int s) const {
-    const uint16_t *at = &intervals_[0][(size_t)y0 * W_ + x0];
+  bool one_interval(const uint16_t *at, int s) const {
     const uint16_t first = at[0];
     unsigned differs = 0;
     for (int y = 0; y < s; y++, at += W_)
@@ -380,42 +412,29 @@ class Composite {
     return !differs;
   }
 
-  // The sums of a block that shows one surface, all of it between two nodes.
-  template <int CHANNELS>
-  void sum_block(int y0, int x0, int s, int k, float *out) const {
+  // The sums of a block of one surface that lies between two nodes.
+  template <int CHANNELS, bool WEIGHTED>
+  void sum_block(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int s,
+                 int k, float *out) const {
     typedef float f4 __attribute__((vector_size(16)));
-    const float *light[CHANNELS ? CHANNELS : 1], *coc, *weight;
     const float node = layers_[k].at, per_after = layers_[k].per_after;
-    f4 part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
-    s_.row(0, y0, x0, light, coc, weight);
-    const size_t coc_step = W_, light_step = weight ? BLOCK : W_;  // a block has weights
-    for (int y = 0; y < s; y++) {
-      if (s == 2) {
-        const f4 at = {coc[0], coc[1], 0, 0};
-        f4 part = (axis4(at) - node) * per_after;
-        part[2] = part[3] = 0;
+    f4 share = {}, part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
+    auto read = [&](const float *from) { return s == 2 ? f4{from[0], from[1], 0, 0} : load<f4>(from); };
+    const f4 there = s == 2 ? f4{1, 1, 0, 0} : f4{1, 1, 1, 1};
+    for (int y = 0; y < s; y++)
+      for (int x = 0; x < s; x += 4) {
+        const f4 w = WEIGHTED ? read(weight + y * light_step + x) : there;
+        const f4 part = (axis4(read(coc + y * coc_step + x)) - node) * per_after * w;
+        share += w;
         part_sum += part;
         for (int c = 0; c < CHANNELS; c++) {
-          const f4 v = {light[c][0], light[c][1], 0, 0};
-          one[c] += v;
+          const f4 v = read(light[c] + y * light_step + x);
+          one[c] += v * w;
           two[c] += v * part;
         }
-      } else {
-        for (int x = 0; x < s; x += 4) {
-          const f4 part = (axis4(load<f4>(coc + x)) - node) * per_after;
-          part_sum += part;
-          for (int c = 0; c < CHANNELS; c++) {
-            const f4 v = load<f4>(light[c] + x);
-            one[c] += v;
-            two[c] += v * part;
-          }
-        }
       }
-      coc += coc_step;
-      for (int c = 0; c < CHANNELS; c++) light[c] += light_step;
-    }
     auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
-    out[0] = out[1] = (float)(s * s);
+    out[0] = out[1] = sum(share);
     out[CHANNELS + 2] = out[CHANNELS + 3] = sum(part_sum);
     for (int c = 0; c < CHANNELS; c++) {
       out[2 + c] = sum(one[c]);
@@ -439,12 +458,12 @@ class Composite {
   }
 
   // What layer k spreads of the pieces of its run; what lies behind it is added to the rest.
-  void add_pieces(const Run &run, int k, int n, Scratch &b) {
+  void add_pieces(const Run &run, int k, int height, Scratch &b) {
     const int C = C_, stride = 2 * (C + 2), L = run.last - run.first + 2;
     const float each = 1.0f / (run.scale * run.scale);
     Pieces &p = b.pieces;
     for (int c = 0; c < C + 3; c++)
-      if (c != C + 1) memset(b.term[c], 0, sizeof(float) * n * pitch_);
+      if (c != C + 1) memset(b.term[c], 0, sizeof(float) * height * pitch_);
     auto add = [&](int node, bool behind) {  // pieces before the layer's node, or behind it
       for (int i = p.order[node]; i < p.order[node + 1]; i++) {
         const int piece = p.order[L + 2 + i], at = p.at[piece];
@@ -460,24 +479,24 @@ class Composite {
       }
     };
     add(k - run.first + 1, true);
-    memcpy(b.term[C + 1], b.rest, sizeof(float) * n * pitch_);
+    memcpy(b.term[C + 1], b.rest, sizeof(float) * height * pitch_);
     add(k - run.first, false);
   }
 
   // The same of surfaces that cover each other: means of what the layer spreads at each pixel.
-  void block_means(int k, int s, int top, int left, int side, size_t shift, Scratch &b) {
+  void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
     const float each = 1.0f / (s * s);
-    const int n = side * s;
-    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + 1 + C_ + 3 + 2 * s_.count) * n);
+    const int n = width * s;
+    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + 1 + C_ + 3 + 2 * s_.count) * (n + LANES));
     float *m = memory.data();
-    auto take = [&] { return (m += n) - n; };
+    auto take = [&] { return (m += n + LANES) - (n + LANES); };  // vectors may read beyond the end
     std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 3), mine(2 * s_.count);
     for (auto *v : {&light, &coc, &weight, &term, &mine})
       for (float *&row : *v) row = take();
     float *known = take();
-    for (int by = 0; by < side; by++) {
+    for (int by = 0; by < height; by++) {
       const size_t to = shift + (size_t)by * pitch_;
-      for (int c = 0; c < C_ + 3; c++) memset(b.term[c] + to, 0, side * sizeof(float));
+      for (int c = 0; c < C_ + 3; c++) memset(b.term[c] + to, 0, width * sizeof(float));
       for (int y = 0; y < s; y++) {
         read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), known, b);
         row_terms(layers_[k], n, false, light.data(), coc.data(), weight.data(), mine.data(), term.data());
@@ -607,18 +626,19 @@ class Composite {
   }
 
   // Spreads the terms of a layer, which begin at an offset, and lays them on the tile's canvas.
-  void lay(Scratch &b, const Layer &l, int side, size_t shift, bool border) {
-    const int C = C_, E = E_;
+  void lay(Scratch &b, const Layer &l, int rows, int columns, size_t shift, bool border) {
+    const int C = C_, E = E_, height = rows + 2 * l.half, width = columns + 2 * l.half;
+    const int whole_rows = (rows + 3) / 4 * 4, whole_columns = (columns + 15) / 16 * 16;
     // where there is anything; whether nothing lies behind the layer, or before it
     bool any = false;
     vec open = {}, uneven = {};
-    for (int y = 0; y < side; y++) {
+    for (int y = 0; y < height; y++) {
       const float *share = b.term[C] + shift + (size_t)y * pitch_, *room = b.term[C + 1] + shift + (size_t)y * pitch_;
       uint32_t bits = 0;
-      for (int x = 0; x < side; x += 16) {
+      for (int x = 0; x < width; x += 16) {
         vec some = {};
         int i = x;
-        for (; i + LANES <= std::min(x + 16, side); i += LANES) {
+        for (; i + LANES <= std::min(x + 16, width); i += LANES) {
           const vec s = load<vec>(share + i);
           some = most(some, s);
           if (!over_) continue;
@@ -626,7 +646,7 @@ class Composite {
           open = most(open, r - s);
           uneven = most(uneven, d * d);
         }
-        for (; i < std::min(x + 16, side); i++) {
+        for (; i < std::min(x + 16, width); i++) {
           some[0] = std::max(some[0], share[i]);
           if (!over_) continue;
           open[0] = std::max(open[0], room[i] - share[i]);
@@ -637,14 +657,15 @@ class Composite {
       b.rows[y] = bits;
       any |= bits != 0;
     }
+    for (int y = height; y < whole_rows + 2 * l.half; y++) b.rows[y] = 0;
     const bool closed = !any_positive(open), flat = largest(uneven) <= 1e-12f;
     if (!any) return;
-    auto spread = [&](int term, const uint32_t *rows, const Kernel &kernel, float *to) {
+    auto spread = [&](int term, const uint32_t *rows_with, const Kernel &kernel, float *to) {
       if (l.half)
-        convolve(b.term[term] + shift, pitch_, rows, kernel, TILE, TILE, to, TILE);
+        convolve(b.term[term] + shift, pitch_, rows_with, kernel, whole_rows, whole_columns, to, TILE);
       else
-        for (int y = 0; y < TILE; y++)
-          for (int x = 0; x < TILE; x++) to[y * TILE + x] = b.term[term][shift + (size_t)y * pitch_ + x] * kernel.sum;
+        for (int y = 0; y < rows; y++)
+          for (int x = 0; x < columns; x++) to[y * TILE + x] = b.term[term][shift + (size_t)y * pitch_ + x] * kernel.sum;
     };
     for (int c = 0; c < C; c++) spread(c, b.rows.data(), l.kernels[E > 1 ? c : 0], b.spread[c]);
     for (int e = 0; e < E; e++) {
@@ -658,17 +679,17 @@ class Composite {
         continue;
       }
       if (flat)
-        std::fill(room, room + TILE_PIXELS, kernel.sum);
+        std::fill(room, room + whole_rows * TILE, kernel.sum);
       else
         spread(C + 1, b.every.data(), kernel, room);
       if (closed)
-        memcpy(share, room, TILE_PIXELS * sizeof(float));
+        memcpy(share, room, whole_rows * TILE * sizeof(float));
       else
         spread(C, b.rows.data(), kernel, share);
       if (border) spread(C + 2, b.rows.data(), kernel, seen);
       // colour = light / room, coverage = share / room; where not all light was seen, the colour of what was, fading
       // out with the last of it
-      for (int i = 0; i < TILE_PIXELS; i += LANES) {
+      for (int i = 0; i < whole_rows * TILE; i += LANES) {
         const vec all_room = load<vec>(room + i), its_share = load<vec>(share + i), one = all(1.0f);
         const vec per_room = one / most(all_room, all(LEAST));
         vec gain = per_room, cover = its_share;
@@ -698,33 +719,49 @@ class Composite {
     for (int r = y0 / s / TILE; r <= r1; r++)
       for (int c = x0 / s / TILE; c <= c1; c++) any |= run.used[r * run.tile_columns + c];
     if (!any) return;
-    const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s;
-    std::vector<float> lines(count), values((size_t)channels * TILE);
+    const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s, pitch = TILE + 32;
+    std::vector<float> lines((size_t)channels * count), planes((size_t)channels * pitch);
+    float *const values = planes.data() + s / 2;  // between two samples the first value lies half a sample behind
+    float ramp[16];
+    for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
     for (int y = 0; y < TILE; y++) {
       const float at_y = (y0 + y + 0.5f) / s + 0.5f;
       const int row = std::min((int)at_y, run.rows - 2);
       const float down = at_y - row;
-      for (int c = 0; c < channels; c++) {
-        const float *upper = &run.canvas[((size_t)c * run.rows + row) * run.columns], *lower = upper + run.columns;
-        float *line = lines.data(), *v = &values[(size_t)c * TILE];
-        const int inside = std::min(count, run.columns - first);
-        for (int i = 0; i < inside; i++) line[i] = upper[first + i] + down * (lower[first + i] - upper[first + i]);
-        for (int i = std::max(inside, 0); i < count; i++) line[i] = 0;
-        for (int phase = 0; phase < s; phase++) {
-          const float at_x = (phase + 0.5f) / s + 0.5f;
-          const float *from = line + (int)at_x;
-          const float across = at_x - (int)at_x;
-          for (int i = 0; i < TILE / s; i++) v[i * s + phase] = from[i] + across * (from[i + 1] - from[i]);
-        }
+      const int inside = std::max(std::min(count, run.columns - first), 0);
+      bool covered = false;
+      for (int c = channels - 1; c >= 0; c--) {
+        const float *upper = &run.canvas[((size_t)c * run.rows + row) * run.columns + first], *lower = upper + run.columns;
+        float *line = &lines[(size_t)c * count];
+        for (int i = 0; i < inside; i++) line[i] = upper[i] + down * (lower[i] - upper[i]);
+        if (c >= C_)
+          for (int i = 0; i < inside; i++) covered |= line[i] > 0;
+        else if (!covered)
+          break;
+        float *v = &planes[(size_t)c * pitch];
+        if (s == 2)
+          for (int i = 0; i + 1 < count; i++, v += 2) {
+            const float step = line[i + 1] - line[i];
+            v[0] = line[i] + 0.25f * step;
+            v[1] = line[i] + 0.75f * step;
+          }
+        else
+          for (int i = 0; i + 1 < count; i++)
+            for (int part = 0; part < s; part += 4, v += 4) {
+              typedef float f4 __attribute__((vector_size(16)));
+              const f4 from = f4{} + line[i], step = f4{} + (line[i + 1] - line[i]);
+              store(v, from + step * load<f4>(ramp + part));
+            }
       }
+      if (!covered) continue;
       for (int e = 0; e < E_; e++) {
-        const float *cover = &values[(size_t)(C_ + e) * TILE];
+        const float *cover = values + (size_t)(C_ + e) * pitch;
         for (int x = 0; x < TILE; x += LANES) {
           const vec left = over_ ? most(all(1.0f) - load<vec>(cover + x), vec{}) : all(1.0f);
           for (int c = 0; c < channels; c++) {
             if (c < C_ ? E_ > 1 && c != e : c != C_ + e) continue;
             float *canvas = b.canvas[c] + y * TILE + x;
-            store(canvas, load<vec>(&values[(size_t)c * TILE + x]) + left * load<vec>(canvas));
+            store(canvas, load<vec>(values + (size_t)c * pitch + x) + left * load<vec>(canvas));
           }
         }
       }
@@ -752,8 +789,8 @@ class Composite {
       single = look_around(y0, x0, ceil_div(halo, CELL), b);
       std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
       float *known = b.known;
-      for (int y = y0 - halo; y < y0 + TILE + halo; y++) {
-        read_row(y, x0 - halo, TILE + 2 * halo, single, light.data(), coc.data(), weight.data(), known, b);
+      for (int y = y0 - halo; y < y0 + rows + halo; y++) {
+        read_row(y, x0 - halo, columns + 2 * halo, single, light.data(), coc.data(), weight.data(), known, b);
         for (auto *v : {&light, &coc, &weight})
           for (float *&row : *v) row += pitch_;
         known += pitch_;
@@ -770,8 +807,8 @@ class Composite {
       }
       for (; next < reaching.size() && reaching[next] >= run.first; next++) {
         const Layer &l = layers_[reaching[next]];
-        const int spare = halo - l.half, side = TILE + 2 * l.half;
-        for (int y = 0; y < side; y++) {
+        const int spare = halo - l.half, width = columns + 2 * l.half;
+        for (int y = 0; y < rows + 2 * l.half; y++) {
           const size_t from = (size_t)(y + spare) * pitch_ + spare, to = (size_t)y * pitch_;
           for (int i = 0; i < s_.count; i++) {
             for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + from;
@@ -779,11 +816,11 @@ class Composite {
             weight[i] = b.weight[i] + from;
           }
           for (int c = 0; c < C_ + 3; c++) term[c] = b.term[c] + to;
-          row_terms(l, side, single, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
+          row_terms(l, width, single, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
           if (border)
-            for (int x = 0; x < side; x++) term[C_ + 2][x] = term[C_][x] * b.known[from + x];
+            for (int x = 0; x < width; x += LANES) store(term[C_ + 2] + x, load<vec>(term[C_] + x) * load<vec>(b.known + from + x));
         }
-        lay(b, l, side, 0, border);
+        lay(b, l, rows, columns, 0, border);
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);

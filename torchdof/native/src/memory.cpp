@@ -9,7 +9,7 @@
 namespace torchdof {
 namespace {
 
-constexpr size_t KEPT_BYTES = size_t(128) << 20;  // in all
+constexpr size_t KEPT_BYTES = size_t(192) << 20;  // in all
 constexpr size_t LEAST_BYTES = size_t(64) << 10;  // less is malloc's own business
 constexpr size_t HEADER = 64;
 
