@@ -36,7 +36,14 @@ struct Run {
 // 2 (channels + 2) sums: share, seen share and light; and these times how far between the nodes each pixel lies.
 struct Pieces {
   std::vector<int> at, node, order;
-  std::vector<float> values;
+  std::vector<float> values;  // of more pieces than there are
+  int count = 0;
+  float *add(int place, int after, int stride) {
+    if ((size_t)(count + 1) * stride > values.size()) values.resize(std::max<size_t>(values.size() * 2, 4096 * stride));
+    at.push_back(place);
+    node.push_back(after);
+    return values.data() + (size_t)count++ * stride;
+  }
 };
 
 // Planes of a window, `pitch` values a row.
@@ -85,7 +92,7 @@ class Composite {
       }
     }
     window_ = TILE + 2 * half;
-    pitch_ = (window_ + 15) / 16 * 16 + 16;
+    pitch_ = (window_ + 15) / 16 * 16 + 3 * BLOCK;  // rows are read in whole blocks
     scratches_.resize(std::max(1, job_.scene.threads));
     index();
     std::vector<std::pair<int, int>> coarse;  // run and tile
@@ -191,6 +198,25 @@ class Composite {
               for (int y = row * CELL; y < std::min(H_, (row + 1) * CELL); y++) {
                 if (!s_.row(i, y, x0, light.data(), coc, weight)) break;
                 if (i && !weight) single = false;
+                if (n == CELL) {
+                  vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = all(weight ? 0.0f : 1.0f);
+                  for (int x = 0; x < CELL; x += LANES, count += LANES) {
+                    const vec place = axis(load<vec>(coc + x), low_, high_);
+                    store(places + count, place);
+                    lows = least(lows, place);
+                    highs = most(highs, place);
+                    if (weight) {
+                      least_weight = least(least_weight, load<vec>(weight + x));
+                      most_weight = most(most_weight, load<vec>(weight + x));
+                    }
+                    for (int lane = 0; lane < LANES; lane++) there[count + lane] = !weight || weight[x + lane] != 0;
+                  }
+                  low = std::min(low, smallest(lows));
+                  high = std::max(high, largest(highs));
+                  if (i ? largest(most_weight) != 0 : smallest(least_weight) < 1) single = false;
+                  any |= largest(most_weight) != 0;
+                  continue;
+                }
                 for (int x = 0; x < n; x++, count++) {
                   const float w = weight ? weight[x] : 1.0f;
                   if (weight && (i ? w != 0 : w < 1)) single = false;
@@ -286,7 +312,7 @@ class Composite {
     Pieces &p = b.pieces;
     p.at.clear();
     p.node.clear();
-    p.values.clear();
+    p.count = 0;
     std::vector<float> sums(stride);
     for (int by = 0; by < height; by++) memset(b.rest + (size_t)by * pitch_, 0, width * sizeof(float));
     for (int by = 0; by < height; by++)
@@ -335,10 +361,7 @@ class Composite {
                 b.rest[place] += sum * each;
                 continue;
               }
-              p.at.push_back(place);
-              p.node.push_back(k - run.first + 1);
-              p.values.resize(p.values.size() + stride);
-              float *to = p.values.data() + p.values.size() - stride;
+              float *to = p.add(place, k - run.first + 1, stride);
               if (weight)
                 sum_block<CHANNELS, true>(light, light_step, coc, coc_step, weight, s, k, to);
               else
@@ -349,9 +372,7 @@ class Composite {
           int node = -1;
           auto flush = [&] {
             if (node < 0) return;
-            p.at.push_back(place);
-            p.node.push_back(node - run.first + 1);
-            p.values.insert(p.values.end(), sums.begin(), sums.end());
+            memcpy(p.add(place, node - run.first + 1, stride), sums.data(), stride * sizeof(float));
           };
           for (int y = 0; y < rows; y++) {
             const int at_y = std::clamp(y0 + y, 0, H_ - 1);
@@ -396,7 +417,7 @@ class Composite {
         }
       }
     // sorted by node
-    const int pieces = (int)p.at.size();
+    const int pieces = p.count;
     p.order.assign(L + 2 + pieces, 0);
     for (int node : p.node) p.order[node + 1]++;
     for (int i = 0; i <= L; i++) p.order[i + 1] += p.order[i];
@@ -419,20 +440,26 @@ class Composite {
     typedef float f4 __attribute__((vector_size(16)));
     const float node = layers_[k].at, per_after = layers_[k].per_after;
     f4 share = {}, part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
-    auto read = [&](const float *from) { return s == 2 ? f4{from[0], from[1], 0, 0} : load<f4>(from); };
-    const f4 there = s == 2 ? f4{1, 1, 0, 0} : f4{1, 1, 1, 1};
-    for (int y = 0; y < s; y++)
-      for (int x = 0; x < s; x += 4) {
-        const f4 w = WEIGHTED ? read(weight + y * light_step + x) : there;
-        const f4 part = (axis4(read(coc + y * coc_step + x)) - node) * per_after * w;
-        share += w;
-        part_sum += part;
-        for (int c = 0; c < CHANNELS; c++) {
-          const f4 v = read(light[c] + y * light_step + x);
-          one[c] += v * w;
-          two[c] += v * part;
-        }
+    auto add = [&](const f4 w, const f4 at, auto light_at) {
+      const f4 part = (axis4(at) - node) * per_after * w;
+      share += w;
+      part_sum += part;
+      for (int c = 0; c < CHANNELS; c++) {
+        const f4 v = light_at(light[c]);
+        one[c] += v * w;
+        two[c] += v * part;
       }
+    };
+    const f4 whole = {1, 1, 1, 1};
+    if (s == 2) {
+      auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
+      add(WEIGHTED ? four(weight, light_step) : whole, four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
+    } else {
+      for (int y = 0; y < s; y++)
+        for (int x = 0; x < s; x += 4)
+          add(WEIGHTED ? load<f4>(weight + y * light_step + x) : whole, load<f4>(coc + y * coc_step + x),
+              [&](const float *from) { return load<f4>(from + y * light_step + x); });
+    }
     auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
     out[0] = out[1] = sum(share);
     out[CHANNELS + 2] = out[CHANNELS + 3] = sum(part_sum);
@@ -785,12 +812,15 @@ class Composite {
     }
     const bool border = !extend_ && (y0 < halo || x0 < halo || y0 + TILE + halo > H_ || x0 + TILE + halo > W_);
     bool single = false;
+    int left = x0;  // where rows begin
     if (!reaching.empty()) {
       single = look_around(y0, x0, ceil_div(halo, CELL), b);
       std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
       float *known = b.known;
+      left = floor_div(x0 - halo, BLOCK) * BLOCK;
+      const int across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
       for (int y = y0 - halo; y < y0 + rows + halo; y++) {
-        read_row(y, x0 - halo, columns + 2 * halo, single, light.data(), coc.data(), weight.data(), known, b);
+        read_row(y, left, across, single, light.data(), coc.data(), weight.data(), known, b);
         for (auto *v : {&light, &coc, &weight})
           for (float *&row : *v) row += pitch_;
         known += pitch_;
@@ -809,7 +839,7 @@ class Composite {
         const Layer &l = layers_[reaching[next]];
         const int spare = halo - l.half, width = columns + 2 * l.half;
         for (int y = 0; y < rows + 2 * l.half; y++) {
-          const size_t from = (size_t)(y + spare) * pitch_ + spare, to = (size_t)y * pitch_;
+          const size_t from = (size_t)(y + spare) * pitch_ + x0 - l.half - left, to = (size_t)y * pitch_;
           for (int i = 0; i < s_.count; i++) {
             for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + from;
             coc[i] = b.coc[i] + from;

@@ -142,95 +142,110 @@ class Filling {
   void finest(int band) {
     const int H = job_.height, W = job_.width, C = C_, y_end = std::min(area_height_, (band + 1) * BLOCK);
     const Level &level = pyramid_[0];
-    for (int y = band * BLOCK; y < y_end; y++)
-      if (y % cell_ == 0)
-        for (int x = 0; x < cell_columns_; x++) {
-          near_[y / cell_ * cell_columns_ + x] = NEVER;
-          blur_[y / cell_ * cell_columns_ + x] = 0;
-        }
-    std::vector<float> children(4 * stride_);
-    const float *child[4];
-    for (int i = 0; i < 4; i++) child[i] = children.data() + i * stride_;
+    std::vector<float> rows((size_t)2 * (C + 2) * BLOCK);
     for (int bx = 0; bx * BLOCK < area_width_; bx++) {
-      const int x_end = std::min(area_width_, (bx + 1) * BLOCK);
-      const bool inside = y_end <= H && x_end <= W && y_end == (band + 1) * BLOCK && x_end == (bx + 1) * BLOCK;
-      const int which = inside ? band * s_.block_columns + bx : 0;
-      const bool plain = inside && !s_.has_block(which) && job_.block_high[which] - job_.block_low[which] < BEHIND_PX &&
-                         !(job_.block_peak[which] > least_threshold(job_, band * BLOCK, bx * BLOCK));
-      if (plain) {
-        means(band * BLOCK, bx * BLOCK);
-        for (int y = band * BLOCK; y < y_end; y += cell_)
-          for (int x = bx * BLOCK; x < x_end; x += cell_) {
-            const size_t cell = (size_t)(y / cell_) * cell_columns_ + x / cell_;
-            near_[cell] = job_.block_low[which];
-            blur_[cell] = std::max(std::fabs(job_.block_low[which]), std::fabs(job_.block_high[which]));
-          }
-        continue;
-      }
-      const float limit = least_threshold(job_, std::min(band * BLOCK, H - 1) / BLOCK * BLOCK, std::min(bx * BLOCK, W - 1) / BLOCK * BLOCK);
-      for (int y = band * BLOCK; y < y_end; y += 2)
-        for (int x = bx * BLOCK; x < x_end; x += 2) {
-          float *out = level.at(y / 2, x / 2);
-          float &near = near_[y / cell_ * cell_columns_ + x / cell_], &blur = blur_[y / cell_ * cell_columns_ + x / cell_];
-          for (int i = 0; i < 4; i++) {
-            const int py = std::min(y + i / 2, H - 1), px = std::min(x + i % 2, W - 1);
-            float *v = children.data() + i * stride_;
-            pixel(py, px, limit, v);
-            const float coc = s_.coc[(size_t)py * W + px];
-            near = std::min(near, coc);
-            blur = std::max(blur, std::fabs(coc));
-          }
-          farthest(child, C, stride_, out);
+      const int x0 = bx * BLOCK, x_end = std::min(area_width_, x0 + BLOCK);
+      const bool inside = y_end <= H && x_end <= W && y_end == (band + 1) * BLOCK && x_end == x0 + BLOCK;
+      const int which = std::min(band, s_.block_rows - 1) * s_.block_columns + std::min(bx, s_.block_columns - 1);
+      const float limit = least_threshold(job_, which / s_.block_columns * BLOCK, which % s_.block_columns * BLOCK);
+      const bool own = s_.has_block(which), bright = own || job_.block_peak[which] > limit;
+      const float low = job_.block_low[which], high = job_.block_high[which];
+      for (int y = band * BLOCK; y < y_end; y += cell_)
+        for (int x = x0; x < x_end; x += cell_) {
+          const size_t cell = (size_t)(y / cell_) * cell_columns_ + x / cell_;
+          near_[cell] = low;  // none too far: it only tells where to look
+          blur_[cell] = std::max(std::fabs(low), std::fabs(high));
         }
-    }
-  }
-
-  // A block of the first level where all four children count.
-  void means(int y0, int x0) {
-    constexpr int HALF = BLOCK / 2;
-    const int W = job_.width;
-    std::vector<const float *> planes(C_ + 1);
-    for (int c = 0; c <= C_; c++) planes[c] = (c < C_ ? s_.light + c * s_.area() : s_.coc) + (size_t)y0 * W + x0;
-    for (int y = 0; y < BLOCK; y += 2) {
-      float *out = pyramid_[0].at((y0 + y) / 2, x0 / 2);
-      for (int c = 0; c <= C_; c++) {
-        const float *upper = planes[c] + (size_t)y * W, *lower = upper + W;
-        float sums[BLOCK];
-        for (int x = 0; x < BLOCK; x += LANES)
-          store(sums + x, all(0.25f) * load<vec>(upper + x) + all(0.25f) * load<vec>(lower + x));
-        for (int x = 0; x < HALF; x++) out[x * stride_ + c] = sums[2 * x] + sums[2 * x + 1];
-      }
-      for (int x = 0; x < HALF; x++) {
-        out[x * stride_ + C_ + 1] = 1.0f;
-        for (int c = C_ + 2; c < stride_; c++) out[x * stride_ + c] = 0;
+      for (int y = band * BLOCK; y < y_end; y += 2) {
+        for (int i = 0; i < 2; i++)
+          pixels(std::min(y + i, H - 1), x0, x_end - x0, inside, bright, limit, rows.data() + (size_t)i * (C + 2) * BLOCK);
+        farthest_of_rows(rows.data(), x_end - x0, level.at(y / 2, x0 / 2));
       }
     }
   }
 
-  // Light, coc and weight of the surface that a pixel gives to the pyramid: of two the farther one.
-  void pixel(int y, int x, float least_limit, float *out) const {
-    const size_t at = (size_t)y * job_.width + x, area = s_.area();
-    const int which = y / BLOCK * s_.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK, C = C_;
-    out[C] = s_.coc[at];
-    out[C + 1] = 1.0f;
-    if (s_.has_block(which)) {
-      const Block b = s_.block(which);
-      const float valid = s_.valid ? s_.valid[at] : 1.0f;
-      const bool mixed = b.weight[within] > MIXED && b.coc[within] > out[C];
-      for (int c = 0; c < C; c++) out[c] = (mixed ? b.other : b.own)[c * BLOCK_PIXELS + within];
-      if (mixed) out[C] = b.coc[within];
-      out[C + 1] = mixed ? b.weight[within] : b.seen[within];
-      if (!(valid > 0)) out[C] = -NEVER;
+  // Light, coc and weight [channels + 2, BLOCK] of the surfaces that pixels of a row give to the pyramid: of two the
+  // farther one.
+  void pixels(int y, int x0, int n, bool inside, bool bright, float least_limit, float *out) const {
+    const size_t area = s_.area(), row = (size_t)y * job_.width;
+    const int C = C_, whole = y / BLOCK * s_.block_columns + x0 / BLOCK;
+    float *coc = out + C * BLOCK, *weight = coc + BLOCK;
+    if (inside && !s_.has_block(whole)) {
+      for (int c = 0; c < C; c++) memcpy(out + c * BLOCK, s_.light + c * area + row + x0, BLOCK * sizeof(float));
+      memcpy(coc, s_.coc + row + x0, BLOCK * sizeof(float));
+      for (int i = 0; i < BLOCK; i++) weight[i] = 1.0f;
+    } else if (inside && !s_.valid) {
+      const Block b = s_.block(whole);
+      const int first = y % BLOCK * BLOCK;
+      const float *own_coc = s_.coc + row + x0, *other_coc = b.coc + first, *share = b.weight + first, *seen = b.seen + first;
+      for (int x = 0; x < BLOCK; x += LANES) {
+        const vec its = load<vec>(other_coc + x), mine = load<vec>(own_coc + x), s = load<vec>(share + x);
+        const auto mixed = (s > all(MIXED)) & (its > mine);
+        store(coc + x, mixed ? its : mine);
+        store(weight + x, mixed ? s : load<vec>(seen + x));
+        for (int c = 0; c < C; c++)
+          store(out + c * BLOCK + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x) : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
+      }
     } else {
-      for (int c = 0; c < C; c++) out[c] = s_.light[c * area + at];
+      for (int i = 0; i < n; i++) {
+        const int x = std::min(x0 + i, job_.width - 1), which = y / BLOCK * s_.block_columns + x / BLOCK;
+        const size_t at = row + x;
+        coc[i] = s_.coc[at];
+        weight[i] = 1.0f;
+        if (s_.has_block(which)) {
+          const int within = y % BLOCK * BLOCK + x % BLOCK;
+          const Block b = s_.block(which);
+          const bool mixed = b.weight[within] > MIXED && b.coc[within] > coc[i];
+          for (int c = 0; c < C; c++) out[c * BLOCK + i] = (mixed ? b.other : b.own)[c * BLOCK_PIXELS + within];
+          weight[i] = mixed ? b.weight[within] : b.seen[within];
+          if (mixed) coc[i] = b.coc[within];
+          if (s_.valid && !(s_.valid[at] > 0)) coc[i] = -NEVER;
+        } else {
+          for (int c = 0; c < C; c++) out[c * BLOCK + i] = s_.light[c * area + at];
+        }
+      }
     }
-    float most = out[0];
-    for (int c = 1; c < C; c++) most = std::max(most, out[c]);
-    if (!(most > least_limit)) return;
-    float limit, step;
-    threshold_row(job_, y, x, limit, step);
-    if (most > limit)  // what is hidden beside a highlight is none
-      for (int c = 0; c < C; c++) out[c] *= limit / most;
+    if (!bright) return;
+    for (int i = 0; i < n; i++) {
+      float most = out[i];
+      for (int c = 1; c < C; c++) most = std::max(most, out[c * BLOCK + i]);
+      if (!(most > least_limit)) continue;
+      float limit, step;
+      threshold_row(job_, y, std::min(x0 + i, job_.width - 1), limit, step);
+      if (most > limit)  // what is hidden beside a highlight is none
+        for (int c = 0; c < C; c++) out[c * BLOCK + i] *= limit / most;
+    }
+  }
+
+  // Of the four pixels of two rows that are one in the first level, the mean of those that are farthest.
+  void farthest_of_rows(const float *rows, int n, float *out) const {
+    constexpr int HALF = BLOCK / 2;
+    const int C = C_;
+    const size_t plane = BLOCK, line = (size_t)(C + 2) * BLOCK;
+    float counts[4][HALF], each[HALF], total[HALF];
+    const float *coc = rows + C * plane, *weight = coc + plane;
+    auto child = [&](const float *of, int i, int x) { return of[(i / 2) * line + 2 * x + i % 2]; };
+    for (int x = 0; x < n / 2; x++) {
+      const float a = child(coc, 0, x), b = child(coc, 1, x), c = child(coc, 2, x), d = child(coc, 3, x);
+      const float most = std::max(std::max(a, b), std::max(c, d)) - BEHIND_PX;
+      counts[0][x] = a > most ? child(weight, 0, x) : 0.0f;
+      counts[1][x] = b > most ? child(weight, 1, x) : 0.0f;
+      counts[2][x] = c > most ? child(weight, 2, x) : 0.0f;
+      counts[3][x] = d > most ? child(weight, 3, x) : 0.0f;
+      total[x] = 0.25f * ((counts[0][x] + counts[1][x]) + (counts[2][x] + counts[3][x]));
+      each[x] = 0.25f / std::max(total[x], 1e-9f);
+    }
+    for (int k = 0; k <= C; k++) {
+      const float *of = rows + k * plane;
+      for (int x = 0; x < n / 2; x++)
+        out[x * stride_ + k] = each[x] * ((child(of, 0, x) * counts[0][x] + child(of, 1, x) * counts[1][x]) +
+                                          (child(of, 2, x) * counts[2][x] + child(of, 3, x) * counts[3][x]));
+    }
+    for (int x = 0; x < n / 2; x++) {
+      if (!(total[x] > 0)) out[x * stride_ + C] = -NEVER;
+      out[x * stride_ + C + 1] = total[x];
+      for (int k = C + 2; k < stride_; k++) out[x * stride_ + k] = 0;
+    }
   }
 
   void coarser(int i, int band) {

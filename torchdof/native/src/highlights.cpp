@@ -242,10 +242,41 @@ Visibility look_at(const Job &job) {
   return v;
 }
 
+// Adds how much of the rays of a row that land n pixels from column x on is taken by surfaces at a place.
+static void add_blocked(const Job &job, const Ray &ray, float place, int y, int x, int n, float *blocked) {
+  constexpr int LONGEST = 256;
+  const int H = job.height, W = job.width;
+  const float *coc = job.surfaces.coc;
+  const float along = 1.0f - place / ray.coc;
+  const float at_y = clamp(ray.row + (y - ray.row) * along, 0.0f, H - 1.0f);
+  const int row = std::min((int)at_y, std::max(0, H - 2));
+  const float down = at_y - row;
+  const float *upper = coc + (size_t)row * W, *lower = upper + (H > 1 ? W : 0);
+  auto column_of = [&](int i) { return clamp(ray.column + (x + i - ray.column) * along, 0.0f, W - 1.0f); };
+  auto share = [&](int column) {
+    const float a = std::max(1.0f - std::fabs(upper[column] - place), 0.0f), b = std::max(1.0f - std::fabs(lower[column] - place), 0.0f);
+    return a + down * (b - a);
+  };
+  const float ends[2] = {column_of(0), column_of(n - 1)};
+  const int first = (int)std::min(ends[0], ends[1]), last = std::min((int)std::max(ends[0], ends[1]) + 1, W - 1);
+  float shares[LONGEST];
+  const bool few = last - first + 2 <= LONGEST;  // columns that the row of rays meets
+  if (few) {
+    for (int i = 0; i <= last - first; i++) shares[i] = share(first + i);
+    shares[last - first + 1] = shares[last - first];
+  }
+  for (int i = 0; i < n; i++) {
+    const float at_x = column_of(i);
+    const int column = (int)at_x;
+    const float across = at_x - column;
+    const float a = few ? shares[column - first] : share(column), b = few ? shares[column - first + 1] : share(std::min(column + 1, W - 1));
+    blocked[i] += a + across * (b - a);
+  }
+}
+
 void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const float *const *kernels,
            const int32_t *halves, float *tile) {
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
-  const float *coc = job.surfaces.coc;
   const int bins = (int)v.present.size();
   std::vector<int> nearer(bins);
   for (int r = 0; r < count; r++) {
@@ -278,30 +309,13 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             if (classes & ((2ull << last) - (1ull << first))) nearer[m++] = k;
           }
         for (int y = py; y < py + ny; y++) {
-          float passes[PATCH], blocked[PATCH] = {};
-          for (int i = 0; i < m; i++) {
-            const float place = v.low + nearer[i], along = 1.0f - place / ray.coc;
-            const float at_y = clamp(ray.row + (y - ray.row) * along, 0.0f, H - 1.0f);
-            const int row = std::min((int)at_y, std::max(0, H - 2));
-            const float down = at_y - row;
-            const float *upper = coc + (size_t)row * W, *lower = upper + (H > 1 ? W : 0);
-            const int beside = W > 1;
-            for (int x = 0; x < PATCH; x++) {
-              const float at_x = std::min(std::max(ray.column + (px + x - ray.column) * along, 0.0f), W - 1.0f);
-              const int column = std::min((int)at_x, std::max(0, W - 2));
-              const float across = at_x - column;
-              const float a = std::max(1.0f - std::fabs(upper[column] - place), 0.0f), b = std::max(1.0f - std::fabs(upper[column + beside] - place), 0.0f);
-              const float c = std::max(1.0f - std::fabs(lower[column] - place), 0.0f), d = std::max(1.0f - std::fabs(lower[column + beside] - place), 0.0f);
-              const float u = a + across * (b - a), w = c + across * (d - c);
-              blocked[x] += u + down * (w - u);
-            }
-          }
-          for (int x = 0; x < PATCH; x++) passes[x] = 1.0f - std::min(blocked[x], 1.0f);
           const size_t tap = (size_t)(y - ray.row + half) * side + (px - ray.column + half);
+          float blocked[PATCH] = {};
+          for (int i = 0; i < m; i++) add_blocked(job, ray, v.low + nearer[i], y, px, nx, blocked);
           for (int c = 0; c < C; c++) {
             const float *taps = kernel + (E > 1 ? (size_t)c * side * side : 0) + tap;
             float *to = tile + (size_t)c * TILE * TILE + (y - y0) * TILE + (px - x0);
-            for (int x = 0; x < nx; x++) to[x] += taps[x] * passes[x] * light[c];
+            for (int x = 0; x < nx; x++) to[x] += taps[x] * (1.0f - std::min(blocked[x], 1.0f)) * light[c];
           }
         }
       }
