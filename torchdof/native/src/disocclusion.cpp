@@ -131,8 +131,13 @@ class Filling {
     found_.resize(near_.size());
     fine_.resize(near_.size());
     job_.parallel(area_height_ / BLOCK + (area_height_ % BLOCK != 0), [&](int band, int) { finest(band); });
-    for (int i = 1; i < levels; i++)
-      job_.parallel(ceil_div(pyramid_[i].height, 8), [&](int band, int) { coarser(i, band); });
+    for (int i = 1; i < levels; i++) {
+      const int bands = ceil_div(pyramid_[i].height, 8);
+      if (i == 1)
+        job_.parallel(bands, [&](int band, int) { coarser(i, band); });
+      else  // too little to wait for each other
+        for (int band = 0; band < bands; band++) coarser(i, band);
+    }
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
     if (stride_ == 8) fill<2>(); else fill<0>();
   }

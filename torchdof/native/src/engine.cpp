@@ -28,6 +28,24 @@ Job::Job(const torchdof_scene &scene)
   }
 }
 
+// Least and largest of a block of values, where they are beyond those known.
+static void ends_of(const float *values, int pitch, int rows, int columns, float &low, float &high) {
+  vec lows = all(low), highs = all(high);
+  for (int y = 0; y < rows; y++, values += pitch) {
+    int x = 0;
+    for (; x + LANES <= columns; x += LANES) {
+      lows = least(load<vec>(values + x), lows);
+      highs = most(load<vec>(values + x), highs);
+    }
+    for (; x < columns; x++) {
+      low = std::min(low, values[x]);
+      high = std::max(high, values[x]);
+    }
+  }
+  low = std::min(low, smallest(lows));
+  high = std::max(high, largest(highs));
+}
+
 // What is given, without what is not finite, and within reach of the layers.
 void Job::take_scene() {
   surfaces.height = height;
@@ -79,28 +97,20 @@ void Job::take_scene() {
     surfaces.light = clean_light.data();
     surfaces.coc = clean_coc.data();
   }
+  block_peak = Buffer<float>(surfaces.blocks.size());
   auto find_ends = [&] {
     parallel(surfaces.block_rows, [&](int by, int) {
       for (int bx = 0; bx < surfaces.block_columns; bx++) {
-        const int y0 = by * BLOCK, x0 = bx * BLOCK, columns = std::min(BLOCK, width - x0);
-        vec low_lanes = all(NEVER), high_lanes = all(-NEVER);
-        float block_least = NEVER, block_most = -NEVER;
-        for (int y = y0; y < std::min(height, y0 + BLOCK); y++) {
-          const float *coc = surfaces.coc + (size_t)y * width + x0;
-          if (columns == BLOCK)
-            for (int x = 0; x < BLOCK; x += LANES) {
-              low_lanes = least(load<vec>(coc + x), low_lanes);
-              high_lanes = most(load<vec>(coc + x), high_lanes);
-            }
-          else
-            for (int x = 0; x < columns; x++) {
-              block_least = std::min(block_least, coc[x]);
-              block_most = std::max(block_most, coc[x]);
-            }
-        }
+        const int y0 = by * BLOCK, x0 = bx * BLOCK, rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
+        const size_t at = (size_t)y0 * width + x0;
+        float block_least = NEVER, block_most = -NEVER, peak = -INFINITY;
+        ends_of(surfaces.coc + at, width, rows, columns, block_least, block_most);
+        float dimmest = INFINITY;
+        for (int c = 0; c < channels; c++) ends_of(surfaces.light + c * area + at, width, rows, columns, dimmest, peak);
         const int block = by * surfaces.block_columns + bx;
-        block_low[block] = block_least = std::min(block_least, smallest(low_lanes));
-        block_high[block] = block_most = std::max(block_most, largest(high_lanes));
+        block_low[block] = block_least;
+        block_high[block] = block_most;
+        block_peak[block] = peak;
         if (block_least < low || block_most > high) beyond[by] = 1;
       }
     });
@@ -126,32 +136,11 @@ void Job::take_scene() {
     }
 }
 
-void Job::find_peaks() {
-  block_peak = Buffer<float>(surfaces.blocks.size());
-  parallel(surfaces.block_rows, [&](int by, int) {
-    for (int bx = 0; bx < surfaces.block_columns; bx++) {
-      const int y0 = by * BLOCK, x0 = bx * BLOCK, columns = std::min(BLOCK, width - x0);
-      vec peak_lanes = all(-INFINITY);
-      float peak = -INFINITY;
-      for (int c = 0; c < channels; c++)
-        for (int y = y0; y < std::min(height, y0 + BLOCK); y++) {
-          const float *light = surfaces.light + c * surfaces.area() + (size_t)y * width + x0;
-          if (columns == BLOCK)
-            for (int x = 0; x < BLOCK; x += LANES) peak_lanes = most(load<vec>(light + x), peak_lanes);
-          else
-            for (int x = 0; x < columns; x++) peak = std::max(peak, light[x]);
-        }
-      block_peak[by * surfaces.block_columns + bx] = std::max(peak, largest(peak_lanes));
-    }
-  });
-}
-
 void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
   const bool several = layers.size() > 1, background = scene.kind == TORCHDOF_BACKGROUND;
   bool bright = scene.occlusion;
-  if (several) find_peaks();
   if (several && !scene.occlusion && scene.highlights) {  // coarse layers soften what is brighter than a display shows
     float reach = 0;
     for (const Layer &l : layers) reach = std::max(reach, std::fabs(coc_at(l.node)));

@@ -165,7 +165,6 @@ struct Job {
 
  private:
   void take_scene();
-  void find_peaks();
   void find_threshold();                  // highlights.cpp
   void split_mixed();                     // matting.cpp
   void fill_hidden();                     // disocclusion.cpp

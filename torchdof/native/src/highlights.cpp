@@ -99,19 +99,21 @@ void Job::extract_highlights() {
     farthest = std::max(farthest, block_high[i]);
     first_nearest = std::min(first_nearest, block_low[i]);
   }
-  for (int i = 0; i < surfaces.count; i++) {
-    // bright pixels of this surface
-    std::vector<std::vector<Candidate>> bands(surfaces.block_rows);
-    parallel(surfaces.block_rows, [&](int by, int) {
-      std::vector<const float *> light(channels);
-      const float *coc, *weight;
-      for (int bx = 0; bx < surfaces.block_columns; bx++) {
-        const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
-        if (!surfaces.whole() && !surfaces.has_block(block) && !(block_peak[block] > least_threshold(*this, by * BLOCK, x0))) continue;
-        for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
+  // bright pixels of each surface
+  const int count = surfaces.count;
+  std::vector<std::vector<Candidate>> bands((size_t)surfaces.block_rows * count);
+  parallel(surfaces.block_rows, [&](int by, int) {
+    std::vector<const float *> light(channels);
+    const float *coc, *weight;
+    for (int bx = 0; bx < surfaces.block_columns; bx++) {
+      const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
+      if (!surfaces.whole() && !surfaces.has_block(block) && !(block_peak[block] > least_threshold(*this, by * BLOCK, x0))) continue;
+      for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
+        float first, step;
+        threshold_row(*this, y, x0, first, step);
+        for (int i = 0; i < count; i++) {
           if (!surfaces.row(i, y, x0, light.data(), coc, weight)) continue;
-          float first, step, most[BLOCK];
-          threshold_row(*this, y, x0, first, step);
+          float most[BLOCK];
           for (int x = 0; x < n; x++) most[x] = light[0][x];
           for (int c = 1; c < channels; c++)
             for (int x = 0; x < n; x++) most[x] = std::max(most[x], light[c][x]);
@@ -121,13 +123,18 @@ void Job::extract_highlights() {
           for (int x = 0; x < n; x++) {
             const float limit = first + step * x;
             if (!(most[x] > limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > 1.0f)) continue;
-            bands[by].push_back({y, x0 + x, most[x], coc[x], limit});
+            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, most[x], coc[x], limit});
           }
         }
       }
-    });
+    }
+  });
+  for (int i = 0; i < count; i++) {
     std::vector<Candidate> all;
-    for (const auto &band : bands) all.insert(all.end(), band.begin(), band.end());
+    for (int by = 0; by < surfaces.block_rows; by++) {
+      const auto &band = bands[(size_t)i * surfaces.block_rows + by];
+      all.insert(all.end(), band.begin(), band.end());
+    }
     if (all.empty()) continue;
     if (occlusion && nearest_around.empty()) {
       std::vector<float> cells((size_t)rows * columns, NEVER);
