@@ -164,7 +164,7 @@ def render(
         torch.get_num_threads(),
         ctypes.pointer(cancelled),
     )
-    out = torch.empty(channels, height, width)
+    out = torch.empty(channels, height, width, dtype=torch.float32, device="cpu")
 
     def run() -> None:
         engine, job = _engine(), ctypes.c_void_p()

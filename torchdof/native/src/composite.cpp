@@ -156,7 +156,7 @@ class Composite {
     }
     const float scale = reach > 0 ? (float)(STEPS / reach) : 0.0f;
     auto node_before = [&](float place) {
-      int k = start[(int)((place - low_) * scale)];
+      int k = start[std::clamp((int)((place - low_) * scale), 0, STEPS)];
       while (k + 1 < N_ && place >= layers_[k + 1].at) k++;
       return k;
     };
@@ -902,16 +902,19 @@ class Composite {
     for (int y = 0; y < rows; y++) {
       const float at_y = std::max((y0 + y + 0.5f) / BEHIND_STEP - 0.5f, 0.0f);
       const int top = std::min((int)at_y, h - 1), bottom = std::min(top + 1, h - 1);
-      for (int x = 0; x < columns; x++) {
-        const float at_x = std::max((x0 + x + 0.5f) / BEHIND_STEP - 0.5f, 0.0f);
-        const int left = std::min((int)at_x, w - 1), right = std::min(left + 1, w - 1);
-        const float down = at_y - top, across = at_x - left;
-        for (int c = 0; c < C_; c++) {
-          const float *p = &job_.behind[(size_t)c * h * w];
-          const float u = p[(size_t)top * w + left] + across * (p[(size_t)top * w + right] - p[(size_t)top * w + left]);
-          const float v = p[(size_t)bottom * w + left] + across * (p[(size_t)bottom * w + right] - p[(size_t)bottom * w + left]);
-          const float uncovered = std::max(1.0f - b.canvas[C_ + (E_ > 1 ? c : 0)][y * TILE + x], 0.0f);
-          b.canvas[c][y * TILE + x] += uncovered * (u + down * (v - u));
+      const float down = at_y - top;
+      for (int c = 0; c < C_; c++) {
+        const float *cover = b.canvas[C_ + (E_ > 1 ? c : 0)] + y * TILE;
+        float *canvas = b.canvas[c] + y * TILE;
+        const float *upper = &job_.behind[((size_t)c * h + top) * w], *lower = &job_.behind[((size_t)c * h + bottom) * w];
+        for (int x = 0; x < columns; x++) {
+          const float uncovered = 1.0f - cover[x];
+          if (!(uncovered > COVERED)) continue;
+          const float at_x = std::max((x0 + x + 0.5f) / BEHIND_STEP - 0.5f, 0.0f);
+          const int left = std::min((int)at_x, w - 1), right = std::min(left + 1, w - 1);
+          const float across = at_x - left;
+          const float u = upper[left] + across * (upper[right] - upper[left]), v = lower[left] + across * (lower[right] - lower[left]);
+          canvas[x] += uncovered * (u + down * (v - u));
         }
       }
     }

@@ -40,7 +40,8 @@ void farthest(const float *const *child, int channels, int stride, float *out) {
   for (int c = channels + 2; c < stride; c++) out[c] = 0;
 }
 
-typedef float f4 __attribute__((vector_size(16)));
+typedef float f8 __attribute__((vector_size(32)));
+constexpr int F8 = 8;
 
 inline void between(float at, int size, int &before, float &part) {
   at = clamp(at, 0.0f, (float)(size - 1));
@@ -49,9 +50,9 @@ inline void between(float at, int size, int &before, float &part) {
 }
 
 // Mean of the four samples of a level around a place, of those only that lie behind it; returns their weight.
-template <int F4>
-float behind(const Level &level, float row, float column, float here, f4 *seen) {
-  const int count = F4 ? F4 : level.stride / 4, C = level.channels;
+template <int VECTORS>
+float behind(const Level &level, float row, float column, float here, f8 *seen) {
+  const int count = VECTORS ? VECTORS : level.stride / F8, C = level.channels;
   int y, x;
   float down, right;
   const float per_step = 1.0f / level.step;
@@ -61,30 +62,27 @@ float behind(const Level &level, float row, float column, float here, f4 *seen) 
   const size_t below = level.height > 1 ? (size_t)level.width * level.stride : 0, beside = level.width > 1 ? level.stride : 0;
   const float *corner[4] = {first, first + beside, first + below, first + below + beside};
   const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
-  float total = 0;
-  for (int i = 0; i < count; i++) seen[i] = f4{};
-  for (int k = 0; k < 4; k++) {
-    const float s = corner[k][C] > here + BEHIND_PX ? share[k] * corner[k][C + 1] : 0.0f;
-    total += s;
-    for (int i = 0; i < count; i++) seen[i] += load<f4>(corner[k] + 4 * i) * f4{s, s, s, s};
-  }
-  if (!(total > 1e-4f)) total = 0;
-  const float each = 1.0f / std::max(total, 1e-4f);
-  for (int i = 0; i < count; i++) seen[i] *= f4{each, each, each, each};
+  float total = 0, counts[4];
+  for (int k = 0; k < 4; k++) total += counts[k] = corner[k][C] > here + BEHIND_PX ? share[k] * corner[k][C + 1] : 0.0f;
+  for (int i = 0; i < count; i++) seen[i] = f8{};
+  if (!(total > 1e-4f)) return 0;
+  const float each = 1.0f / total;
+  for (int k = 0; k < 4; k++)
+    for (int i = 0; i < count; i++) seen[i] += load<f8>(corner[k] + F8 * i) * (counts[k] * each);
   return total;
 }
 
 // What levels show behind a place: light, coc; returns the sum of their votes. With farthest, of two surfaces only the
 // farther one counts.
-template <int F4>
-float look(const Level *const *levels, int n, float row, float column, float here, bool farthest, float *out, f4 *b) {
-  const int count = F4 ? F4 : levels[0]->stride / 4, C = levels[0]->channels;
+template <int VECTORS>
+float look(const Level *const *levels, int n, float row, float column, float here, bool farthest, float *out, f8 *b) {
+  const int count = VECTORS ? VECTORS : levels[0]->stride / F8, C = levels[0]->channels;
   float total = 0;
-  for (int i = 0; i < 4 * count; i++) out[i] = 0;
+  for (int i = 0; i < F8 * count; i++) out[i] = 0;
   for (int l = 0; l < n; l++) {
     const Level &level = *levels[l];
     if (level.least_px > std::fabs(here)) continue;
-    const float any = behind<F4>(level, row, column, here, b);
+    const float any = behind<VECTORS>(level, row, column, here, b);
     float vote = any > 0 ? (level.vote > 0 ? level.vote : any) : 0.0f;
     if (farthest) {
       const float apart = ((const float *)b)[C] - out[C];
@@ -95,8 +93,8 @@ float look(const Level *const *levels, int n, float row, float column, float her
     if (!(vote > 0)) continue;
     const float part = vote / std::max(total, 1e-9f);
     for (int i = 0; i < count; i++) {
-      const f4 o = load<f4>(out + 4 * i);
-      store(out + 4 * i, o + (b[i] - o) * f4{part, part, part, part});
+      const f8 o = load<f8>(out + F8 * i);
+      store(out + F8 * i, o + (b[i] - o) * part);
     }
   }
   return total;
@@ -104,7 +102,7 @@ float look(const Level *const *levels, int n, float row, float column, float her
 
 class Filling {
  public:
-  Filling(Job &job) : job_(job), s_(job.surfaces), C_(job.channels), stride_((job.channels + 2 + 3) / 4 * 4) {}
+  Filling(Job &job) : job_(job), s_(job.surfaces), C_(job.channels), stride_((job.channels + 2 + F8 - 1) / F8 * F8) {}
 
   void run() {
     const int levels = job_.levels, step = 1 << levels;
@@ -139,7 +137,7 @@ class Filling {
         for (int band = 0; band < bands; band++) coarser(i, band);
     }
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
-    if (stride_ == 8) fill<2>(); else fill<0>();
+    if (stride_ == F8) fill<1>(); else fill<0>();
   }
 
  private:
@@ -290,7 +288,7 @@ class Filling {
     return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < HIDDEN_WEIGHT;
   }
 
-  template <int F4>
+  template <int VECTORS>
   void fill() {
     const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
     const int rows = area_height_ / STEP, columns = area_width_ / STEP;
@@ -311,7 +309,7 @@ class Filling {
     const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
     job_.parallel(rows, [&](int row, int) {
       std::vector<float> seen(stride_);
-      std::vector<f4> sample(stride_ / 4);
+      std::vector<f8> sample(stride_ / F8);
       for (int column = 0; column < columns; column++) {
         const size_t at = (size_t)row * columns + column;
         const float *shown = base.at(row, column);
@@ -328,10 +326,10 @@ class Filling {
             const float y = row * STEP + 0.5f * (STEP - 1), x = column * STEP + 0.5f * (STEP - 1);
             if (levels > FINE_LEVELS) {
               float *to = together.at(row, column);
-              const float total = look<F4>(every.data() + FINE_LEVELS, levels - FINE_LEVELS, y, x, near, false, to, sample.data());
+              const float total = look<VECTORS>(every.data() + FINE_LEVELS, levels - FINE_LEVELS, y, x, near, false, to, sample.data());
               to[C + 1] = total;
             }
-            if (look<F4>(every.data(), levels, y, x, near, true, seen.data(), sample.data()) > 0) shown = seen.data();
+            if (look<VECTORS>(every.data(), levels, y, x, near, true, seen.data(), sample.data()) > 0) shown = seen.data();
           }
         }
         for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = shown[c];
@@ -342,7 +340,7 @@ class Filling {
     looks[FINE_LEVELS] = &together;
     job_.parallel(s_.block_rows, [&](int by, int) {
       std::vector<float> seen(stride_);
-      std::vector<f4> sample(stride_ / 4);
+      std::vector<f8> sample(stride_ / F8);
       for (int bx = 0; bx < s_.block_columns; bx++)
         for (int y = by * BLOCK; y < std::min(H, (by + 1) * BLOCK); y++)
           for (int x = bx * BLOCK; x < std::min(W, (bx + 1) * BLOCK); x++) {
@@ -355,9 +353,9 @@ class Filling {
             const float here = s_.coc[(size_t)y * W + x];
             float total;
             if (fine_[cell])
-              total = look<F4>(looks, levels > FINE_LEVELS ? FINE_LEVELS + 1 : FINE_LEVELS, y, x, here, false, seen.data(), sample.data());
+              total = look<VECTORS>(looks, levels > FINE_LEVELS ? FINE_LEVELS + 1 : FINE_LEVELS, y, x, here, false, seen.data(), sample.data());
             else if (levels > FINE_LEVELS)
-              total = look<F4>(looks + FINE_LEVELS, 1, y, x, here, false, seen.data(), sample.data());
+              total = look<VECTORS>(looks + FINE_LEVELS, 1, y, x, here, false, seen.data(), sample.data());
             else
               continue;
             if (!(total > 0)) continue;

@@ -180,7 +180,7 @@ void threshold_row(const Job &job, int y, int x, float &first, float &step);
 // What the image shows, as rays of highlights meet it; highlights.cpp
 struct Visibility {
   float low = 0, class_width = 1;
-  std::vector<uint8_t> present;  // bins of 1 px of coc in which there is something, or in the one before
+  std::vector<int> bins;  // of 1 px of coc in which there is something, or in the one before
   int cell_rows = 0, cell_columns = 0;
   std::vector<uint64_t> cells;  // classes of coc that occur in each cell, a bit each
 };

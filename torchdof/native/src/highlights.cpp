@@ -229,7 +229,7 @@ Visibility look_at(const Job &job) {
   }
   v.low = low;
   const int bins = (int)(high - low) + 2;
-  v.present.assign(bins + 1, 0);
+  std::vector<uint8_t> present(bins + 1, 0);
   v.class_width = std::max(1.0f, bins / (float)CLASSES);
   v.cell_rows = ceil_div(H, CELL);
   v.cell_columns = ceil_div(W, CELL);
@@ -245,7 +245,9 @@ Visibility look_at(const Job &job) {
       }
   });
   for (size_t i = 0; i < floors.size(); i++)
-    if (floors[i]) v.present[i % bins] = v.present[i % bins + 1] = 1;
+    if (floors[i]) present[i % bins] = present[i % bins + 1] = 1;
+  for (int k = 0; k <= bins; k++)
+    if (present[k]) v.bins.push_back(k);
   return v;
 }
 
@@ -284,8 +286,7 @@ static void add_blocked(const Job &job, const Ray &ray, float place, int y, int 
 void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const float *const *kernels,
            const int32_t *halves, float *tile) {
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
-  const int bins = (int)v.present.size();
-  std::vector<int> nearer(bins);
+  std::vector<int> nearer(v.bins.size());
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
@@ -299,8 +300,8 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
         const int ny = std::min(PATCH, bottom - py), nx = std::min(PATCH, right - px);
         int m = 0;
         if (job.scene.occlusion)
-          for (int k = 0; k < bins && ray.coc - NEARER_PX >= v.low + k; k++) {
-            if (!v.present[k]) continue;
+          for (int k : v.bins) {
+            if (!(ray.coc - NEARER_PX >= v.low + k)) break;
             // a ray that lands so many pixels away met the surface at this share of them
             const float along = 1.0f - (v.low + k) / ray.coc;
             const float ya = ray.row + (py - ray.row) * along, yb = ray.row + (py + ny - 1 - ray.row) * along;

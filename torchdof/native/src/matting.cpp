@@ -40,9 +40,12 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
   const int H = job.height, W = job.width;
   const float *coc = job.surfaces.coc, *valid = job.surfaces.valid;
   float low[SIDE * PITCH], high[SIDE * PITCH];  // of valid pixels
+  const bool inside = x0 >= MARGIN && x0 + BLOCK + MARGIN <= W;
   for (int i = 0; i < SIDE; i++) {
     const size_t row = (size_t)std::clamp(y0 - MARGIN + i, 0, H - 1) * W;
-    for (int j = 0; j < SIDE; j++) {
+    if (inside && !valid)
+      for (float *to : {w.coc, low, high}) memcpy(to + i * PITCH, coc + row + x0 - MARGIN, SIDE * sizeof(float));
+    for (int j = inside && !valid ? SIDE : 0; j < SIDE; j++) {
       const size_t at = row + std::clamp(x0 - MARGIN + j, 0, W - 1);
       w.coc[i * PITCH + j] = low[i * PITCH + j] = high[i * PITCH + j] = coc[at];
       if (!valid) continue;
@@ -62,6 +65,18 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
       const float *l = low + (y - 1) * PITCH + j, *h = high + (y - 1) * PITCH + j;
       least_of[j] = std::min(std::min(l[0], l[PITCH]), l[2 * PITCH]);
       most_of[j] = std::max(std::max(h[0], h[PITCH]), h[2 * PITCH]);
+    }
+    if (inside && !valid) {
+      float most_edge = 0;
+      for (int j = 0; j < EDGES; j++) {
+        const float gap = std::max(std::max(most_of[j], most_of[j + 1]), most_of[j + 2]) -
+                          std::min(std::min(least_of[j], least_of[j + 1]), least_of[j + 2]);
+        w.edge[i * PITCH + j] = clamp01(gap / EDGE_PX - 1.0f);
+      }
+      if (i >= REACH && i < REACH + BLOCK)
+        for (int j = REACH; j < REACH + BLOCK; j++) most_edge = std::max(most_edge, w.edge[i * PITCH + j]);
+      any |= most_edge > 0;
+      continue;
     }
     for (int j = 0; j < EDGES; j++) {
       const int x = std::clamp(x0 - REACH + j, 0, W - 1) - x0 + MARGIN;
