@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from torchdof import Camera, DepthOfField
-from torchdof.render import load_table
+from torchdof.render_frame import load_table
 from torchdof.tolerance import from_text
 
 from .conversion import OPSET, to_onnx

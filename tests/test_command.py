@@ -189,7 +189,7 @@ def test_method_reaches_the_function(scene: Path, monkeypatch: pytest.MonkeyPatc
         methods.append(method)
         return torchdof.depth_of_field(*arguments, method=method, **options)
 
-    monkeypatch.setattr("torchdof.render.depth_of_field", spy)
+    monkeypatch.setattr("torchdof.render_frame.depth_of_field", spy)
     for method in ("fold", "layered"):
         run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", "--method", method)
     assert methods == ["fold", "layered"]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from torchdof import Camera, DepthOfField, growth, metrics, speed
 from torchdof.command import app
 from torchdof.files import Picture, read_image, write_image
-from torchdof.render import RenderSettings
+from torchdof.render_frame import RenderSettings
 from torchdof.subject import Subject, from_files, shipped
 
 LEVELS = ["8/255", "4/255", "2/255", "1/255", "0.5/255", "exact"]

@@ -6,7 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["number", "pixels_wide", "real_tensor", "show", "whole"]
+__all__ = ["is_traced", "number", "pixels_wide", "real_tensor", "show", "whole"]
+
+
+def is_traced() -> bool:
+    """Whether this code is being compiled or exported: sizes are symbols then, values cannot be looked at."""
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
 
 
 def number(
@@ -57,7 +62,7 @@ def pixels_wide(width: Any) -> None:
     Raises:
         ValueError: If it is not a positive finite number, or a tensor of one.
     """
-    if torch.compiler.is_compiling() or torch.compiler.is_exporting() or isinstance(width, torch.SymInt):
+    if is_traced() or isinstance(width, torch.SymInt):
         return
     if isinstance(width, Tensor):
         if width.ndim or width.is_complex() or width.layout != torch.strided or width.device.type == "meta":

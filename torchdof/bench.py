@@ -23,7 +23,7 @@ from .files import Picture, whole_file, write_image
 from .growth import lines, measure_growth, show_growth
 from .module import DepthOfField
 from .reference import lens_views
-from .render import RenderSettings
+from .render_frame import RenderSettings
 from .report import csv_of, markdown
 from .scenes import Scene, read_scenes
 from .subject import from_files, shipped

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .arguments import pixels_wide, real_tensor, show, whole
+from .arguments import is_traced, pixels_wide, real_tensor, show, whole
 
 __all__ = ["Camera"]
 
@@ -60,7 +60,7 @@ class Camera:
             _check_number(name, value)
         if not isinstance(self.focus_breathing, bool):
             raise ValueError(f"focus_breathing must be True or False, got {show(self.focus_breathing)}")
-        if self.focus_breathing and not _traced():
+        if self.focus_breathing and not is_traced():
             focal_m = _largest(self.focal_length_mm / 1000.0 / self.focus_m)
             if focal_m >= 1.0:
                 raise ValueError(
@@ -88,7 +88,7 @@ class Camera:
         """
         _check_number("fov_x_deg", fov_x_deg)
         _check_number("aperture_radius_m", aperture_radius_m)
-        if not _traced() and _largest(fov_x_deg) >= 180.0:
+        if not is_traced() and _largest(fov_x_deg) >= 180.0:
             raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}")
         half = torch.tan(torch.deg2rad(fov_x_deg) / 2) if isinstance(fov_x_deg, Tensor) else _tan_half_deg(fov_x_deg)
         if not isinstance(half, Tensor) and half < 1e-300:
@@ -234,10 +234,6 @@ class Camera:
         return f"Camera({', '.join(numbers)})"
 
 
-def _traced() -> bool:
-    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
-
-
 def _tan_half_deg(degrees: float) -> float:
     return math.tan(math.radians(degrees) / 2)
 
@@ -257,7 +253,7 @@ def _check_number(name: str, value: Number) -> None:
     if isinstance(value, Tensor):
         if value.ndim > 1 or not value.is_floating_point() or value.layout != torch.strided or not value.numel():
             raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {_describe(value)}")
-        if _traced():
+        if is_traced():
             return
         if value.device.type == "meta":
             raise ValueError(f"{name} must be a float or a tensor [B] that holds data, got one on the meta device")

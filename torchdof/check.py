@@ -8,9 +8,9 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from .arguments import real_tensor, show
+from .arguments import is_traced, real_tensor, show
 from .camera import Camera
-from .plan import Plan
+from .render.plan import Plan
 from .table import BlurTable
 from .tolerance import tolerance_of
 
@@ -98,7 +98,7 @@ def attention(where: object, layers: Plan | None) -> None:
         return
     if layers is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
-    if _traced():
+    if is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")
 
 
@@ -147,7 +147,7 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
         ValueError: If shapes or types are wrong, or, with ``values``, a depth is NaN or not positive.
     """
     image_and_map(image, "depth", depth, "in metres")
-    if values and not _traced():
+    if values and not is_traced():
         bad = int((~(depth > 0)).sum())
         if bad:
             raise ValueError(
@@ -166,7 +166,7 @@ def image_and_coc(image: Tensor, coc_px: Tensor, table: BlurTable, values: bool)
     image_and_map(image, "coc_px", coc_px, "in pixels")
     if table.channels not in (1, image.shape[1]):
         raise ValueError(f"the table blurs {table.channels} channels, the image has {image.shape[1]}")
-    if values and not _traced():
+    if values and not is_traced():
         for name, tensor in (("coc_px", coc_px), ("image", image)):
             if bool(torch.isfinite(tensor.sum())):  # one look at each value; a sum that overflows tells nothing
                 continue
@@ -242,7 +242,7 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
         )
     if tuple(depth.shape[3:]) not in ((1, 1), (height, width)):
         raise ValueError(f"depth_m must have the layers' size {height} x {width}, got {list(depth_m.shape)}")
-    if values and not _traced():
+    if values and not is_traced():
         real_tensor("rgba", rgba, "[B, N, C + 1, H, W]")
         real_tensor("depth_m", depth_m, "in metres")
         cover = rgba[:, :, -1]
@@ -262,7 +262,7 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
     """
     _image(image)
     _map(name, unit, value, image)
-    if not _traced():  # there a tensor has no data yet
+    if not is_traced():  # there a tensor has no data yet
         real_tensor("image", image, "[B, C, H, W]")
         real_tensor(name, value, f"[B, 1, H, W] {unit}")
 
@@ -292,7 +292,3 @@ def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
         raise ValueError(f"{expected} as the image is {list(image.shape)}, got {list(value.shape)}")
     if value.device != image.device:
         raise ValueError(f"{name} must be on the image's device {image.device}, got {value.device}")
-
-
-def _traced() -> bool:
-    return torch.compiler.is_compiling() or torch.compiler.is_exporting()

@@ -7,12 +7,11 @@ import torch
 from torch import Tensor, nn
 
 from . import check as checks
-from . import pipeline
-from .attention import Attention
 from .camera import Camera
 from .check import Border, Method, Options
-from .plan import Plan
-from .survey import survey
+from .render import pipeline
+from .render.attention import Attention
+from .render.plan import Plan
 from .table import BlurTable
 from .tolerance import Tolerance, tolerance_of
 
@@ -185,18 +184,17 @@ class DepthOfField(nn.Module):
     ) -> Plan:
         """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`.
 
-        ``print`` tells which layers there are, where in the frame, at which resolution, and what they cost;
-        :attr:`torchdof.plan.Plan.survey` holds the same as numbers.
+        ``print`` tells which layers there are, of which radius, at which resolution, and which share of the pixels
+        each carries.
 
         Example:
             >>> dof = DepthOfField(Camera(focus_m=1.0, f_number=1.0))
             >>> depth = torch.linspace(1, 9, 96).expand(1, 1, 64, 96)
             >>> print(dof.plan(torch.rand(1, 3, 64, 96), depth))  # doctest: +ELLIPSIS
-            96 x 64, tolerance 1/255, predicted error ...
+            8 layers, near to far, tolerance 1/255...
         """
         coc = self.coc_px(image, depth, focus_m, f_number)
-        plan = Plan.of_scene(coc, self.tolerance)
-        return dataclasses.replace(plan, survey=survey(plan, coc, self.table, self.method == "layered", self.occlusion))
+        return Plan.of_scene(coc, self.tolerance).of_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""

@@ -18,7 +18,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from .render import RenderSettings, load_table, pick_device, render_frame
+from .render_frame import RenderSettings, load_table, pick_device, render_frame
 from .sequence import FramePattern, parse_focus, parse_frames
 from .tolerance import from_text
 

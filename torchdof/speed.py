@@ -23,7 +23,7 @@ from torch import Tensor
 
 from . import memory, metrics
 from .arguments import whole
-from .attention import weight_map
+from .render.attention import weight_map
 from .camera import Camera
 from .check import Method
 from .files import whole_file

@@ -10,7 +10,7 @@ from torch import Tensor
 from .camera import Camera
 from .depthmap import depth_from_values, resolve_holes
 from .files import read_image, read_values
-from .render import RenderSettings
+from .render_frame import RenderSettings
 from .scenes import posts, waves
 
 __all__ = ["LEAST_PX", "Subject", "from_files", "shipped"]

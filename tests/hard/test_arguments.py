@@ -18,7 +18,7 @@ from torch import Tensor
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, kernel
 from torchdof.depthmap import depth_from_values, fill_holes
 from torchdof.metadata import camera_facts
-from torchdof.render import RenderSettings, load_table, pick_device, tint_focus
+from torchdof.render_frame import RenderSettings, load_table, pick_device, tint_focus
 from torchdof.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
 
 pytestmark = pytest.mark.hard

@@ -1,0 +1,249 @@
+"""Layers, far to near, to one image: each is scattered with its kernel and composited with what is behind it."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ..arguments import is_traced
+from .convolution import CHANNELS
+from .downsampling import downsampled, upsampled
+from .plan import Blur, Plan
+from .scatter import fold
+from .surfaces import Frame
+
+__all__ = ["Scatter", "accumulate", "accumulate_once", "over"]
+
+Scatter = Callable[[Tensor, Tensor, int], Tensor]
+"""``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
+
+_LEAST = 1e-6  # share of scattered weight below which nothing is known
+
+
+def over(frame: Frame, plan: Plan, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
+    """Normalised "over" of soft layers.
+
+    With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
+    ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
+    Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
+    blurred edge of what is in front. Outside the frame surfaces go on as they are at the border, but their light is
+    unknown and weighs nothing: colours are means over what was seen. Where all layers leave a pixel uncovered, what is
+    behind them shows.
+
+    Args:
+        frame: The surfaces seen in each pixel.
+        plan: Where the layers are.
+        blurs: Kernel and resolution of each layer.
+        scatter: How a layer is scattered.
+
+    Returns:
+        ``[B, C, H, W]``.
+
+    Reference:
+        Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
+    """
+    colours, each = frame.colours, blurs[0].kernel.shape[0]
+
+    def normalised(layer: Tensor) -> Tensor:
+        """Colour and coverage, from scattered ``m_k I``, ``m_k``, ``M_k`` and the ``m_k`` that was seen."""
+        light_and_weight, visible, seen = layer.tensor_split((colours + each, colours + 2 * each), 1)
+        if seen.shape[1]:  # light that was not seen: the colour of what was, fading out with the last of it
+            light, weight = light_and_weight.tensor_split((colours,), 1)
+            floor = weight.clamp(_LEAST**2, _LEAST)
+            light = light * (weight / torch.maximum(seen, floor))
+            light_and_weight = torch.cat([light, weight * (seen / floor).clamp(max=1.0)], 1)
+        visible = visible.clamp_min(_LEAST)
+        return light_and_weight / (visible if each == 1 else visible.repeat(1, 2, 1, 1))
+
+    def composited(front: Tensor, behind: Tensor) -> Tensor:
+        left = (1.0 - front[:, colours:]).clamp_min(0.0)
+        return torch.addcmul(front, left if each == 1 else left.repeat(1, 2, 1, 1), behind)
+
+    light_and_coverage = _composite_layers(frame, plan, blurs, scatter, True, normalised, composited)
+    if frame.behind is None:
+        out = _mean(light_and_coverage, colours)
+    else:
+        light, coverage = light_and_coverage.tensor_split((colours,), 1)
+        out = torch.addcmul(light, (1.0 - coverage).clamp_min(0.0), frame.behind)
+    return out[..., : frame.size[0], : frame.size[1]]
+
+
+def accumulate(
+    frame: Frame,
+    plan: Plan,
+    blurs: Sequence[Blur],
+    scatter: Scatter,
+    normalize: bool,
+    highlights: Tensor | None = None,
+) -> Tensor:
+    """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
+
+    Args:
+        frame: The surfaces seen in each pixel.
+        plan: Where the layers are.
+        blurs: Kernel and resolution of each layer.
+        scatter: How a layer is scattered.
+        normalize: False leaves the plain sum, which is dark at the frame's border and uneven at depth edges.
+        highlights: Light that was extracted from the layers and splat ray by ray, ``[B, C, H, W]``.
+
+    Returns:
+        ``[B, C, H, W]``.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 3.
+    """
+    summed = _composite_layers(frame, plan, blurs, scatter, False, lambda layer: layer, torch.add)
+    summed = summed[..., : frame.size[0], : frame.size[1]]
+    if highlights is not None:
+        light, weight = summed.tensor_split((frame.colours,), 1)
+        summed = torch.cat([light + highlights, weight], 1)
+    return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
+
+
+def accumulate_once(frame: Frame, plan: Plan, blurs: Sequence[Blur], normalize: bool) -> Tensor:
+    """The same scatter as :func:`accumulate`, as the paper does it: one pass, in which each pixel has its own kernel.
+
+    Args:
+        frame: The surface seen in each pixel.
+        plan: Where the layers are; a pixel's kernel is interpolated between the nodes around its coc.
+        blurs: Kernel of each layer, at full resolution.
+        normalize: As in :func:`accumulate`.
+
+    Returns:
+        ``[B, C, H, W]``.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and
+        accumulate.
+    """
+    halo = frame.margin
+    weights = torch.cat([frame.layer(plan.nodes, k, halo, visibility=True)[1] for k in range(len(plan.nodes))], 1)
+    kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
+    light = frame.surfaces[0].light
+    known = torch.ones_like(light) if frame.known is None else frame.known.expand_as(light)
+    if kernels.shape[1] == 1:
+        summed = fold(torch.cat([light, known[:, :1]], 1), kernels, halo, weights)
+    else:
+        summed = fold(torch.cat([light, known], 1), kernels.repeat(1, 2, 1, 1), halo, weights)
+    summed = summed[..., : frame.size[0], : frame.size[1]]
+    return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
+
+
+def _composite_layers(
+    frame: Frame,
+    plan: Plan,
+    blurs: Sequence[Blur],
+    scatter: Scatter,
+    visibility: bool,
+    normalised: Callable[[Tensor], Tensor],
+    composited: Callable[[Tensor, Tensor], Tensor],
+) -> Tensor:
+    """All layers, far to near, over what is behind them: light ``[B, C, h, w]`` and, after it, its coverage.
+
+    Neighbouring layers of one coarser resolution are composited at that resolution first. Coverage has one channel, or
+    C where each colour has a kernel of its own.
+
+    Args:
+        frame: The surfaces seen in each pixel.
+        plan: Where the layers are.
+        blurs: Kernel and resolution of each layer.
+        scatter: How a layer is scattered.
+        visibility: As in :meth:`torchdof.render.surfaces.Frame.layer`.
+        normalised: What was scattered of a layer -> its light and coverage.
+        composited: What is in front and what is behind it -> both together.
+    """
+    light, each = frame.surfaces[0].light, blurs[0].kernel.shape[0]
+    picture = light.new_zeros(light.shape[0], frame.colours + each, *frame.area)
+    for run in _runs(frame, plan, blurs):
+        scale = blurs[run[0][0]].scale
+        part = picture
+        if scale > 1:  # one pixel more on each side, to interpolate from
+            part = picture.new_zeros(*picture.shape[:2], *(n // scale + 2 for n in frame.area))
+        for group in run:
+
+            def with_group(behind: Tensor, group: list[int] = group) -> Tensor:
+                for layer in _scattered(frame, plan, blurs, scatter, visibility, group):
+                    behind = composited(normalised(layer), behind)
+                return behind
+
+            part = _where_needed(with_group, frame, plan, blurs, group, part)
+        if scale == 1:
+            picture = part
+            continue
+
+        def with_run(behind: Tensor, part: Tensor = part, scale: int = scale) -> Tensor:
+            fine = upsampled(part, scale)
+            return composited(fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale], behind)
+
+        picture = _where_needed(with_run, frame, plan, blurs, [k for group in run for k in group], picture)
+    return picture
+
+
+def _runs(frame: Frame, plan: Plan, blurs: Sequence[Blur]) -> list[list[list[int]]]:
+    """Layers in which something lies, far to near: runs of one resolution, in groups that one convolution scatters.
+
+    A run of a coarser resolution lies on one side of the focus, for what is between its layers must not matter.
+    """
+    order = list(reversed(range(len(plan.nodes))))
+    if not is_traced():
+        occupied = frame.occupied(plan.nodes)
+        order = [k for k in order if occupied[k]]
+    channels = frame.colours + 3 if blurs[0].kernel.shape[0] == 1 else CHANNELS
+    runs: list[list[list[int]]] = []
+    for k in order:
+        if runs:
+            last, group = runs[-1][0][0], runs[-1][-1]
+            one_side = (plan.nodes[last] < 0) == (plan.nodes[k] < 0)
+            if blurs[last].scale == blurs[k].scale and (blurs[k].scale == 1 or one_side):
+                widths = [blurs[j].kernel.shape[-1] for j in [*group, k]]
+                if (len(group) + 1) * channels <= CHANNELS and max(widths) ** 2 <= 2 * min(widths) ** 2:
+                    group.append(k)
+                else:
+                    runs[-1].append([k])
+                continue
+        runs.append([[k]])
+    return runs
+
+
+def _scattered(
+    frame: Frame, plan: Plan, blurs: Sequence[Blur], scatter: Scatter, visibility: bool, group: list[int]
+) -> Iterator[Tensor]:
+    """Scattered layers of a group, at their resolution, far to near."""
+    halo, half, scale = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), blurs[group[0]].scale
+    each = blurs[group[0]].kernel.shape[0]
+    layers = [frame.layer(plan.nodes, k, halo, visibility) for k in group]
+    terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1) for terms in layers for term in terms], 1)
+    terms, channels = downsampled(terms, scale), terms.shape[1] // len(group)
+    if len(group) == 1 and each == 1:
+        kernels = blurs[group[0]].kernel
+    else:  # the same one for all terms of a layer, or one colour after the other in each of them
+        padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in group]
+        kernels = torch.cat([kernel.repeat(channels // each, 1, 1) for kernel in padded])
+    yield from scatter(terms, kernels, half).split(channels, 1)
+
+
+def _where_needed(
+    step: Callable[[Tensor], Tensor],
+    frame: Frame,
+    plan: Plan,
+    blurs: Sequence[Blur],
+    group: list[int],
+    picture: Tensor,
+) -> Tensor:
+    """One step on a picture. A graph cannot choose its work beforehand: in one it is a branch, taken where needed."""
+    if not torch.compiler.is_exporting():
+        return step(picture)
+    ends = (-torch.inf, *plan.nodes, torch.inf)
+    needed = frame.any_between(ends[min(group)], ends[max(group) + 2], max(blurs[k].halo for k in group))
+
+    def dense(picture: Tensor) -> Tensor:  # both branches must lie in memory the same way
+        return step(picture).clone(memory_format=torch.contiguous_format)
+
+    return torch.cond(needed, dense, torch.clone, (picture,))
+
+
+def _mean(summed: Tensor, colours: int) -> Tensor:
+    """Light over its weight; 0 where nothing is known."""
+    light, weight = summed.tensor_split((colours,), 1)
+    return light / torch.where(weight > _LEAST, weight, torch.inf)
