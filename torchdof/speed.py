@@ -23,11 +23,11 @@ from torch import Tensor
 
 from . import memory, metrics
 from .arguments import whole
-from .render.attention import weight_map
 from .camera import Camera
 from .check import Method
 from .files import whole_file
 from .module import DepthOfField, blur_by_coc
+from .render.attention import weight_map
 from .report import machine, markdown
 from .subject import LEAST_PX, Subject
 

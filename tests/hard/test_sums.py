@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import BlurTable, blur_by_coc, kernel
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.hard
 

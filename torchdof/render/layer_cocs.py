@@ -94,8 +94,7 @@ def _crowded(x: Tensor, width: float, least_share: float, tolerance: float | Non
         tolerance: Of what lies within a layer's spacing of such a place, half must lie at it; None does not look
             around.
     """
-    steps = x.abs().clamp(max=_WIDE) / _FINEST + _FINEST_PARTS * (x.abs() / _WIDE).clamp_min(1.0).log()
-    bins = torch.round(steps * x.sign() * (3.0 / width)).long()
+    bins = torch.round(_in_finest(x) * (3.0 / width)).long()
     first = int(bins.min())
     counts = torch.bincount(bins - first)
     sums = functional.pad(counts.cumsum(0), (1, 0)).tolist()
@@ -118,6 +117,12 @@ def _crowded(x: Tensor, width: float, least_share: float, tolerance: float | Non
             # one that occurs: its pixels then lie in no other layer
             places.append(float(x[(bins - first - i).abs() <= 1].median()))
     return places
+
+
+def _in_finest(x: Tensor) -> Tensor:
+    """Places in finest distances from focus."""
+    steps = x.abs().clamp(max=_WIDE) / _FINEST + _FINEST_PARTS * (x.abs() / _WIDE).clamp_min(1.0).log()
+    return steps * x.sign()
 
 
 def _from_finest(steps: float) -> float:

@@ -11,7 +11,7 @@ from ..kernel_cache import KernelCache
 from ..table import BlurTable
 from . import layer_cocs
 from .downsampling import shrink
-from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
+from .layer_weights import from_blur_axis, weight_at_or_behind
 
 __all__ = ["Blur", "Plan", "kernels_for"]
 
