@@ -8,7 +8,7 @@ from torch import Tensor
 from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
 from torchdof.render.highlights import threshold
-from torchdof.render.plan import Blur, Plan
+from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Surface, framed, surfaces_of_image
 
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
@@ -67,7 +67,7 @@ def test_behind_two_blurred_surfaces_lies_the_farthest_around() -> None:
 def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, int]) -> None:
     cells = torch.rand(1, 3, size[0] // 4 + 3, size[1] // 4 + 2, generator=torch.Generator().manual_seed(2))
     behind = functional.interpolate(cells, scale_factor=4.0, mode="bilinear")[..., : size[0], : size[1]]
-    coc, plan = torch.full((1, 1, *size), 0.0), Plan((0.0, 1.0), 1 / 255)
+    coc = torch.zeros(1, 1, *size)
     blurs = [Blur(torch.ones(1, 1, 1), 1), Blur(torch.zeros(1, 1, 1), 1)]  # light of the farther layer goes elsewhere
     for cover in (0.0, 0.75, 1.0):
         light = torch.full((1, 3, *size), 0.2)
@@ -75,6 +75,6 @@ def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, in
             Surface(light, coc, torch.full_like(coc, cover)),
             Surface(light, coc + 9.0, torch.full_like(coc, 1 - cover)),
         ]
-        frame = framed(surfaces, cells, plan.nodes, blurs, extend=False, stacked=False)
-        shown = over(frame, plan, blurs, convolve)
+        frame = framed(surfaces, cells, (0.0, 1.0), blurs, extend=False, stacked=False)
+        shown = over(frame, blurs, convolve)
         torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)

@@ -6,10 +6,9 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..arguments import is_traced
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
-from .plan import Blur, Plan
+from .plan import Blur
 from .scatter import fold
 from .surfaces import Frame
 
@@ -21,7 +20,7 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 
 
-def over(frame: Frame, plan: Plan, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
+def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     """Normalised "over" of soft layers.
 
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
@@ -33,7 +32,6 @@ def over(frame: Frame, plan: Plan, blurs: Sequence[Blur], scatter: Scatter) -> T
 
     Args:
         frame: The surfaces seen in each pixel.
-        plan: Where the layers are.
         blurs: Kernel and resolution of each layer.
         scatter: How a layer is scattered.
 
@@ -60,7 +58,7 @@ def over(frame: Frame, plan: Plan, blurs: Sequence[Blur], scatter: Scatter) -> T
         left = (1.0 - front[:, colours:]).clamp_min(0.0)
         return torch.addcmul(front, left if each == 1 else left.repeat(1, 2, 1, 1), behind)
 
-    light_and_coverage = _composite_layers(frame, plan, blurs, scatter, True, normalised, composited)
+    light_and_coverage = _composite_layers(frame, blurs, scatter, composited, normalised)
     if frame.behind is None:
         out = _mean(light_and_coverage, colours)
     else:
@@ -70,18 +68,12 @@ def over(frame: Frame, plan: Plan, blurs: Sequence[Blur], scatter: Scatter) -> T
 
 
 def accumulate(
-    frame: Frame,
-    plan: Plan,
-    blurs: Sequence[Blur],
-    scatter: Scatter,
-    normalize: bool,
-    highlights: Tensor | None = None,
+    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, normalize: bool, highlights: Tensor | None = None
 ) -> Tensor:
     """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
 
     Args:
         frame: The surfaces seen in each pixel.
-        plan: Where the layers are.
         blurs: Kernel and resolution of each layer.
         scatter: How a layer is scattered.
         normalize: False leaves the plain sum, which is dark at the frame's border and uneven at depth edges.
@@ -93,7 +85,7 @@ def accumulate(
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
     """
-    summed = _composite_layers(frame, plan, blurs, scatter, False, lambda layer: layer, torch.add)
+    summed = _composite_layers(frame, blurs, scatter, torch.add)
     summed = summed[..., : frame.size[0], : frame.size[1]]
     if highlights is not None:
         light, weight = summed.tensor_split((frame.colours,), 1)
@@ -101,13 +93,12 @@ def accumulate(
     return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
 
 
-def accumulate_once(frame: Frame, plan: Plan, blurs: Sequence[Blur], normalize: bool) -> Tensor:
+def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Tensor:
     """The same scatter as :func:`accumulate`, as the paper does it: one pass, in which each pixel has its own kernel.
 
     Args:
         frame: The surface seen in each pixel.
-        plan: Where the layers are; a pixel's kernel is interpolated between the nodes around its coc.
-        blurs: Kernel of each layer, at full resolution.
+        blurs: Kernel of each layer, at full resolution; a pixel's own is interpolated between those around its coc.
         normalize: As in :func:`accumulate`.
 
     Returns:
@@ -118,7 +109,7 @@ def accumulate_once(frame: Frame, plan: Plan, blurs: Sequence[Blur], normalize: 
         accumulate.
     """
     halo = frame.margin
-    weights = torch.cat([frame.layer(plan.nodes, k, halo, visibility=True)[1] for k in range(len(plan.nodes))], 1)
+    weights = torch.cat([frame.layer(k, halo, visibility=True)[1] for k in range(len(blurs))], 1)
     kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
     light = frame.surfaces[0].light
     known = torch.ones_like(light) if frame.known is None else frame.known.expand_as(light)
@@ -132,110 +123,91 @@ def accumulate_once(frame: Frame, plan: Plan, blurs: Sequence[Blur], normalize: 
 
 def _composite_layers(
     frame: Frame,
-    plan: Plan,
     blurs: Sequence[Blur],
     scatter: Scatter,
-    visibility: bool,
-    normalised: Callable[[Tensor], Tensor],
     composited: Callable[[Tensor, Tensor], Tensor],
+    normalised: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor:
     """All layers, far to near, over what is behind them: light ``[B, C, h, w]`` and, after it, its coverage.
 
-    Neighbouring layers of one coarser resolution are composited at that resolution first. Coverage has one channel, or
-    C where each colour has a kernel of its own.
+    Coverage has one channel, or C where each colour has a kernel of its own.
 
     Args:
         frame: The surfaces seen in each pixel.
-        plan: Where the layers are.
         blurs: Kernel and resolution of each layer.
         scatter: How a layer is scattered.
-        visibility: As in :meth:`torchdof.render.surfaces.Frame.layer`.
-        normalised: What was scattered of a layer -> its light and coverage.
         composited: What is in front and what is behind it -> both together.
+        normalised: Scattered terms of a layer, its visibility among them -> its light and coverage; None: they are.
     """
-    light, each = frame.surfaces[0].light, blurs[0].kernel.shape[0]
-    picture = light.new_zeros(light.shape[0], frame.colours + each, *frame.area)
-    for run in _runs(frame, plan, blurs):
-        scale = blurs[run[0][0]].scale
+    order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
+    light = frame.surfaces[0].light
+    picture = light.new_zeros(light.shape[0], frame.colours + blurs[0].kernel.shape[0], *frame.area)
+
+    # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between
+    runs: dict[tuple[int, bool], list[int]] = {}
+    for k in order:
+        scale = blurs[k].scale
+        runs.setdefault((scale, scale > 1 and frame.nodes[k] < 0), []).append(k)
+    for (scale, _), run in runs.items():
         part = picture
         if scale > 1:  # one pixel more on each side, to interpolate from
             part = picture.new_zeros(*picture.shape[:2], *(n // scale + 2 for n in frame.area))
-        for group in run:
+        for group in _groups(run, blurs, frame.colours):
 
             def with_group(behind: Tensor, group: list[int] = group) -> Tensor:
-                for layer in _scattered(frame, plan, blurs, scatter, visibility, group):
-                    behind = composited(normalised(layer), behind)
+                for layer in _scattered(frame, blurs, scatter, group, normalised is not None):
+                    behind = composited(layer if normalised is None else normalised(layer), behind)
                 return behind
 
-            part = _where_needed(with_group, frame, plan, blurs, group, part)
-        if scale == 1:
-            picture = part
-            continue
+            part = _where_needed(with_group, part, frame, blurs, group)
 
         def with_run(behind: Tensor, part: Tensor = part, scale: int = scale) -> Tensor:
             fine = upsampled(part, scale)
             return composited(fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale], behind)
 
-        picture = _where_needed(with_run, frame, plan, blurs, [k for group in run for k in group], picture)
+        picture = part if scale == 1 else _where_needed(with_run, picture, frame, blurs, run)
     return picture
 
 
-def _runs(frame: Frame, plan: Plan, blurs: Sequence[Blur]) -> list[list[list[int]]]:
-    """Layers in which something lies, far to near: runs of one resolution, in groups that one convolution scatters.
-
-    A run of a coarser resolution lies on one side of the focus, for what is between its layers must not matter.
-    """
-    order = list(reversed(range(len(plan.nodes))))
-    if not is_traced():
-        occupied = frame.occupied(plan.nodes)
-        order = [k for k in order if occupied[k]]
-    channels = frame.colours + 3 if blurs[0].kernel.shape[0] == 1 else CHANNELS
-    runs: list[list[list[int]]] = []
-    for k in order:
-        if runs:
-            last, group = runs[-1][0][0], runs[-1][-1]
-            one_side = (plan.nodes[last] < 0) == (plan.nodes[k] < 0)
-            if blurs[last].scale == blurs[k].scale and (blurs[k].scale == 1 or one_side):
-                widths = [blurs[j].kernel.shape[-1] for j in [*group, k]]
-                if (len(group) + 1) * channels <= CHANNELS and max(widths) ** 2 <= 2 * min(widths) ** 2:
-                    group.append(k)
-                else:
-                    runs[-1].append([k])
-                continue
-        runs.append([[k]])
-    return runs
+def _groups(run: list[int], blurs: Sequence[Blur], colours: int) -> list[list[int]]:
+    """Layers of a run that one convolution scatters: as many as fill its channels, with kernels of like size."""
+    most = CHANNELS // (colours + 3) if blurs[0].kernel.shape[0] == 1 else 1
+    groups: list[list[int]] = []
+    for k in run:
+        widths = [blurs[j].kernel.shape[-1] for j in [*groups[-1], k]] if groups else []
+        if 1 < len(widths) <= most and max(widths) ** 2 <= 2 * min(widths) ** 2:
+            groups[-1].append(k)
+        else:
+            groups.append([k])
+    return groups
 
 
 def _scattered(
-    frame: Frame, plan: Plan, blurs: Sequence[Blur], scatter: Scatter, visibility: bool, group: list[int]
+    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
 ) -> Iterator[Tensor]:
-    """Scattered layers of a group, at their resolution, far to near."""
-    halo, half, scale = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), blurs[group[0]].scale
-    each = blurs[group[0]].kernel.shape[0]
-    layers = [frame.layer(plan.nodes, k, halo, visibility) for k in group]
+    """Terms of the layers of a group, scattered at their resolution: see :meth:`torchdof.render.surfaces.Frame.layer`.
+
+    Where each colour has a kernel of its own, each term has as many channels.
+    """
+    halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
+    layers = [frame.layer(k, halo, visibility) for k in group]
     terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1) for terms in layers for term in terms], 1)
-    terms, channels = downsampled(terms, scale), terms.shape[1] // len(group)
-    if len(group) == 1 and each == 1:
-        kernels = blurs[group[0]].kernel
-    else:  # the same one for all terms of a layer, or one colour after the other in each of them
+    terms, channels = downsampled(terms, blurs[group[0]].scale), terms.shape[1] // len(group)
+    kernels = blurs[group[0]].kernel
+    if len(group) > 1 or each > 1:
         padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in group]
         kernels = torch.cat([kernel.repeat(channels // each, 1, 1) for kernel in padded])
     yield from scatter(terms, kernels, half).split(channels, 1)
 
 
 def _where_needed(
-    step: Callable[[Tensor], Tensor],
-    frame: Frame,
-    plan: Plan,
-    blurs: Sequence[Blur],
-    group: list[int],
-    picture: Tensor,
+    step: Callable[[Tensor], Tensor], picture: Tensor, frame: Frame, blurs: Sequence[Blur], layers: list[int]
 ) -> Tensor:
     """One step on a picture. A graph cannot choose its work beforehand: in one it is a branch, taken where needed."""
     if not torch.compiler.is_exporting():
         return step(picture)
-    ends = (-torch.inf, *plan.nodes, torch.inf)
-    needed = frame.any_between(ends[min(group)], ends[max(group) + 2], max(blurs[k].halo for k in group))
+    ends = (-torch.inf, *frame.nodes, torch.inf)
+    needed = frame.any_between(ends[min(layers)], ends[max(layers) + 2], max(blurs[k].halo for k in layers))
 
     def dense(picture: Tensor) -> Tensor:  # both branches must lie in memory the same way
         return step(picture).clone(memory_format=torch.contiguous_format)

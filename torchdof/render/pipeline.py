@@ -238,7 +238,7 @@ def _composite(
 ) -> Tensor:
     """Surfaces, and the light of highlights, to a picture. The list of surfaces is emptied."""
     light = surfaces[0].light
-    layered, tiling = options.method == "layered", _tiling.get()
+    layered, tiling = options.method == "layered", _tiling.get() if torch.compiler.is_exporting() else None
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
     align = None if tiling is None else tiling.align
     del light
@@ -247,11 +247,11 @@ def _composite(
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
         scatter = convolve if layered else fold
         if options.occlusion:
-            out = composite.over(frame, plan, blurs, scatter)
+            out = composite.over(frame, blurs, scatter)
             return out if splats is None else out + splats
         if not layered:
-            return composite.accumulate_once(frame, plan, blurs, options.normalize)
-        return composite.accumulate(frame, plan, blurs, scatter, options.normalize, splats)
+            return composite.accumulate_once(frame, blurs, options.normalize)
+        return composite.accumulate(frame, blurs, scatter, options.normalize, splats)
 
     return picture(frame, blurs) if tiling is None else tiling.render(frame, blurs, picture)
 

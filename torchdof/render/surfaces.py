@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..arguments import is_traced
 from .disocclusion import BEHIND_STEP, behind_size, fill_hidden
 from .downsampling import upsampled
 from .layer_weights import blur_axis, weight_at_or_behind
@@ -42,6 +43,7 @@ class Frame:
 
     Args:
         surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area.
+        nodes: Places of the layers on the blur axis, near to far.
         known: 1 where light was seen, 0 where it is unknown, ``[1 or B, 1, ...]`` as they are; None: all is known.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
         margin: Pixels on each side, as many as the widest kernel reaches.
@@ -52,6 +54,7 @@ class Frame:
     """
 
     surfaces: Sequence[Placed]
+    nodes: Sequence[float]
     known: Tensor | None
     behind: Tensor | None
     margin: int
@@ -69,49 +72,50 @@ class Frame:
         start = self.margin - halo
         return values[..., start : start + self.area[0] + 2 * halo, start : start + self.area[1] + 2 * halo]
 
-    def occupied(self, nodes: Sequence[float]) -> list[bool]:
-        """Whether anything lies in each layer."""
+    def occupied(self) -> list[bool]:
+        """Whether anything lies in each layer; in traced code, which cannot look, anything may."""
+        count = len(self.nodes)
+        if is_traced():
+            return [True] * count
         x = torch.stack([s.x for s in self.surfaces])
-        axis = x.new_tensor(nodes)
-        nearer = (torch.bucketize(x, axis, right=True) - 1).clamp(0, len(nodes) - 1)  # the node at or before
-        counts = torch.bincount((2 * nearer + (x > axis[nearer])).flatten(), minlength=2 * len(nodes)).tolist()
-        return [any(counts[max(2 * k - 1, 0) : 2 * k + 2]) for k in range(len(nodes))]
+        axis = x.new_tensor(self.nodes)
+        nearer = (torch.bucketize(x, axis, right=True) - 1).clamp(0, count - 1)  # the node at or before
+        counts = torch.bincount((2 * nearer + (x > axis[nearer])).flatten(), minlength=2 * count).tolist()
+        return [any(counts[max(2 * k - 1, 0) : 2 * k + 2]) for k in range(count)]
 
     def any_between(self, low: float, high: float, halo: int) -> Tensor:
         """Whether anything, up to so far beyond the area, lies between two places on the blur axis: a bool tensor."""
         places = [self.cut(s.x, halo) for s in self.surfaces]
         return torch.stack([((x > low) & (x < high)).any() for x in places]).any()
 
-    def layer(self, nodes: Sequence[float], k: int, halo: int, visibility: bool) -> list[Tensor]:
+    def layer(self, k: int, halo: int, visibility: bool) -> list[Tensor]:
         """What layer k scatters: light ``m_k I`` and weight ``m_k``; with visibility also ``M_k`` and the seen weight.
 
         Args:
-            nodes: Places of the layers.
-            k: Which one.
+            k: Which layer.
             halo: Pixels beyond the area that are needed.
             visibility: Whether to give ``M_k``, the weight at or behind the layer, and the part of ``m_k`` whose light
                 was seen, where some was not. Without it, only weight that was seen is given.
         """
         surfaces = [Placed(*(None if t is None else self.cut(t, halo) for t in s)) for s in self.surfaces]
         known = None if self.known is None else self.cut(self.known, halo)
-        light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, nodes, k)
+        light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, self.nodes, k)
         if not visibility:
             return [light, weight if known is None else weight * known]
         return [light, weight, behind] if known is None else [light, weight, behind, weight * known]
 
 
 def _mixed(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
-    """``m_k I``, ``m_k`` and ``M_k`` of surfaces that share their pixels."""
-    light, weight, at_or_behind = [], [], []
-    for surface in surfaces:
-        behind = weight_at_or_behind(surface.x, nodes, k)
-        own = behind - weight_at_or_behind(surface.x, nodes, k + 1)
-        if surface.weight is not None:
-            behind, own = behind * surface.weight, own * surface.weight
-        light.append(surface.light * own)
-        weight.append(own)
-        at_or_behind.append(behind)
-    return sum(light[1:], light[0]), sum(weight[1:], weight[0]), sum(at_or_behind[1:], at_or_behind[0])
+    """``m_k I``, ``m_k`` and ``M_k`` of surfaces that share their pixels: each is a sum over them."""
+    sums: list[Tensor] = []
+    for light, x, cover in surfaces:
+        behind = weight_at_or_behind(x, nodes, k)
+        own = behind - weight_at_or_behind(x, nodes, k + 1)
+        if cover is not None:
+            behind, own = behind * cover, own * cover
+        terms = [light * own, own, behind]
+        sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms
+    return sums[0], sums[1], sums[2]
 
 
 def _stacked(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -122,10 +126,10 @@ def _stacked(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tupl
     visible = torch.ones_like(surfaces[0].x)
     left = unknown = visible
     stopped = []
-    for surface in surfaces:
-        behind = weight_at_or_behind(surface.x, nodes, k)
-        own = behind - weight_at_or_behind(surface.x, nodes, k + 1)
-        cover = torch.ones_like(surface.x) if surface.weight is None else surface.weight
+    for _, x, weight in surfaces:
+        behind = weight_at_or_behind(x, nodes, k)
+        own = behind - weight_at_or_behind(x, nodes, k + 1)
+        cover = torch.ones_like(x) if weight is None else weight
         passes = torch.where(behind > 0, 1.0 - cover * (1.0 - behind), 1.0)  # what layers in front leave
         stops = cover * own / passes.clamp_min(1e-6)  # of what arrives at the surface in this layer
         stopped.append(left * stops)
@@ -177,7 +181,7 @@ def framed(
     if behind is not None:
         behind = upsampled(behind, BEHIND_STEP)[..., : size[0], : size[1]]
         behind = functional.pad(behind, beyond, mode="replicate")
-    return Frame(placed, known, behind, margin, (height, width), size, stacked)
+    return Frame(placed, nodes, known, behind, margin, (height, width), size, stacked)
 
 
 def surfaces_of_image(
