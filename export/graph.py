@@ -7,10 +7,9 @@ from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.camera import Camera
-from torchdof.render.pipeline import tiled_by
 from torchdof.render.plan import Blur, Plan
 
-from .tiling import LOOP
+from .tiling import in_tiles
 
 __all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
 
@@ -117,5 +116,5 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     free = torch.export.Dim.AUTO
     batch, frame = {0: free}, {0: free, 2: free, 3: free}
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
-    with torch.no_grad(), tiled_by(LOOP):
+    with torch.no_grad(), in_tiles():
         return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)

@@ -4,17 +4,18 @@ A graph cannot choose its work before it runs. In a loop over tiles each step se
 inside skip every layer that the window does not hold.
 """
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof.render.pipeline import Tiling
+from torchdof.render.pipeline import Tiling, tiling
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Frame, Placed
 
-__all__ = ["LOOP", "side", "tile_by_tile"]
+__all__ = ["in_tiles", "side", "tile_by_tile"]
 
 _SIDE = 128
 
@@ -73,5 +74,11 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     return image.reshape(batch, colours, *frame.area)[..., : frame.size[0], : frame.size[1]]
 
 
-LOOP = Tiling(side, tile_by_tile)
-"""What :func:`torchdof.render.pipeline.tiled_by` takes."""
+@contextlib.contextmanager
+def in_tiles() -> Iterator[None]:
+    """Within this context graphs that are exported render their frames tile by tile."""
+    token = tiling.set(Tiling(side, tile_by_tile))
+    try:
+        yield
+    finally:
+        tiling.reset(token)

@@ -73,14 +73,11 @@ def accumulate(
     """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
 
     Args:
-        frame: The surfaces seen in each pixel.
+        frame: As in :func:`over`, as ``blurs`` and ``scatter``.
         blurs: Kernel and resolution of each layer.
         scatter: How a layer is scattered.
         normalize: False leaves the plain sum, which is dark at the frame's border and uneven at depth edges.
         highlights: Light that was extracted from the layers and splat ray by ray, ``[B, C, H, W]``.
-
-    Returns:
-        ``[B, C, H, W]``.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
@@ -96,13 +93,7 @@ def accumulate(
 def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Tensor:
     """The same scatter as :func:`accumulate`, as the paper does it: one pass, in which each pixel has its own kernel.
 
-    Args:
-        frame: The surface seen in each pixel.
-        blurs: Kernel of each layer, at full resolution; a pixel's own is interpolated between those around its coc.
-        normalize: As in :func:`accumulate`.
-
-    Returns:
-        ``[B, C, H, W]``.
+    A pixel's kernel is interpolated between those of the layers around its coc, at full resolution.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and
@@ -113,10 +104,8 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Ten
     kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
     light = frame.surfaces[0].light
     known = torch.ones_like(light) if frame.known is None else frame.known.expand_as(light)
-    if kernels.shape[1] == 1:
-        summed = fold(torch.cat([light, known[:, :1]], 1), kernels, halo, weights)
-    else:
-        summed = fold(torch.cat([light, known], 1), kernels.repeat(1, 2, 1, 1), halo, weights)
+    each = kernels.shape[1]
+    summed = fold(torch.cat([light, known[:, :each]], 1), kernels.repeat(1, min(2, each), 1, 1), halo, weights)
     summed = summed[..., : frame.size[0], : frame.size[1]]
     return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
 
@@ -130,14 +119,9 @@ def _composite_layers(
 ) -> Tensor:
     """All layers, far to near, over what is behind them: light ``[B, C, h, w]`` and, after it, its coverage.
 
-    Coverage has one channel, or C where each colour has a kernel of its own.
-
-    Args:
-        frame: The surfaces seen in each pixel.
-        blurs: Kernel and resolution of each layer.
-        scatter: How a layer is scattered.
-        composited: What is in front and what is behind it -> both together.
-        normalised: Scattered terms of a layer, its visibility among them -> its light and coverage; None: they are.
+    Coverage has one channel, or C where each colour has a kernel of its own. ``composited`` puts what is in front and
+    what is behind it together; ``normalised`` makes light and coverage of a layer's scattered terms, which without it
+    are just that.
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
     light = frame.surfaces[0].light
@@ -185,10 +169,7 @@ def _groups(run: list[int], blurs: Sequence[Blur], colours: int) -> list[list[in
 def _scattered(
     frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
 ) -> Iterator[Tensor]:
-    """Terms of the layers of a group, scattered at their resolution: see :meth:`torchdof.render.surfaces.Frame.layer`.
-
-    Where each colour has a kernel of its own, each term has as many channels.
-    """
+    """Scattered terms of the layers of a group; each has C channels where each colour has a kernel of its own."""
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
     layers = [frame.layer(k, halo, visibility) for k in group]
     terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1) for terms in layers for term in terms], 1)

@@ -17,6 +17,8 @@ CHANNELS = 16
 DIRECT_TAPS = 21 * 21
 """Taps up to which sums are taken in float32: longer ones of equal terms drift by more than 1e-6."""
 
+_FOURIER_STEP = 128  # lengths of a Fourier transform: those with large prime factors are slow
+
 
 def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     """Scatter with one kernel a channel, by convolution.
@@ -54,7 +56,7 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     if (2 * half + 1) ** 2 > DIRECT_TAPS and not is_traced():
         wide = widest_float(light.device)
         # what would wrap around falls into the halo
-        area = [_smooth_length(n + 2 * (half - halo)) for n in light.shape[-2:]]
+        area = [-(-(n + 2 * (half - halo)) // _FOURIER_STEP) * _FOURIER_STEP for n in light.shape[-2:]]
         spectrum = torch.fft.rfft2(light.to(wide), s=area) * torch.fft.rfft2(kernels.to(wide), s=area)
         rows, columns = (slice(half + halo, half + n - halo) for n in light.shape[-2:])
         return torch.fft.irfft2(spectrum, s=area)[..., rows, columns].to(light.dtype)
@@ -83,16 +85,3 @@ def check_shapes(light: Tensor, kernels: Tensor) -> None:
         raise ValueError(f"kernels must be square with an odd width, got {list(kernels.shape)}")
     if kernels.shape[-3] not in (1, light.shape[1]):
         raise ValueError(f"kernels must have 1 or {light.shape[1]} channels as the light does, got {kernels.shape[-3]}")
-
-
-def _smooth_length(least: int) -> int:
-    """Smallest length from ``least`` up whose only prime factors are 2, 3 and 5."""
-    length = least
-    while True:
-        rest = length
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-        length += 1

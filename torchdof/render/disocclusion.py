@@ -26,13 +26,10 @@ BEHIND_STEP = 2**_FINE_LEVELS
 
 
 class _Level:
-    """Farthest surfaces, at every ``step``-th pixel.
+    """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
 
-    Args:
-        values: Light, coc and weight ``[B, C + 2, H, W]``.
-        step: A power of two.
-        vote: Weight against other levels; None if it is in the weights.
-        least_px: Blur from which on a pixel looks so far.
+    ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
+    pixel looks so far.
     """
 
     def __init__(self, values: Tensor, step: int, vote: float | None, least_px: float) -> None:
@@ -41,29 +38,19 @@ class _Level:
         self.step, self.vote, self.least_px = step, vote, least_px
 
     def behind(self, item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor]:
-        """Linear interpolation at places of the image, among those of the four samples around that lie behind.
+        """Light and coc ``[C + 1, P]`` behind places ``[P]`` of the image, and their weight, 0 where nothing is.
 
-        Plain interpolation would mix in the foreground's own colour.
-
-        Args:
-            item: ``[P]``.
-            row: ``[P]``, in pixels of the image.
-            column: ``[P]``.
-            coc_px: What lies farther than this is behind, ``[P]``.
-
-        Returns:
-            Light and coc ``[C + 1, P]``, and their weight ``[P]``, 0 where nothing is behind.
+        Interpolated linearly among those of the four samples around that lie behind; plain interpolation would mix in
+        the foreground's own colour.
         """
-        top, down = pixels.between((row + 0.5) / self.step - 0.5, self.height)
-        left, right = pixels.between((column + 0.5) / self.step - 0.5, self.width)
-        first = (item * self.height + top) * self.width + left
+        row, column = (row + 0.5) / self.step - 0.5, (column + 0.5) / self.step - 0.5
         seen = total = torch.zeros_like(coc_px)
-        for i, vertical in enumerate((1 - down, down)):
-            for j, horizontal in enumerate((1 - right, right)):
-                offset = min(i, self.height - 1) * self.width + min(j, self.width - 1)
-                sample = self.flat.index_select(1, first + offset)
-                weight = vertical * horizontal * sample[-1] * (sample[-2] > coc_px + _BEHIND_PX)
-                seen, total = seen + sample[:-1] * weight, total + weight
+        corners, down, right = pixels.corners(item, row, column, self.height, self.width)
+        shares = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
+        for corner, share in zip(corners, shares, strict=True):
+            sample = self.flat.index_select(1, corner)
+            weight = share * sample[-1] * (sample[-2] > coc_px + _BEHIND_PX)
+            seen, total = seen + sample[:-1] * weight, total + weight
         total = torch.where(total > 1e-4, total, 0.0)
         return seen / total.clamp_min(1e-4), total
 
@@ -167,14 +154,9 @@ def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Te
 
 
 def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
-    """Pixels for which a level of the pyramid that they look at may show something farther; none too few.
+    """Pixels for which the coc of a level of the pyramid that they look at may be farther; none too few.
 
-    Args:
-        coc_px: Of the image, continued to whole pixels of the coarsest level, ``[B, 1, H, W]``.
-        farthest: Coc of the levels.
-
-    Returns:
-        ``[B, 1, H, W]``, bool.
+    The image's own coc is continued to whole pixels of the coarsest level.
     """
     coarsest = min(len(farthest), _TOLD_APART)
     near, blur = (functional.max_pool2d(c, 2**coarsest) for c in (-coc_px.detach(), coc_px.detach().abs()))

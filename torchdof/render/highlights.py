@@ -37,13 +37,7 @@ _TAPS = 2**21  # rays splat together
 
 
 class Rays(NamedTuple):
-    """Light extracted from one surface of an image.
-
-    Args:
-        pixels: Flat indices of its pixels in ``[B, 1, H, W]``, ``[n]``.
-        light: ``[C, n]``.
-        coc_px: ``[n]``.
-    """
+    """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.render.pixels`), and their coc."""
 
     pixels: Tensor
     light: Tensor
@@ -78,7 +72,7 @@ def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
 
 
 def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px: float) -> tuple[Surface, Rays | None]:
-    """Take out of a surface the light above a limit that needs to be traced.
+    """Take out of a surface of an image the light above a limit that needs to be traced.
 
     Args:
         surface: Of an image.
@@ -94,10 +88,10 @@ def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px
     is_bright = brightest > limit
     bright = pixels.where(is_bright if weight is None else is_bright & (weight > 0))
     coc = pixels.pick(coc_px.detach(), bright)[0]
-    is_traced = coc.abs() >= crisp_px
+    needed = coc.abs() >= crisp_px
     if nearest_px is not None and len(bright):
-        is_traced |= _reaches_border(bright, coc, coc_px) | _may_be_hidden(bright, coc, nearest_px)
-    bright = bright[is_traced & (coc.abs() > 1.0)]
+        needed |= _need_tracing(bright, coc, nearest_px)
+    bright = bright[needed & (coc.abs() > 1.0)]
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
     order = torch.argsort(peak.detach(), descending=True)
     taps = ((2.0 * coc.detach().abs() + 1.0) ** 2)[order].cumsum(0)
@@ -114,23 +108,18 @@ def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px
     return surface._replace(light=left), rays
 
 
-def _reaches_border(bright: Tensor, coc: Tensor, coc_px: Tensor) -> Tensor:
-    """Whether light of pixels lands beyond the border or so near that layers would scale it up there."""
-    height, width = coc_px.shape[-2:]
-    _, row, column = pixels.places(bright, height, width)
-    rows, columns = torch.minimum(row, height - 1 - row), torch.minimum(column, width - 1 - column)
-    return 2.0 * coc.abs() > torch.minimum(rows, columns) + 0.5
-
-
-def _may_be_hidden(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
+def _need_tracing(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     """Whether a ray of a pixel could meet a nearer surface, or land where layers would scale it; none too few.
 
-    Wider and wider windows are looked at: a surface that is nearer by ``d`` hides from at most ``d`` pixels away.
+    They do so beside the border and beside what is nearer. Wider and wider windows are looked at, in cells: a surface
+    that is nearer by ``d`` hides from at most ``d`` pixels away.
     """
-    item, row, column = pixels.places(bright, int(nearest_px.shape[-2]), int(nearest_px.shape[-1]))
+    height, width = nearest_px.shape[-2:]
+    item, row, column = pixels.places(bright, height, width)
+    to_border = torch.minimum(torch.minimum(row, height - 1 - row), torch.minimum(column, width - 1 - column)) + 0.5
+    found = 2.0 * coc.abs() > to_border
     cells = functional.max_pool2d(-nearest_px.detach(), _COARSE_CELL, ceil_mode=True)
     rows, columns = row // _COARSE_CELL, column // _COARSE_CELL
-    found = torch.zeros_like(coc, dtype=torch.bool)
     inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells
     farthest = float(torch.maximum(coc.max() + cells.max(), 2.0 * coc.abs().max()))
     while inner < farthest:
@@ -192,11 +181,7 @@ def splat(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, occlusion: boo
 
 
 class _Hiding:
-    """What may stand in the way of rays: what an image shows, in bins of 1 px of coc.
-
-    Args:
-        coc_px: ``[B, 1, H, W]``.
-    """
+    """What may stand in the way of rays: what an image shows, in bins of 1 px of its coc ``[B, 1, H, W]``."""
 
     def __init__(self, coc_px: Tensor) -> None:
         self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
@@ -212,15 +197,9 @@ class _Hiding:
             self.sums.append(functional.pad(cells.cumsum(-1).cumsum(-2), (1, 0, 1, 0)))
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor, farthest: float) -> Tensor:
-        """Share of each ray that nearer surfaces take: ``[n, k, k]`` for rays that land so many pixels away.
+        """Share of each ray that nearer surfaces take, ``[n, k, k]``: from sources ``[n]`` of a coc up to the farthest.
 
-        Args:
-            item: Of the rays' sources, ``[n]``.
-            row: ``[n]``.
-            column: ``[n]``.
-            coc: ``[n]``.
-            step: Pixels from a source to where its rays land, along each axis, ``[k]``.
-            farthest: Largest of ``coc``.
+        They land so many pixels ``[k]`` from their source along each axis.
         """
         hidden = coc.new_zeros(len(coc), len(step), len(step))
         for k, sums in zip(self.bins, self.sums, strict=True):
@@ -229,31 +208,18 @@ class _Hiding:
                 break
             scale = 1.0 - nearer / coc  # a ray passes this surface so far on its way, as a share of its step
             reach = scale.detach().abs() * step[-1]
-            top, bottom = (self._cell(row + end, self.height) for end in (-reach, reach + 1.0))
-            left, right = (self._cell(column + end, self.width) for end in (-reach, reach + 1.0))
-            shown = sums[item, bottom + 1, right + 1] - sums[item, top, right + 1]
-            shown = shown - sums[item, bottom + 1, left] + sums[item, top, left]
-            met = ((shown > 0) & (coc.detach() - _NEARER_PX >= nearer)).nonzero()[:, 0]
+            (top, bottom), (left, right) = (
+                [(place + end).clamp(0, size - 1).long() // _COARSE_CELL for end in (-reach, reach + 1.0)]
+                for place, size in ((row, self.height), (column, self.width))
+            )
+            count = sums[item, bottom + 1, right + 1] - sums[item, top, right + 1]
+            count = count - sums[item, bottom + 1, left] + sums[item, top, left]
+            met = ((count > 0) & (coc.detach() - _NEARER_PX >= nearer)).nonzero()[:, 0]
             if len(met):
                 way = scale[met, None] * step
-                share = self._share_of_bin(k, item[met], row[met, None] + way, column[met, None] + way)
-                hidden = hidden.index_add(0, met, share)
+                rows, columns = (row[met, None] + way)[:, :, None], (column[met, None] + way)[:, None, :]
+                around, down, right = pixels.corners(item[met, None, None], rows, columns, self.height, self.width)
+                shown = [(1.0 - (self.place[pixel] - k).abs()).clamp_min(0.0) for pixel in around]
+                upper, lower = torch.lerp(shown[0], shown[1], right), torch.lerp(shown[2], shown[3], right)
+                hidden = hidden.index_add(0, met, torch.lerp(upper, lower, down))
         return hidden.clamp(max=1.0)
-
-    def _cell(self, coordinate: Tensor, size: int) -> Tensor:
-        return coordinate.clamp(0, size - 1).long() // _COARSE_CELL
-
-    def _share_of_bin(self, k: int, item: Tensor, row: Tensor, column: Tensor) -> Tensor:
-        """How much of what the image shows at rows ``[n, k]`` and columns ``[n, k]`` lies in bin k: ``[n, k, k]``."""
-        # surfaces go on beyond the border
-        (top, down), (left, right) = pixels.between(row, self.height), pixels.between(column, self.width)
-        first = ((item[:, None] * self.height + top) * self.width)[:, :, None] + left[:, None, :]
-        down, right = down[:, :, None], right[:, None, :]
-        corners = []
-        for i in (0, 1):
-            for j in (0, 1):
-                offset = min(i, self.height - 1) * self.width + min(j, self.width - 1)
-                place = self.place[offset:].index_select(0, first.flatten()).view(first.shape)
-                corners.append((1.0 - (place - k).abs()).clamp_min(0.0))
-        upper, lower = torch.lerp(corners[0], corners[1], right), torch.lerp(corners[2], corners[3], right)
-        return torch.lerp(upper, lower, down)

@@ -1,9 +1,8 @@
 """The chain: an image's surfaces and its highlights, the layers they lie in, scattered and composited."""
 
-import contextlib
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import NamedTuple
 
@@ -22,35 +21,24 @@ from .plan import Blur, Plan
 from .scatter import fold
 from .surfaces import Frame, Surface, framed, surfaces_of_image
 
-__all__ = ["Tiling", "blur", "blur_attended", "blur_stack", "tiled_by"]
+__all__ = ["Tiling", "blur", "blur_attended", "blur_stack", "tiling"]
 
 _REACH = 4.0  # blur radii within which what lies around a pixel can change it: its light, and what is filled in behind
 _SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
 
 
 class Tiling(NamedTuple):
-    """How an exported graph goes over a frame.
+    """How an exported graph goes over a frame: ``render`` takes it, its kernels and what renders one piece of it.
 
-    Args:
-        align: What the frame must be a multiple of, given the pixels that the widest kernel reaches.
-        render: Renders a frame with kernels and what renders one piece of it.
+    ``align`` tells what the frame must be a multiple of, given the pixels that the widest kernel reaches.
     """
 
     align: Callable[[int], int]
     render: Callable[[Frame, Sequence[Blur], Callable[[Frame, Sequence[Blur]], Tensor]], Tensor]
 
 
-_tiling: ContextVar[Tiling | None] = ContextVar("tiling", default=None)
-
-
-@contextlib.contextmanager
-def tiled_by(tiling: Tiling) -> Iterator[None]:
-    """Within this context frames are rendered by a tiling, as a graph needs it; else they are rendered whole."""
-    token = _tiling.set(tiling)
-    try:
-        yield
-    finally:
-        _tiling.reset(token)
+tiling: ContextVar[Tiling | None] = ContextVar("tiling", default=None)
+"""Set by whoever exports a graph; frames are rendered whole else."""
 
 
 def blur(
@@ -145,7 +133,7 @@ def _render_item(
     behind_coc: Tensor | None = None,
     cover: Tensor | None = None,
 ) -> Tensor:
-    """The picture of float maps with a plan: the one entry to this engine.
+    """The picture ``[B, C, H, W]`` of float maps with a plan: the one entry to this engine.
 
     Args:
         plan: Layers.
@@ -155,12 +143,14 @@ def _render_item(
         behind_light: What is seen where the nearer surfaces of the image are taken away, if it is known.
         behind_coc: Its coc.
         cover: How much of each pixel each layer of a stack covers, ``[B, N, 1, H, W]``.
-
-    Returns:
-        ``[B, C, H, W]``.
     """
+    low, high = plan.coc_px[0], plan.coc_px[-1]  # beyond, blurs are alike, and differences of huge ones would cancel
     if cover is not None:
-        return _render_stack(plan, options, light, coc, cover)
+        coc = coc.clamp(low, high)
+        stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
+        # what no layer covers is seen through all of them
+        stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], high)))
+        return _composite(stack, None, plan, options, stacked=True)
     if plan.nodes == (0.0,):
         # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
         return light + 0.0 * torch.nan_to_num(coc) if torch.is_grad_enabled() and coc.requires_grad else light.clone()
@@ -168,7 +158,7 @@ def _render_item(
     if not options.check:
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
-    coc = _within(coc, plan)
+    coc = coc.clamp(low, high)
 
     # what is a highlight; without occlusion it matters only where a light is too bright for a coarse layer
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
@@ -180,31 +170,21 @@ def _render_item(
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None:
-        surfaces = _before_background(surfaces[0], behind_light, _within(behind_coc, plan), options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc.clamp(low, high), options)
     elif options.occlusion and limit is not None:
         widest = max(2.0, *(abs(c) for c in plan.coc_px))
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
         surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels)
 
     # the highlights of these, ray by ray
-    splats, rays = None, []
+    splats = None
     if limit is not None and plan.rays:
         extracted = [highlights.extract(s, limit, coc if options.occlusion else None, crisp_px) for s in surfaces]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
-    if rays:
-        splats = highlights.splat(rays, coc, options.table, options.occlusion)
+        splats = highlights.splat(rays, coc, options.table, options.occlusion) if rays else None
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, splats)
     return out if valid is None else torch.where(valid, out, image)
-
-
-def _render_stack(plan: Plan, options: Options, light: Tensor, coc: Tensor, cover: Tensor) -> Tensor:
-    """The picture of a stack, in which nothing is hidden."""
-    coc = _within(coc, plan)
-    stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
-    # what no layer covers is seen through all of them
-    stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], plan.coc_px[-1])))
-    return _composite(stack, None, plan, options, stacked=True)
 
 
 def _before_background(surface: Surface, behind: Tensor, behind_coc: Tensor, options: Options) -> list[Surface]:
@@ -220,12 +200,8 @@ def _before_background(surface: Surface, behind: Tensor, behind_coc: Tensor, opt
     if not options.check:
         valid = torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
         behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
-    behind_coc = torch.maximum(behind_coc, coc)
-    return [
-        Surface(other, other_coc, share),
-        Surface(own, coc, own_weight),
-        Surface(behind, behind_coc, behind_weight),
-    ]
+    shown = [Surface(other, other_coc, share), Surface(own, coc, own_weight)]
+    return [*shown, Surface(behind, torch.maximum(behind_coc, coc), behind_weight)]
 
 
 def _composite(
@@ -236,12 +212,11 @@ def _composite(
     stacked: bool,
     splats: Tensor | None = None,
 ) -> Tensor:
-    """Surfaces, and the light of highlights, to a picture. The list of surfaces is emptied."""
+    """Surfaces, and the light of highlights, to a picture."""
     light = surfaces[0].light
-    layered, tiling = options.method == "layered", _tiling.get() if torch.compiler.is_exporting() else None
+    layered, tiles = options.method == "layered", tiling.get() if torch.compiler.is_exporting() else None
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
-    align = None if tiling is None else tiling.align
-    del light
+    align = None if tiles is None else tiles.align
     frame = framed(surfaces, behind, plan.nodes, blurs, options.border == "extend", stacked, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
@@ -253,9 +228,4 @@ def _composite(
             return composite.accumulate_once(frame, blurs, options.normalize)
         return composite.accumulate(frame, blurs, scatter, options.normalize, splats)
 
-    return picture(frame, blurs) if tiling is None else tiling.render(frame, blurs, picture)
-
-
-def _within(coc: Tensor, plan: Plan) -> Tensor:
-    """Beyond the plan's reach blurs are alike, and differences of huge ones would cancel."""
-    return coc.clamp(plan.coc_px[0], plan.coc_px[-1])
+    return picture(frame, blurs) if tiles is None else tiles.render(frame, blurs, picture)

@@ -6,7 +6,7 @@ Depth edges, hidden surfaces and highlights concern few pixels; these are looked
 import torch
 from torch import Tensor
 
-__all__ = ["around", "between", "pick", "places", "put", "where"]
+__all__ = ["around", "corners", "pick", "places", "put", "where"]
 
 
 def where(mask: Tensor) -> Tensor:
@@ -15,12 +15,7 @@ def where(mask: Tensor) -> Tensor:
 
 
 def places(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Item, row and column of pixels.
-
-    Example:
-        >>> [part.tolist() for part in places(torch.tensor([5, 7]), 2, 3)]
-        [[0, 1], [1, 0], [2, 1]]
-    """
+    """Item, row and column of pixels."""
     line = pixels // width
     item = line // height
     return item, line - item * height, pixels - line * width
@@ -55,15 +50,13 @@ def around(pixels: Tensor, like: Tensor, reach: int) -> Tensor:
     return (lines[:, None] + columns).flatten(0, 1)
 
 
-def between(coordinate: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """The pixel before each coordinate along an axis, and the share of the next one, for linear interpolation.
+def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:
+    """The four pixels around places, for linear interpolation, and how far down and right of the first the places lie.
 
-    Values go on beyond both ends as they are there. An axis of one pixel has no next one, and gives it no share.
-
-    Example:
-        >>> [part.tolist() for part in between(torch.tensor([-1.0, 0.25, 2.0]), 3)]
-        [[0, 0, 1], [0.0, 0.25, 1.0]]
+    Values go on beyond the border as they are at it. An axis of one pixel has no next one, and gives it no weight.
     """
-    coordinate = coordinate.clamp(0, size - 1)
-    before = coordinate.floor().clamp(max=max(0, size - 2))
-    return before.long(), coordinate - before
+    row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
+    top, left = row.floor().clamp(max=max(0, height - 2)), column.floor().clamp(max=max(0, width - 2))
+    first = (item * height + top.long()) * width + left.long()
+    below, beside = min(1, height - 1) * width, min(1, width - 1)
+    return [first, first + beside, first + below, first + (below + beside)], row - top, column - left

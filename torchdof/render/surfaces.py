@@ -140,7 +140,7 @@ def _stacked(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tupl
 
 
 def framed(
-    surfaces: list[Surface],
+    surfaces: Sequence[Surface],
     behind: Tensor | None,
     nodes: Sequence[float],
     blurs: Sequence[Blur],
@@ -151,7 +151,7 @@ def framed(
     """Surfaces of an image as a frame: they go on beyond the border as they are at it; light there is 0 and unknown.
 
     Args:
-        surfaces: Near to far if stacked. The list is emptied: large frames have no room for two copies.
+        surfaces: Near to far if stacked.
         behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
         nodes: Places of the layers; beyond the outermost ones surfaces belong to these.
         blurs: Kernel and resolution of each layer.
@@ -167,17 +167,11 @@ def framed(
     beyond = (0, width - size[1], 0, height - size[0])  # right and below, to whole blocks
     ends = (margin, margin + beyond[1], margin, margin + beyond[3])
     placed = []
-    while surfaces:
-        light, coc, weight = surfaces.pop(0)
-        x = blur_axis(coc).clamp(nodes[0], nodes[-1])
-        placed.append(
-            Placed(
-                functional.pad(light, ends, mode="replicate" if extend else "constant"),
-                functional.pad(x, ends, mode="replicate"),
-                None if weight is None else functional.pad(weight, ends, mode="replicate"),
-            )
-        )
-    known = None if extend else functional.pad(torch.ones_like(x[:1]), ends)
+    for light, coc, weight in surfaces:
+        light = functional.pad(light, ends, mode="replicate" if extend else "constant")
+        x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
+        placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
+    known = None if extend else functional.pad(torch.ones_like(surfaces[0].coc_px[:1]), ends)
     if behind is not None:
         behind = upsampled(behind, BEHIND_STEP)[..., : size[0], : size[1]]
         behind = functional.pad(behind, beyond, mode="replicate")
