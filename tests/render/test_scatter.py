@@ -190,21 +190,6 @@ def test_scatter_takes_any_shape_and_stride(
     assert_close(out, columns, rtol=1e-10, atol=1e-13)
 
 
-@BOTH
-@pytest.mark.parametrize(
-    ("light", "kernels", "message"),
-    [
-        (torch.rand(3, 4, 4), torch.rand(1, 3, 3), r"light must be \[B, C, H, W\], got \[3, 4, 4\]"),
-        (torch.rand(1, 3, 4, 4), torch.rand(1, 4, 4), r"square with an odd width, got \[1, 4, 4\]"),
-        (torch.rand(1, 3, 4, 4), torch.rand(1, 3, 5), r"square with an odd width, got \[1, 3, 5\]"),
-        (torch.rand(1, 3, 4, 4), torch.rand(2, 3, 3), "kernels must have 1 or 3 channels as the light does, got 2"),
-    ],
-)
-def test_shapes_that_do_not_fit_are_refused(scatter: Spread, light: Tensor, kernels: Tensor, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        scatter(light, kernels)
-
-
 FRAME_1080P = """
 import torch
 from torchdof import kernel, memory

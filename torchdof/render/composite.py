@@ -35,9 +35,6 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
         blurs: Kernel and resolution of each layer.
         scatter: How a layer is scattered.
 
-    Returns:
-        ``[B, C, H, W]``.
-
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
@@ -72,12 +69,8 @@ def accumulate(
 ) -> Tensor:
     """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
 
-    Args:
-        frame: As in :func:`over`, as ``blurs`` and ``scatter``.
-        blurs: Kernel and resolution of each layer.
-        scatter: How a layer is scattered.
-        normalize: False leaves the plain sum, which is dark at the frame's border and uneven at depth edges.
-        highlights: Light that was extracted from the layers and splat ray by ray, ``[B, C, H, W]``.
+    Not normalised, the plain sum is dark at the frame's border and uneven at depth edges. ``highlights`` is light that
+    was extracted from the layers and splat ray by ray; else arguments are those of :func:`over`.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
@@ -127,16 +120,21 @@ def _composite_layers(
     light = frame.surfaces[0].light
     picture = light.new_zeros(light.shape[0], frame.colours + blurs[0].kernel.shape[0], *frame.area)
 
-    # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between
-    runs: dict[tuple[int, bool], list[int]] = {}
+    # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
+    # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
+    most = CHANNELS // (frame.colours + 3) if blurs[0].kernel.shape[0] == 1 else 1
+    runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
-        scale = blurs[k].scale
-        runs.setdefault((scale, scale > 1 and frame.nodes[k] < 0), []).append(k)
-    for (scale, _), run in runs.items():
+        groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and frame.nodes[k] < 0), [[]])
+        widths = [blurs[j].kernel.shape[-1] for j in [*groups[-1], k]]
+        if len(widths) > max(most, 1) or max(widths) ** 2 > 2 * min(widths) ** 2:
+            groups.append([])
+        groups[-1].append(k)
+    for (scale, _), groups in runs.items():
         part = picture
         if scale > 1:  # one pixel more on each side, to interpolate from
             part = picture.new_zeros(*picture.shape[:2], *(n // scale + 2 for n in frame.area))
-        for group in _groups(run, blurs, frame.colours):
+        for group in groups:
 
             def with_group(behind: Tensor, group: list[int] = group) -> Tensor:
                 for layer in _scattered(frame, blurs, scatter, group, normalised is not None):
@@ -149,21 +147,10 @@ def _composite_layers(
             fine = upsampled(part, scale)
             return composited(fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale], behind)
 
-        picture = part if scale == 1 else _where_needed(with_run, picture, frame, blurs, run)
+        if scale > 1:
+            part = _where_needed(with_run, picture, frame, blurs, [k for group in groups for k in group])
+        picture = part
     return picture
-
-
-def _groups(run: list[int], blurs: Sequence[Blur], colours: int) -> list[list[int]]:
-    """Layers of a run that one convolution scatters: as many as fill its channels, with kernels of like size."""
-    most = CHANNELS // (colours + 3) if blurs[0].kernel.shape[0] == 1 else 1
-    groups: list[list[int]] = []
-    for k in run:
-        widths = [blurs[j].kernel.shape[-1] for j in [*groups[-1], k]] if groups else []
-        if 1 < len(widths) <= most and max(widths) ** 2 <= 2 * min(widths) ** 2:
-            groups[-1].append(k)
-        else:
-            groups.append([k])
-    return groups
 
 
 def _scattered(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..arguments import is_traced
 
-__all__ = ["CHANNELS", "check_shapes", "convolve", "widest_float"]
+__all__ = ["CHANNELS", "DIRECT_TAPS", "convolve", "widest_float"]
 
 CHANNELS = 16
 """Channels of one depthwise convolution: on CPUs fewer take as long, in PyTorch and in onnxruntime."""
@@ -29,23 +29,8 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     Args:
         light: ``[B, C, H, W]``.
         kernels: ``[1 or C, k, k]``, symmetric under a half turn, k odd.
-        halo: Pixels on each side that scatter light into the result but are not part of it.
-
-    Returns:
-        ``[B, C, H - 2 halo, W - 2 halo]``. Differentiable in both.
-
-    Raises:
-        ValueError: If the shapes do not fit.
-
-    Example:
-        >>> from torchdof import kernel
-        >>> from torchdof.render.scatter import fold
-        >>> light = torch.rand(1, 2, 9, 9, dtype=torch.float64)
-        >>> bank = kernel.disc(1.7)[None].expand(2, -1, -1)
-        >>> bool(torch.allclose(convolve(light, bank), fold(light, bank)))
-        True
+        halo: Pixels on each side that scatter light into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
     """
-    check_shapes(light, kernels)
     half, channels = kernels.shape[-1] // 2, light.shape[1]
     if halo > half:
         spare = halo - half
@@ -71,17 +56,3 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
 def widest_float(device: torch.device) -> torch.dtype:
     """Type for long sums; not every device has float64."""
     return torch.float32 if device.type == "mps" else torch.float64
-
-
-def check_shapes(light: Tensor, kernels: Tensor) -> None:
-    """Refuse light and kernels that do not fit.
-
-    Raises:
-        ValueError: Saying what was expected.
-    """
-    if light.ndim != 4:
-        raise ValueError(f"light must be [B, C, H, W], got {list(light.shape)}")
-    if kernels.shape[-1] != kernels.shape[-2] or kernels.shape[-1] % 2 == 0:
-        raise ValueError(f"kernels must be square with an odd width, got {list(kernels.shape)}")
-    if kernels.shape[-3] not in (1, light.shape[1]):
-        raise ValueError(f"kernels must have 1 or {light.shape[1]} channels as the light does, got {kernels.shape[-3]}")

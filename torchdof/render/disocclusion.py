@@ -21,6 +21,7 @@ _BEHIND_PX = 2.0  # a hidden surface lies at least so much farther, in coc
 _FALL = 0.7  # weight of a level of the pyramid against the finer one before
 _FINE_LEVELS = 2  # of the pyramid that each pixel looks at; the coarser ones are looked at from cells as large as these
 _TOLD_APART = 3  # level of the pyramid whose pixels are told apart when looking for those that may hide something
+
 BEHIND_STEP = 2**_FINE_LEVELS
 """Light behind both surfaces is known at every so many pixels."""
 
@@ -80,14 +81,13 @@ def fill_hidden(
     the levels show, the farthest.
 
     Args:
-        light: Own light of each pixel ``[B, C, H, W]``.
+        light: Each pixel's own, as :func:`torchdof.render.matting.split_mixed` gives it, ``[B, C, H, W]``.
         coc_px: Its signed coc ``[B, 1, H, W]``.
-        other_light: Light of the second surface of mixed pixels, as :func:`torchdof.render.matting.split_mixed` has it.
-        other_coc_px: Its coc.
-        share: Its share, 0 where a pixel is not mixed.
+        other_light: Of mixed pixels' second surface, from there as well, as the next two.
+        other_coc_px: ``[B, 1, H, W]``.
+        share: ``[B, 1, H, W]``, 0 where a pixel is not mixed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
-        threshold: Largest light that is no highlight's ``[B, 1, H, W]``: a highlight is in one place, so what is hidden
-            beside it is none.
+        threshold: Largest light that is no highlight's, ``[B, 1, H, W]``; a highlight is nowhere else but in its place.
         levels: Levels of the pyramid, from 2; the widest look is ``2 ** levels`` pixels.
 
     Returns:

@@ -34,10 +34,6 @@ def downsampled(values: Tensor, scale: int) -> Tensor:
     """Mean of each ``scale x scale`` values, a power of two: ``[..., H, W] -> [..., H / scale, W / scale]``.
 
     By halves, for a sum could overflow.
-
-    Example:
-        >>> downsampled(torch.arange(16.0).reshape(4, 4), 4).tolist()
-        [[7.5]]
     """
     for _ in range(scale.bit_length() - 1):
         rows = torch.lerp(values[..., 0::2, :], values[..., 1::2, :], 0.5)
@@ -53,14 +49,8 @@ def upsampled(values: Tensor, scale: int) -> Tensor:
 def shrink(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
     """Size of a kernel that is used at every ``scale``-th pixel, as a share of the size that it stands for.
 
-    Args:
-        table: Blur of the lens.
-        coc_px: Its coc in coarse pixels, signed.
-        width: Width of the image in coarse pixels.
-        scale: A power of two, from 2.
-
-    Returns:
-        A factor for the coc, at most 1.
+    It is a factor for the coc, at most 1. The coc, signed, and the width of the image are in coarse pixels; ``scale``
+    is a power of two, from 2.
     """
     if abs(coc_px) > _LARGEST_PX or table.reach_px(coc_px, width) >= _PERIOD / 2 - 1:
         return _by_moments(table, coc_px, width, scale)

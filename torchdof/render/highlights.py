@@ -45,16 +45,9 @@ class Rays(NamedTuple):
 
 
 def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Largest light that is no highlight's.
+    """Largest light ``[B, 1, H, W]`` that is no highlight's, where light ``[B, C, H, W]`` is valid.
 
     It is :data:`FACTOR` times what four fifths of the pixels of a cell stay below, interpolated between cells.
-
-    Args:
-        light: ``[B, C, H, W]``.
-        valid: ``[B, 1, H, W]``, 0 where the light is not known; None counts all.
-
-    Returns:
-        ``[B, 1, H, W]``.
     """
     height, width = light.shape[-2:]
     brightest = light.detach()[..., ::2, ::2].amax(1, keepdim=True)
@@ -81,7 +74,7 @@ def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px
         crisp_px: Blurs from this radius on lose their edge in coarse layers, so they are traced in any case.
 
     Returns:
-        The surface with the light that is left, and the rays; None where there are none.
+        The surface with what is left of its light, and the rays if there are any.
     """
     light, coc_px, weight = surface
     brightest = light.amax(1, keepdim=True)
@@ -133,16 +126,10 @@ def _need_tracing(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
 
 
 def splat(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, occlusion: bool = True) -> Tensor:
-    """Scatter highlights, each ray to where it lands unless a nearer surface is in its way.
+    """Scatter highlights to ``[B, C, H, W]``, each ray to where it lands unless a nearer surface is in its way.
 
-    Args:
-        rays: From :func:`extract`.
-        coc_px: What each pixel shows, ``[B, 1, H, W]``.
-        table: Blur of the lens.
-        occlusion: False lets all rays pass.
-
-    Returns:
-        ``[B, C, H, W]``. Differentiable in the light and coc of the rays.
+    What is in the way is told by the coc that each pixel shows, ``[B, 1, H, W]``; without occlusion all rays pass.
+    Differentiable in the light and coc of the rays.
     """
     batch, _, height, width = coc_px.shape
     longest = max(height, width)

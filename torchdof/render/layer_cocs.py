@@ -62,13 +62,7 @@ def ends(x: Tensor) -> tuple[float, float]:
 def plane_nodes(x: Tensor, tolerance: float) -> list[float]:
     """Places at which many pixels lie and few around them: planes that face the camera, and distant backgrounds.
 
-    Args:
-        x: Places of pixels, ``[B, 1, H, W]``.
-        tolerance: Decides how far around a place few may lie: as far as the next layer would be.
-
-    Example:
-        >>> plane_nodes(torch.tensor([3.0, 7.25]).repeat(1, 1, 64, 32), 1 / 255)
-        [3.0, 7.25]
+    Few may lie as far around as the next layer would be at this tolerance.
     """
     step = max(1, math.isqrt(x.numel() // _SAMPLES))
     return _crowded(x[..., ::step, ::step].flatten(), width=0.2, least_share=0.01, tolerance=tolerance)
@@ -85,14 +79,10 @@ def border_nodes(x: Tensor) -> list[float]:
 
 
 def _crowded(x: Tensor, width: float, least_share: float, tolerance: float | None = None) -> list[float]:
-    """Places at which at least so large a share of all lies, and 16, the most crowded first.
+    """Places at which at least so large a share of all places ``[n]`` lies, and 16, the most crowded first.
 
-    Args:
-        x: Places, ``[n]``.
-        width: What counts as one place, in finest distances; a third of it is a bin of the histogram.
-        least_share: Of all places.
-        tolerance: Of what lies within a layer's spacing of such a place, half must lie at it; None does not look
-            around.
+    What counts as one place is ``width`` finest distances wide, three bins of the histogram. With a tolerance, half of
+    what lies within a layer's spacing of such a place must lie at it.
     """
     bins = torch.round(_in_finest(x) * (3.0 / width)).long()
     first = int(bins.min())

@@ -31,15 +31,12 @@ def from_blur_axis(x: float) -> float:
 
 
 def weight_at_or_behind(x: Tensor, nodes: Sequence[float], k: int) -> Tensor:
-    """How much of each pixel lies in layer ``k`` or behind it: ``M_k`` of the composite.
+    """How much of each pixel, 0 to 1, lies in layer ``k`` or behind it: ``M_k`` of the composite.
 
     Args:
-        x: Places on the blur axis, any shape.
+        x: Places on the blur axis, any shape; those beyond the outermost nodes belong to these.
         nodes: Places of the layers, strictly increasing: near to far.
-        k: Layer, 0 to ``len(nodes)``; ``len(nodes)`` is behind everything.
-
-    Returns:
-        Weights in [0, 1], shaped as ``x``. Pixels beyond the outermost nodes belong to these.
+        k: Layer, 0 to ``len(nodes)``, which is behind everything.
     """
     if k == 0:
         return torch.ones_like(x)

@@ -44,14 +44,9 @@ tiling: ContextVar[Tiling | None] = ContextVar("tiling", default=None)
 def blur(
     image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options, behind: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """Depth of field of checked arguments; see :func:`torchdof.blur_by_coc`.
+    """Depth of field of checked arguments, as :func:`torchdof.blur_by_coc` has them; ``behind`` is background and coc.
 
-    Args:
-        image: ``[B, C, H, W]``.
-        coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``.
-        plan: Layers to render with; None plans for each item.
-        options: Options.
-        behind: Background and its coc, where they are known.
+    Without a plan each item gets its own.
     """
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
@@ -100,16 +95,7 @@ def blur_attended(
 
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
-    """Depth of field of a stack of layers; see :meth:`torchdof.DepthOfField.layers`.
-
-    Args:
-        rgba: ``[B, N, C + 1, H, W]``, premultiplied.
-        coc_px: ``[B, N, 1, H, W]``.
-        options: Options.
-
-    Returns:
-        ``[B, C + 1, H, W]``, premultiplied.
-    """
+    """Depth of field of checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
     wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
     light, coc = rgba.to(wide), coc_px.to(wide)
     cover = light[:, :, -1:].clamp(0.0, 1.0)

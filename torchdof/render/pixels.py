@@ -35,13 +35,7 @@ def put(values: Tensor, pixels: Tensor, new: Tensor) -> Tensor:
 
 
 def around(pixels: Tensor, like: Tensor, reach: int) -> Tensor:
-    """The pixels around each, row by row, those beyond the frame's border on it: ``[(2 reach + 1)^2, P]``.
-
-    Args:
-        pixels: ``[P]``.
-        like: A map of the frame, ``[..., H, W]``.
-        reach: Pixels to each side.
-    """
+    """The pixels up to ``reach`` around each, row by row, those beyond the border on it: ``[(2 reach + 1)^2, P]``."""
     height, width = like.shape[-2:]
     item, row, column = places(pixels, height, width)
     offsets = torch.arange(-reach, reach + 1, device=pixels.device)[:, None]

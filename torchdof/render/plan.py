@@ -64,11 +64,7 @@ class Plan:
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
         """Layers for this scene: they span the coc that occur, with one on each end, and lie close at those of borders.
 
-        A scene of one plane gets one layer, and its kernel is exact.
-
-        Args:
-            coc_px: ``[B, 1, H, W]``; NaN is left out.
-            tolerance: As in :class:`torchdof.DepthOfField`.
+        A scene ``[B, 1, H, W]`` of one plane gets one layer, and its kernel is exact. NaN is left out.
         """
         x = layer_cocs.on_axis(coc_px)
         low, high = layer_cocs.ends(x)
@@ -77,7 +73,6 @@ class Plan:
         nodes = [low, high]
 
         def add(node: float, gap: float) -> None:
-            """A layer, unless it is one of the ends or nearer to another one than a gap."""
             if low < node < high and min(abs(node - other) for other in nodes) > gap:
                 nodes.append(node)
 
@@ -136,16 +131,10 @@ class Plan:
     def blurs(
         self, table: BlurTable, size: tuple[int, int], dtype: torch.dtype, device: torch.device, coarse: bool
     ) -> list[Blur]:
-        """Kernel and resolution of each layer, for a frame of ``size`` (height, width).
+        """Kernel and resolution of each layer for a frame of ``size`` (height, width).
 
-        Traced code holds the kernels as constants, so a table that is tied to the width of the image ties it as well.
-
-        Args:
-            table: Blur of the lens.
-            size: Height and width of the frame; kernels are cut to what reaches from one of its pixels to another.
-            dtype: Of the kernels.
-            device: Of the kernels.
-            coarse: Whether layers may have a coarser resolution.
+        Kernels are cut to what reaches from one pixel of the frame to another. Traced code holds them as constants, so
+        a table that is tied to the width of the image ties it as well.
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
@@ -173,16 +162,10 @@ class Plan:
 
 
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:
-    """Kernels of single pixels, such as highlights: each that of the nearest 1/32 px where no gradient asks for more.
+    """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, of signed coc ``[n]``.
 
-    Args:
-        table: Blur of the lens.
-        coc_px: Signed coc of the pixels, ``[n]``.
-        width: Of the image in pixels.
-        longest: Pixels of the frame's longer side; kernels are cut to what reaches within it.
-
-    Returns:
-        ``[n, 1 or C, k, k]``, float64.
+    Each is that of the nearest 1/32 px where no gradient asks for more. They are cut to what reaches within a frame
+    whose longer side is ``longest`` pixels.
     """
     if torch.is_grad_enabled() and coc_px.requires_grad:
         kernels = table.kernels(coc_px, width)

@@ -47,8 +47,8 @@ class Frame:
         known: 1 where light was seen, 0 where it is unknown, ``[1 or B, 1, ...]`` as they are; None: all is known.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
         margin: Pixels on each side, as many as the widest kernel reaches.
-        area: The frame's height and width, continued to whole blocks of the coarsest layer.
-        size: The frame's height and width.
+        area: Height and width, continued to whole blocks of the coarsest layer.
+        size: Height and width of the image.
         stacked: The surfaces of a pixel, near to far, each cover it by their weight, whatever the others do. False:
             their weights are shares of the pixel.
     """
@@ -89,13 +89,10 @@ class Frame:
         return torch.stack([((x > low) & (x < high)).any() for x in places]).any()
 
     def layer(self, k: int, halo: int, visibility: bool) -> list[Tensor]:
-        """What layer k scatters: light ``m_k I`` and weight ``m_k``; with visibility also ``M_k`` and the seen weight.
+        """What layer k scatters, with so many pixels beyond the area: light ``m_k I`` and the weight ``m_k`` seen.
 
-        Args:
-            k: Which layer.
-            halo: Pixels beyond the area that are needed.
-            visibility: Whether to give ``M_k``, the weight at or behind the layer, and the part of ``m_k`` whose light
-                was seen, where some was not. Without it, only weight that was seen is given.
+        With visibility all of ``m_k``, then ``M_k``, the weight at or behind the layer; and what of ``m_k`` was seen,
+        where some was not.
         """
         surfaces = [Placed(*(None if t is None else self.cut(t, halo) for t in s)) for s in self.surfaces]
         known = None if self.known is None else self.cut(self.known, halo)
@@ -150,13 +147,14 @@ def framed(
 ) -> Frame:
     """Surfaces of an image as a frame: they go on beyond the border as they are at it; light there is 0 and unknown.
 
+    Surfaces beyond the outermost nodes belong to these.
+
     Args:
         surfaces: Near to far if stacked.
+        nodes: As in :class:`Frame`, as ``stacked``.
         behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
-        nodes: Places of the layers; beyond the outermost ones surfaces belong to these.
         blurs: Kernel and resolution of each layer.
         extend: Continue light over the border as well, as if it were known.
-        stacked: As in :class:`Frame`.
         align: What the area must be a multiple of, given the margin; None: the coarsest layer's pixel.
     """
     coarsest = max(blur.scale for blur in blurs)
@@ -181,18 +179,9 @@ def framed(
 def surfaces_of_image(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
 ) -> tuple[list[Surface], Tensor]:
-    """What each pixel shows, what is mixed into it or hidden behind it, and light behind both.
+    """What each pixel shows, and what is mixed into it or hidden behind it; and light behind both.
 
-    Args:
-        light: ``[B, C, H, W]``.
-        coc_px: ``[B, 1, H, W]``, signed.
-        valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
-        threshold: As in :func:`torchdof.render.disocclusion.fill_hidden`.
-        levels: As in :func:`torchdof.render.disocclusion.fill_hidden`.
-
-    Returns:
-        Each pixel's own surface and its second one; and light of what lies behind both, at every
-        :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel ``[B, C, h, w]``, for somewhat more than the image.
+    Arguments and what is behind are those of :func:`torchdof.render.disocclusion.fill_hidden`.
     """
     compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
     maps = (_operator if compiling else _split_and_fill)(light, coc_px, valid, threshold, levels)
