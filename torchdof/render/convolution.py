@@ -29,7 +29,7 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     Args:
         light: ``[B, C, H, W]``.
         kernels: ``[1 or C, k, k]``, symmetric under a half turn, k odd.
-        halo: Pixels on each side that scatter light into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
+        halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
     """
     half, channels = kernels.shape[-1] // 2, light.shape[1]
     if halo > half:

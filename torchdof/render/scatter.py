@@ -23,7 +23,7 @@ def fold(light: Tensor, kernels: Tensor, halo: int = 0, weights: Tensor | None =
     Args:
         light: ``[B, C, H, W]``.
         kernels: ``[1 or C, k, k]``, k odd; or, with weights, a bank of them ``[n, 1 or C, k, k]``.
-        halo: Pixels on each side that scatter light into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
+        halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
         weights: How much of each kernel of the bank a pixel is scattered with, ``[B, n, H, W]``.
 
     Reference:

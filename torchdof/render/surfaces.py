@@ -147,14 +147,13 @@ def framed(
 ) -> Frame:
     """Surfaces of an image as a frame: they go on beyond the border as they are at it; light there is 0 and unknown.
 
-    Surfaces beyond the outermost nodes belong to these.
-
     Args:
         surfaces: Near to far if stacked.
-        nodes: As in :class:`Frame`, as ``stacked``.
+        nodes: As in :class:`Frame`; surfaces beyond the outermost ones belong to these.
         behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
         blurs: Kernel and resolution of each layer.
         extend: Continue light over the border as well, as if it were known.
+        stacked: As in :class:`Frame`.
         align: What the area must be a multiple of, given the margin; None: the coarsest layer's pixel.
     """
     coarsest = max(blur.scale for blur in blurs)
