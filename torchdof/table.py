@@ -147,7 +147,7 @@ class BlurTable:
             True
         """
         if self._fingerprint is None:
-            facts = [self.family, self.unit, self.sensor_width_mm, self._px_per_unit(1.0), self.coc.tolist()]
+            facts: list[Any] = [self.family, self.unit, self.sensor_width_mm, self._px_per_unit(1.0), self.coc.tolist()]
             facts += [(name, value.tolist()) for name, value in self._params.items()]
             self._fingerprint = hashlib.sha256(repr(facts).encode()).hexdigest()
         return self._fingerprint

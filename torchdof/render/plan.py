@@ -1,6 +1,7 @@
 """What a scene needs: the layers to render it with, for a tolerance, and their kernels."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -150,8 +151,9 @@ class Plan:
             bank = []
             for coc, scale in zip(self.coc_px, scales, strict=True):
                 longest_px = -(-max(size) // scale)
-                wide = table.reach_px(coc / scale, width / scale) > longest_px - 0.5
-                window = 2 * longest_px - 1 if wide else None
+                reach = functools.partial(table.reach_px, coc / scale, width / scale)
+                reach_px = _kernels.get((lens, coc, width, scale), reach)
+                window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
         return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
 
@@ -205,7 +207,7 @@ def _constant_kernels(table: BlurTable, coc_px: Sequence[float], width: int, sca
 
 for _constant in (_constant_shapes, _constant_kernels):  # one result each, for a compiled graph holds one of a function
     # what torch.compiler.assume_constant_result does, without importing the whole compiler for it
-    _constant._dynamo_marked_constant = True  # type: ignore[attr-defined]
+    _constant._dynamo_marked_constant = True  # type: ignore[union-attr]
 
 
 def _masked(kernel: Tensor, longest: int) -> Tensor:

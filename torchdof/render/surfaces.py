@@ -94,7 +94,7 @@ class Frame:
         With visibility all of ``m_k``, then ``M_k``, the weight at or behind the layer; and what of ``m_k`` was seen,
         where some was not.
         """
-        surfaces = [Placed(*(None if t is None else self.cut(t, halo) for t in s)) for s in self.surfaces]
+        surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
         known = None if self.known is None else self.cut(self.known, halo)
         light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, self.nodes, k)
         if not visibility:
