@@ -117,13 +117,13 @@ def fill_hidden(
     may_hide = _may_hide(functional.pad(coc_px, ends, mode="replicate"), [far_coc for _, far_coc, _ in pyramid])
     hides = may_hide[..., :height, :width] & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT)
     nearest = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-NEVER_PX), BEHIND_STEP)
-    cells = pixels.where(functional.max_pool2d(functional.pad(hides.to(coc_px.dtype), ends), BEHIND_STEP) > 0)
+    cells = pixels.indices(functional.max_pool2d(functional.pad(hides.to(coc_px.dtype), ends), BEHIND_STEP) > 0)
     item, row, column = pixels.places(cells, nearest.shape[-2], nearest.shape[-1])
     centre = (BEHIND_STEP - 1) / 2
     cell_places = (item, row * BEHIND_STEP + centre, column * BEHIND_STEP + centre, pixels.pick(nearest, cells)[0])
     total, seen = _look(looks, *cell_places, farthest=True)
-    found = pixels.where(total > 0)
-    behind = pixels.put(looks[_FINE_LEVELS - 1].light, cells[found], seen[:-1].index_select(1, found))
+    shown = pixels.indices(total > 0)
+    behind = pixels.put(looks[_FINE_LEVELS - 1].light, cells[shown], seen[:-1].index_select(1, shown))
     if levels > _FINE_LEVELS:
         total, seen = _look(looks[_FINE_LEVELS:], *cell_places)
         values = nearest.new_zeros(nearest.shape[0], len(seen) + 1, *nearest.shape[-2:])
@@ -131,10 +131,10 @@ def fill_hidden(
         looks = [*looks[:_FINE_LEVELS], _Level(values, BEHIND_STEP, None, looks[_FINE_LEVELS].least_px)]
 
     # each pixel behind which these levels show something gets it as its second sample
-    hiding = pixels.where(hides)
+    hiding = pixels.indices(hides)
     total, seen = _look(looks, *pixels.places(hiding, height, width), pixels.pick(coc_px, hiding)[0])
-    found = pixels.where(total > 0)
-    hiding, seen = hiding[found], seen.index_select(1, found)
+    shown = pixels.indices(total > 0)
+    hiding, seen = hiding[shown], seen.index_select(1, shown)
     return (
         pixels.put(other_light, hiding, seen[:-1]),
         pixels.put(other_coc_px, hiding, seen[-1]),
@@ -160,15 +160,15 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
     """
     coarsest = min(len(farthest), _TOLD_APART)
     near, blur = (functional.max_pool2d(c, 2**coarsest) for c in (-coc_px.detach(), coc_px.detach().abs()))
-    found = torch.zeros_like(near, dtype=torch.bool)
+    may_hide = torch.zeros_like(near, dtype=torch.bool)
     for level, coc in enumerate(farthest, 1):
         around = functional.max_pool2d(coc.detach(), 3, stride=1, padding=1)
         if level < coarsest:
             around = functional.max_pool2d(around, 2 ** (coarsest - level))
         elif level > coarsest:
             around = functional.interpolate(around, scale_factor=float(2 ** (level - coarsest)), mode="nearest")
-        found = found | ((around > _BEHIND_PX - near) & (blur >= _least_px(level)))
-    return functional.interpolate(found.to(near.dtype), scale_factor=float(2**coarsest), mode="nearest") > 0
+        may_hide = may_hide | ((around > _BEHIND_PX - near) & (blur >= _least_px(level)))
+    return functional.interpolate(may_hide.to(near.dtype), scale_factor=float(2**coarsest), mode="nearest") > 0
 
 
 def _look(

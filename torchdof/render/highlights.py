@@ -79,7 +79,7 @@ def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px
     light, coc_px, weight = surface
     brightest = light.amax(1, keepdim=True)
     is_bright = brightest > limit
-    bright = pixels.where(is_bright if weight is None else is_bright & (weight > 0))
+    bright = pixels.indices(is_bright if weight is None else is_bright & (weight > 0))
     coc = pixels.pick(coc_px.detach(), bright)[0]
     needed = coc.abs() >= crisp_px
     if nearest_px is not None and len(bright):
@@ -110,7 +110,7 @@ def _need_tracing(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     height, width = nearest_px.shape[-2:]
     item, row, column = pixels.places(bright, height, width)
     to_border = torch.minimum(torch.minimum(row, height - 1 - row), torch.minimum(column, width - 1 - column)) + 0.5
-    found = 2.0 * coc.abs() > to_border
+    needed = 2.0 * coc.abs() > to_border
     cells = functional.max_pool2d(-nearest_px.detach(), _COARSE_CELL, ceil_mode=True)
     rows, columns = row // _COARSE_CELL, column // _COARSE_CELL
     inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells
@@ -120,9 +120,9 @@ def _need_tracing(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
         around = functional.max_pool2d(cells, (2 * down + 1, 1), stride=1, padding=(down, 0))
         around = functional.max_pool2d(around, (1, 2 * right + 1), stride=1, padding=(0, right))
         near = -around[item, 0, rows, columns]
-        found |= (near < coc - inner) | ((near < coc - _NEARER_PX) & (2.0 * coc.abs() > inner))
+        needed |= (near < coc - inner) | ((near < coc - _NEARER_PX) & (2.0 * coc.abs() > inner))
         inner, radius = max(_NEARER_PX, float(radius * _COARSE_CELL)), 2 * radius
-    return found
+    return needed
 
 
 def splat(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, occlusion: bool = True) -> Tensor:
@@ -151,16 +151,16 @@ def splat(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, occlusion: boo
     while start < len(radii):  # sources of increasing blur, as many as make a bounded number of taps
         stop = min(len(radii), start + max(1, _TAPS // (2 * half_of(radii[start]) + 1) ** 2))
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
-        some = slice(start, stop)
-        kernels = kernels_for(table, coc[some], width, longest).to(light.dtype)  # [n, 1 or C, k, k]
+        part = slice(start, stop)
+        kernels = kernels_for(table, coc[part], width, longest).to(light.dtype)  # [n, 1 or C, k, k]
         half = kernels.shape[-1] // 2
         step = torch.arange(-half, half + 1, device=light.device)
-        landing = kernels * light[:, some].t()[:, :, None, None]
+        landing = kernels * light[:, part].t()[:, :, None, None]
         if hiding is not None:
-            hidden = hiding.hidden(item[some], row[some], column[some], coc[some], step, max(radii[some]))
+            hidden = hiding.hidden(item[part], row[part], column[part], coc[part], step, max(radii[part]))
             landing = landing * (1.0 - hidden).unsqueeze(1)
-        lines = item[some, None] * area + (row[some, None] + margin + step) * across
-        lands = lines[:, :, None] + (column[some, None] + margin + step)[:, None, :]  # [n, k, k]
+        lines = item[part, None] * area + (row[part, None] + margin + step) * across
+        lands = lines[:, :, None] + (column[part, None] + margin + step)[:, None, :]  # [n, k, k]
         splats.index_add_(1, lands.flatten(), landing.transpose(0, 1).flatten(1))
         start = stop
     frame = splats.unflatten(1, (batch, height + 2 * margin, across)).transpose(0, 1)
@@ -201,12 +201,12 @@ class _Hiding:
             )
             count = sums[item, bottom + 1, right + 1] - sums[item, top, right + 1]
             count = count - sums[item, bottom + 1, left] + sums[item, top, left]
-            met = ((count > 0) & (coc.detach() - _NEARER_PX >= nearer)).nonzero()[:, 0]
-            if len(met):
-                way = scale[met, None] * step
-                rows, columns = (row[met, None] + way)[:, :, None], (column[met, None] + way)[:, None, :]
-                around, down, right = pixels.corners(item[met, None, None], rows, columns, self.height, self.width)
+            hit = ((count > 0) & (coc.detach() - _NEARER_PX >= nearer)).nonzero()[:, 0]
+            if len(hit):
+                way = scale[hit, None] * step
+                rows, columns = (row[hit, None] + way)[:, :, None], (column[hit, None] + way)[:, None, :]
+                around, down, right = pixels.corners(item[hit, None, None], rows, columns, self.height, self.width)
                 shown = [(1.0 - (self.place[pixel] - k).abs()).clamp_min(0.0) for pixel in around]
                 upper, lower = torch.lerp(shown[0], shown[1], right), torch.lerp(shown[2], shown[3], right)
-                hidden = hidden.index_add(0, met, torch.lerp(upper, lower, down))
+                hidden = hidden.index_add(0, hit, torch.lerp(upper, lower, down))
         return hidden.clamp(max=1.0)

@@ -50,7 +50,7 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
     high, low = (functional.max_pool2d(c, 3, stride=1, padding=1) for c in (high, low))
     is_edge = high + low > _EDGE_PX
-    edge_pixels = pixels.where(is_edge if known is None else is_edge & known)
+    edge_pixels = pixels.indices(is_edge if known is None else is_edge & known)
 
     # the two surfaces are as near and as far as the pixel's direct neighbours
     own_coc, colour = pixels.pick(coc_px, edge_pixels)[0], pixels.pick(light, edge_pixels)

@@ -6,10 +6,10 @@ Depth edges, hidden surfaces and highlights concern few pixels; these are looked
 import torch
 from torch import Tensor
 
-__all__ = ["around", "corners", "pick", "places", "put", "where"]
+__all__ = ["around", "corners", "indices", "pick", "places", "put"]
 
 
-def where(mask: Tensor) -> Tensor:
+def indices(mask: Tensor) -> Tensor:
     """Indices of the pixels of a mask ``[B, 1, H, W]`` that are set: ``[P]``."""
     return mask.flatten().nonzero()[:, 0]
 
