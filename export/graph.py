@@ -8,7 +8,9 @@ from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.optics.camera import Camera
-from torchdof.plan import Blur, Plan
+from torchdof.render.plan import Blur, Plan
+
+from .tiling import in_tiles
 
 __all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
 
@@ -114,5 +116,5 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     free = torch.export.Dim.AUTO
     batch, frame = {0: free}, {0: free, 2: free, 3: free}
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
-    with torch.no_grad():
+    with torch.no_grad(), in_tiles():
         return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)

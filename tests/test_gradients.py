@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 EVERY_WAY = pytest.mark.parametrize(
     "way",

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 Tolerances = dict[torch.dtype, Any]
 TYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]

@@ -1,19 +1,18 @@
 """Depth of field as a module and as functions: configuration, checks, then one call of the pipeline."""
 
-import dataclasses
 import math
 from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
 
-from . import pipeline, validation
-from .attention import Attention
+from . import validation
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
-from .plan import Plan
-from .survey import survey
+from .render import pipeline
+from .render.attention import Attention
+from .render.plan import Plan
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -163,19 +162,19 @@ class DepthOfField(nn.Module):
     ) -> Plan:
         """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`.
 
-        ``print`` tells which layers there are, where in the frame, at which resolution, and what they cost;
-        :attr:`torchdof.plan.Plan.survey` holds the same as numbers.
+        ``print`` tells which layers there are, of which radius, at which resolution, and which share of the pixels
+        each carries.
 
         Example:
             >>> dof = DepthOfField(Camera(focus_m=1.0, f_number=1.0))
             >>> depth = torch.linspace(1, 9, 96).expand(1, 1, 64, 96)
             >>> print(dof.plan(torch.rand(1, 3, 64, 96), depth))  # doctest: +ELLIPSIS
-            96 x 64, tolerance 1/255, predicted error ...
+            6 layers, near to far, tolerance 1/255
+              coc px  radius    at  pixels
+            ...
         """
-        options, coc = self.options, self.coc_px(image, depth, focus_m, f_number)
-        plan = Plan.of_scene(coc, options.tolerance)
-        told = survey(plan, coc, options.table, options.method == "layered", options.occlusion)
-        return dataclasses.replace(plan, survey=told)
+        coc = self.coc_px(image, depth, focus_m, f_number)
+        return Plan.of_scene(coc, self.options.tolerance).of_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""

@@ -11,7 +11,7 @@ from torch import Tensor
 import torchdof
 from torchdof.export import Verification, to_onnx
 from torchdof.export.verification import session
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 
 @dataclasses.dataclass(frozen=True)

@@ -75,7 +75,7 @@ def test_a_file_may_take_the_circle_of_confusion_and_a_single_channel(tmp_path: 
     expected = torchdof.blur_by_coc(
         *wide,
         table=table,
-        plan=torchdof.plan.Plan.all(3.0, 0.2),
+        plan=torchdof.render.plan.Plan.all(3.0, 0.2),
         **{k: v for k, v in SIMPLE.items() if k != "max_coc_px"},
     )
     torch.testing.assert_close(out[..., :40], expected[..., :40], atol=1e-5, rtol=0)

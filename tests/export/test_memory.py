@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchdof import blur_by_coc
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.hard
 

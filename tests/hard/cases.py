@@ -14,7 +14,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 HEIGHT, WIDTH = 24, 32
 CAMERA = Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0, sensor_width_mm=4.0)  # 4 px at infinity

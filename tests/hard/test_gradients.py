@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdof import Camera, DepthOfField, blur_by_coc
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.hard
 

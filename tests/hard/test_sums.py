@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from torchdof import BlurTable, blur_by_coc
 from torchdof.optics import psf
-from torchdof.plan import Plan
+from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.hard
 

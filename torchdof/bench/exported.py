@@ -107,7 +107,7 @@ def _torch_seconds(path: str, size: tuple[int, int], scene: str, threads: int, r
     import torch
 
     from torchdof import Camera, DepthOfField
-    from torchdof.plan import Plan
+    from torchdof.render.plan import Plan
 
     torch.set_num_threads(threads)
     runner = session(path, threads)

@@ -19,11 +19,11 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
-from ..attention import weight_map
 from ..module import DepthOfField, blur_by_coc
 from ..optics.camera import Camera
 from ..options import Method
 from ..reference import metrics
+from ..render.attention import weight_map
 from ..validation import whole
 from . import memory
 from .inputs import LEAST_PX, Subject

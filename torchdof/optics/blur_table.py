@@ -1,5 +1,6 @@
 """Blur tables: signed circle of confusion to kernel parameters, as measured from a camera or a lens."""
 
+import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -94,6 +95,7 @@ class BlurTable:
         self.strength = self._per_node("strength", strength)
         self.residual = self._per_node("residual", residual)
         self.provenance = dict(provenance or {})
+        self._fingerprint: str | None = None
         self._sides = {sign: self._side(sign) for sign in (-1, 1)}
         for sign in (-1, 1):
             self._sides[sign] = self._sides[sign] or self._sides[-sign]
@@ -117,6 +119,19 @@ class BlurTable:
             BlurTable('gaussian', gaussian, 1 node)
         """
         return cls("gaussian", [1.0], {"sigma": [sigma_per_coc]}, name="gaussian")
+
+    def fingerprint(self) -> str:
+        """Hash of all that kernels depend on: tables with the same numbers share it. Kept once it is made.
+
+        Example:
+            >>> BlurTable.disc().fingerprint() == BlurTable.disc().fingerprint() != BlurTable.gaussian().fingerprint()
+            True
+        """
+        if self._fingerprint is None:
+            facts: list[Any] = [self.family, self.unit, self.sensor_width_mm, self._px_per_unit(1.0), self.coc.tolist()]
+            facts += [(name, value.tolist()) for name, value in self._params.items()]
+            self._fingerprint = hashlib.sha256(repr(facts).encode()).hexdigest()
+        return self._fingerprint
 
     @property
     def channels(self) -> int:

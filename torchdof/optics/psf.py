@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ..validation import real_tensor, show
+from .kernel_cache import KernelCache
 
 __all__ = ["FAMILIES", "disc", "gaussian", "profile", "radial", "pixel_kernels", "ring", "softm", "support"]
 
@@ -38,6 +39,7 @@ _CACHED_HALF_WIDTH = 64
 _LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
 _ALWAYS_WHOLE = 256  # px on each side of the centre; a kernel up to there is computed whole, whatever its window
 _AT_ONCE = 2**20  # slices computed together
+_quadrants = KernelCache(64 * 2**20)
 _RINGS = 2**14  # the whole of a larger kernel is summed in so many; agrees with its pixels' sum to 1e-6
 
 Number = float | Tensor
@@ -328,10 +330,10 @@ def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, whol
     rows = max(1, _AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):
-        cut = _cut_quadrant if half <= _CACHED_HALF_WIDTH else _cut_quadrant.__wrapped__
-        inner, outer, area = (
-            t.to(lengths[FAMILIES[family][-1]].device) for t in cut(half, slices, top, min(top + rows, half + 1))
-        )
+        part = (half, slices, top, min(top + rows, half + 1))
+        cut = functools.partial(_cut_quadrant, *part)
+        parts = _quadrants.get(part, cut) if half <= _CACHED_HALF_WIDTH else cut()
+        inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in parts)
         strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
     return torch.cat(strips, -2)
 
@@ -390,7 +392,6 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     return (start + left * part + (right - left) * part * part / 2) * radius / last
 
 
-@functools.lru_cache(maxsize=2 * _CACHED_HALF_WIDTH)
 @torch.inference_mode(False)  # what is kept must serve autograd as well
 def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
     """Slices of the pixels of a quadrant's rows: inner and outer radius and area, each ``[pixels, slices]``."""

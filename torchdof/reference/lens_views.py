@@ -17,9 +17,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .. import background, validation
+from .. import validation
 from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
+from ..render.matting import split_mixed
 from .lens_samples import LensSamples
 
 __all__ = ["LensViews", "lens_views", "lens_views_by_coc"]
@@ -79,7 +80,7 @@ def lens_views(
             ``r^2`` of them.
         surfaces: Further surfaces, such as what is hidden: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
             and depth like ``depth``.
-        mixed_edges: Split pixels that hold two surfaces (:func:`torchdof.background.split_mixed`); None: where no
+        mixed_edges: Split pixels that hold two surfaces (:func:`torchdof.render.matting.split_mixed`); None: where no
             surfaces are given, for beside those the split's guess does more harm than good.
 
     Returns:
@@ -163,7 +164,7 @@ def lens_views_by_coc(
 
 def _split(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Light, coc and cover of the surface in front, and of the one behind it where a pixel holds two."""
-    own, other, other_coc, share = background.split_mixed(image, coc)
+    own, other, other_coc, share = split_mixed(image, coc)
     mixed = share > 1e-3
     in_front, behind = mixed & (other_coc < coc), mixed & (other_coc >= coc)
     front = torch.where(in_front, other, torch.where(behind, own, image))

@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 import torchdof
-from torchdof.attention import box_around, weight_map
 from torchdof.options import NAMED
 from torchdof.reference.scenes import posts, waves
+from torchdof.render.attention import box_around, weight_map
 
 
 def scene(height: int = 192, width: int = 320) -> tuple[Tensor, Tensor]:
@@ -91,7 +91,7 @@ def test_a_map_beyond_0_to_1_is_refused() -> None:
 
 def test_attention_with_a_plan_is_refused() -> None:
     image, coc = scene(32, 40)
-    plan = torchdof.plan.Plan.of_scene(coc, 1 / 255)
+    plan = torchdof.render.plan.Plan.of_scene(coc, 1 / 255)
     with pytest.raises(ValueError, match="leave plan out"):
         torchdof.blur_by_coc(image, coc, plan=plan, attention=(3, 3, 3))
 

@@ -1,9 +1,9 @@
 """Signed circle of confusion to soft layers: how much of each pixel's light each layer carries.
 
 Layers sit at nodes of signed coc, ``nodes[0] < nodes[1] < ...``, so from the nearest to the farthest. A pixel between
-two nodes is shared linearly, which makes the picture continuous and differentiable in depth, focus and aperture. All of
-it follows from one ramp: the share of a pixel at or behind node k is
-``clamp((x - nodes[k-1]) / (nodes[k] - nodes[k-1]))``; the share in layer k is the difference of two ramps.
+two nodes is divided linearly, which makes the picture continuous and differentiable in depth, focus and aperture. All
+of it follows from one ramp: the weight of a pixel at or behind node k is
+``clamp((x - nodes[k-1]) / (nodes[k] - nodes[k-1]))``; its weight in layer k is the difference of two ramps.
 
 Nodes live on the *blur axis* ``x = sign(coc) * max(|coc| - 0.5, 0)``: everything within half a pixel of focus passes
 through unchanged and is one layer, at x = 0.
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["blur_axis", "from_blur_axis", "share_at_or_behind"]
+__all__ = ["blur_axis", "from_blur_axis", "weight_at_or_behind"]
 
 SHARP_PX = 0.5
 """Radius of the circle of confusion up to which a pixel counts as in focus."""
@@ -30,19 +30,16 @@ def from_blur_axis(x: float) -> float:
     return 0.0 if x == 0 else x + SHARP_PX if x > 0 else x - SHARP_PX
 
 
-def share_at_or_behind(x: Tensor, nodes: Sequence[float], k: int) -> Tensor:
-    """Share of each pixel that lies in layer ``k`` or behind it.
+def weight_at_or_behind(x: Tensor, nodes: Sequence[float], k: int) -> Tensor:
+    """How much of each pixel, 0 to 1, lies in layer ``k`` or behind it: ``M_k`` of the composite.
 
     Args:
-        x: Places on the blur axis, any shape.
+        x: Places on the blur axis, any shape; those beyond the outermost nodes belong to these.
         nodes: Places of the layers, strictly increasing: near to far.
-        k: Layer, 0 to ``len(nodes)``; ``len(nodes)`` is behind everything.
-
-    Returns:
-        Shares in [0, 1], shaped as ``x``. Pixels beyond the outermost nodes belong to these.
+        k: Layer, 0 to ``len(nodes)``, which is behind everything.
     """
     if k == 0:
         return torch.ones_like(x)
     if k == len(nodes):
         return torch.zeros_like(x)
-    return (x - nodes[k - 1]).div_(nodes[k] - nodes[k - 1]).clamp_(0.0, 1.0)
+    return ((x - nodes[k - 1]) / (nodes[k] - nodes[k - 1])).clamp(0.0, 1.0)

@@ -6,7 +6,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable
-from torchdof.resolution import shrink
+from torchdof.render.downsampling import downsampled, shrink, upsampled
 
 TABLES = {"disc": BlurTable.disc(), "gaussian": BlurTable.gaussian()}
 
@@ -30,8 +30,7 @@ def spread(image: Tensor, table: BlurTable, coc_px: float) -> Tensor:
 def error(table: BlurTable, coc_px: float, scale: int, factor: float) -> float:
     """RMS difference of the coarse chain from the kernel itself."""
     image = photograph()
-    means = spread(functional.avg_pool2d(image, scale), table, coc_px / scale * factor)
-    fine = functional.interpolate(means, scale_factor=float(scale), mode="bilinear", align_corners=False)
+    fine = upsampled(spread(downsampled(image, scale), table, coc_px / scale * factor), scale)
     inner = (..., slice(64, -64), slice(64, -64))  # interpolation does not wrap around
     return float((fine - spread(image, table, coc_px))[inner].square().mean().sqrt())
 
@@ -60,3 +59,13 @@ def test_a_wide_gaussian_keeps_its_second_moment() -> None:
 def test_a_size_is_a_share(coc_px: float) -> None:
     assert 0.5 <= shrink(TABLES["disc"], coc_px, 500.0, 2) <= 1.0
     assert shrink(TABLES["disc"], coc_px, 500.0, 2) == shrink(TABLES["disc"], -coc_px, 500.0, 2)
+
+
+@pytest.mark.parametrize("scale", [1, 2, 8])
+def test_each_coarse_pixel_is_the_mean_of_its_block(scale: int) -> None:
+    values = torch.rand(2, 3, 16, 24, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    torch.testing.assert_close(downsampled(values, scale), functional.avg_pool2d(values, scale))
+
+
+def test_the_brightest_light_stays_finite() -> None:
+    assert float(downsampled(torch.full((1, 3, 8, 8), 3e38), 4).max()) == pytest.approx(3e38)

@@ -5,9 +5,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import torchdof
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import disc
-from torchdof.plan import Plan, spacing
+from torchdof.render.layer_cocs import spacing
+from torchdof.render.plan import Plan, kernels_for
 
 TOLERANCE = st.sampled_from([0.0, 1 / 1000, 1 / 255, 1 / 60, 1 / 20, 0.5])
 
@@ -111,11 +113,6 @@ def test_highlights_are_traced_wherever_a_coarse_layer_has_a_share_of_them(toler
     assert any(abs(c) < plan.crisp_px for c in plan.coc_px if c) and any(blur.scale > 1 for blur in blurs)
 
 
-def test_looks_for_what_hides_a_highlight_are_shared_the_sooner_the_looser_the_tolerance() -> None:
-    shared = [Plan((-3.0, 0.0, 3.0), tolerance).shared_px for tolerance in (0.0, 1 / 255, 4 / 255)]
-    assert shared == [math.inf, pytest.approx(32.0), pytest.approx(8.0)]
-
-
 def test_the_larger_a_blur_the_coarser_its_layer() -> None:
     plan = Plan.of_scene(coc_map(0.0, 100.0).expand(1, 1, 100, 2), 1 / 255)
     blurs = plan.blurs(BlurTable.disc(), (100, 100), torch.float32, torch.device("cpu"), coarse=True)
@@ -125,3 +122,45 @@ def test_the_larger_a_blur_the_coarser_its_layer() -> None:
     assert (
         7.2 <= starts[2] < 9.0 and 18.0 <= starts[4] < 22.0 and 36.0 <= starts[8] < 44.0 and 72.0 <= starts[16] < 85.0
     )
+
+
+def test_a_plan_prints_its_layers_their_resolution_and_their_share_of_the_pixels() -> None:
+    dof = torchdof.DepthOfField(torchdof.Camera(focus_m=2.0, f_number=1.0, sensor_width_mm=6.0), tolerance="preview")
+    image = torch.rand(1, 3, 128, 256)
+    depth = torch.where(torch.arange(256) < 128, 1.2, 2.0).expand(1, 1, 128, 256)
+    plan = dof.plan(image, depth)
+    lines = str(plan).splitlines()
+    assert lines[0] == f"{len(plan.nodes)} layers, near to far, tolerance 4/255"
+    assert len(lines) == 2 + len(plan.nodes)
+    assert "50.0%" in lines[2] and "1/" in lines[2] and "50.0%" in lines[-1] and "full" in lines[-1]
+    assert plan.pixels is not None and sum(plan.pixels) == pytest.approx(1.0)
+    assert torch.equal(dof(image, depth, plan=plan), dof(image, depth))
+    assert "%" not in str(Plan(plan.nodes, plan.tolerance))
+
+
+def test_depths_that_are_not_numbers_count_as_in_focus_when_a_plan_is_told() -> None:
+    coc = torch.zeros(2, 1, 40, 50)
+    coc[..., :10], coc[0, 0, 0, 0] = -6.0, torch.nan
+    pixels = Plan((-5.5, 0.0), 1 / 255).of_pixels(coc).pixels
+    assert pixels is not None and pixels[0] == pytest.approx(799 / 4000)
+
+
+def test_kernels_of_highlights_are_those_of_the_nearest_thirty_second_of_a_pixel() -> None:
+    table, coc = BlurTable.disc(), torch.tensor([3.01, -7.26, 3.0])
+    kernels = kernels_for(table, coc, 100, 100)
+    expected = table.kernels(torch.tensor([3.0, -7.25, 3.0], dtype=torch.float64), 100)
+    torch.testing.assert_close(kernels, expected)
+    assert kernels_for(table, coc, 100, 4).shape[-1] == 7
+    moving = coc.double().requires_grad_()
+    torch.testing.assert_close(kernels_for(table, moving, 100, 100), table.kernels(moving, 100))
+
+
+def test_kernels_are_those_of_the_table_not_of_the_object() -> None:
+    plan, size = Plan((-5.5, 0.0, 7.5), 1 / 255), (50, 60)
+
+    def kernels(table: BlurTable) -> list[torch.Tensor]:
+        return [b.kernel for b in plan.blurs(table, size, torch.float64, torch.device("cpu"), coarse=True)]
+
+    first, again, other = kernels(BlurTable.disc()), kernels(BlurTable.disc()), kernels(BlurTable.gaussian())
+    assert all(a is b for a, b in zip(first, again, strict=True)), "the same numbers are the same lens"
+    assert first[0].shape != other[0].shape

@@ -4,16 +4,18 @@ A graph cannot choose its work before it runs. In a loop over tiles each step se
 inside skip every layer that the window does not hold.
 """
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .frame import Frame, Sample
-from .plan import Blur
+from torchdof.render.pipeline import Tiling, tiling
+from torchdof.render.plan import Blur
+from torchdof.render.surfaces import Frame, Placed
 
-__all__ = ["tile_by_tile"]
+__all__ = ["in_tiles", "side", "tile_by_tile"]
 
 _SIDE = 128
 
@@ -23,7 +25,7 @@ def side(margin: int) -> int:
     return _SIDE if margin <= _SIDE // 2 else 2 * _SIDE
 
 
-def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, list[Blur]], Tensor]) -> Tensor:
+def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, Sequence[Blur]], Tensor]) -> Tensor:
     """Render each tile of a frame as a frame of its own.
 
     Args:
@@ -34,19 +36,19 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, l
     Returns:
         ``[B, C, H, W]``.
     """
-    from torch._higher_order_ops.scan import scan  # the graph's loop; only an export needs it
+    from torch._higher_order_ops.scan import scan  # the graph's loop
 
-    length = side(frame.margin)
-    window = length + 2 * frame.margin
+    length, margin = side(frame.margin), frame.margin
+    window = length + 2 * margin
     rows, columns = (n // length for n in frame.area)
-    parts = [t for s in frame.samples for t in (s.light, s.x, s.weight) if t is not None]
+    parts = [t for s in frame.surfaces for t in s if t is not None]
     batch, colours = parts[0].shape[0], int(parts[0].shape[1])
     if frame.known is not None:
         parts.append(frame.known.expand(batch, -1, -1, -1))
     if frame.behind is not None:
-        parts.append(functional.pad(frame.behind, (frame.margin,) * 4))
+        parts.append(functional.pad(frame.behind, (margin,) * 4))
     channels = [int(t.shape[1]) for t in parts]
-    weighted, known, backed = frame.samples[0].weight is not None, frame.known is not None, frame.behind is not None
+    weighted, known, backed = frame.surfaces[0].weight is not None, frame.known is not None, frame.behind is not None
     across = torch.arange(window)
     tiles = torch.cat(parts, 1)
     tiles = tiles[:, :, (torch.arange(rows) * length)[:, None] + across]  # [B, P, rows, window, W]
@@ -55,19 +57,28 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, l
 
     # a loop takes no two views of one tensor, and inside it sizes are unknown until they are stated
     bank = [(blur.kernel.clone(), tuple(blur.kernel.shape), blur.scale) for blur in blurs]
-    frame_margin = frame.margin
 
     def step(count: Tensor, tile: Tensor) -> tuple[Tensor, Tensor]:
         fields = [t.clone() for t in tile.reshape(1, sum(channels), window, window).split(channels, 1)]
-        inner = slice(frame_margin, frame_margin + length)
+        inner = slice(margin, margin + length)
         behind = fields.pop()[..., inner, inner] if backed else None
         seen = fields.pop() if known else None
         each = 3 if weighted else 2
-        samples = [Sample(*fields[i : i + each]) for i in range(0, len(fields), each)]
-        piece = Frame.piece(samples, seen, behind, frame_margin, length)
+        surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
+        piece = Frame(surfaces, frame.nodes, seen, behind, margin, (length, length), (length, length))
         tile = render(piece, [Blur(kernel.reshape(shape), scale) for kernel, shape, scale in bank])
         return count + 1, tile.reshape(colours, length, length)
 
     _, pieces = scan(step, torch.zeros(1), tiles)
     image = pieces.reshape(batch, rows, columns, colours, length, length).permute(0, 3, 1, 4, 2, 5)
-    return frame.image(image.reshape(batch, colours, *frame.area))
+    return image.reshape(batch, colours, *frame.area)[..., : frame.size[0], : frame.size[1]]
+
+
+@contextlib.contextmanager
+def in_tiles() -> Iterator[None]:
+    """Within this context graphs that are exported render their frames tile by tile."""
+    token = tiling.set(Tiling(side, tile_by_tile))
+    try:
+        yield
+    finally:
+        tiling.reset(token)

@@ -5,14 +5,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchdof.layers import blur_axis, from_blur_axis, share_at_or_behind
+from torchdof.render.layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
 
 NODES = (-4.0, -1.5, 0.0, 0.5, 2.0)
 
 
-def shares(x: Tensor) -> Tensor:
-    """Share of each pixel in each layer: `[layers, ...]`."""
-    behind = torch.stack([share_at_or_behind(x, NODES, k) for k in range(len(NODES) + 1)])
+def weights(x: Tensor) -> Tensor:
+    """Weight of each pixel in each layer: `[layers, ...]`."""
+    behind = torch.stack([weight_at_or_behind(x, NODES, k) for k in range(len(NODES) + 1)])
     return behind[:-1] - behind[1:]
 
 
@@ -29,23 +29,23 @@ def test_blur_axis_and_back_is_the_coc_of_what_is_blurred_and_zero_of_what_is_no
 
 
 def test_a_pixel_on_a_node_belongs_to_that_layer_alone() -> None:
-    assert_close(shares(torch.tensor(NODES)), torch.eye(len(NODES)), rtol=0.0, atol=0.0)
+    assert_close(weights(torch.tensor(NODES)), torch.eye(len(NODES)), rtol=0.0, atol=0.0)
 
 
 def test_a_pixel_between_nodes_is_shared_linearly() -> None:
-    pixels = shares(torch.tensor([-0.75, 0.8, 1.625])).T
+    pixels = weights(torch.tensor([-0.75, 0.8, 1.625])).T
     assert_close(pixels[0], torch.tensor([0.0, 0.5, 0.5, 0.0, 0.0]))
     assert_close(pixels[1], torch.tensor([0.0, 0.0, 0.0, 0.8, 0.2]))
     assert_close(pixels[2], torch.tensor([0.0, 0.0, 0.0, 0.25, 0.75]))
 
 
 def test_pixels_beyond_the_outermost_nodes_belong_to_these() -> None:
-    assert_close(shares(torch.tensor([-9.0, 9.0])), torch.eye(len(NODES))[:, [0, -1]])
+    assert_close(weights(torch.tensor([-9.0, 9.0])), torch.eye(len(NODES))[:, [0, -1]])
 
 
 @given(st.floats(-1e6, 1e6))
 def test_the_shares_of_a_pixel_are_in_0_to_1_and_sum_to_1(x: float) -> None:
-    parts = shares(torch.tensor(x, dtype=torch.float64))
+    parts = weights(torch.tensor(x, dtype=torch.float64))
     assert (parts >= 0).all() and (parts <= 1).all() and int((parts > 0).sum()) <= 2
     assert_close(float(parts.sum()), 1.0, rtol=0.0, atol=1e-15)
 
@@ -54,6 +54,6 @@ def test_the_shares_of_a_pixel_are_in_0_to_1_and_sum_to_1(x: float) -> None:
 def test_shares_are_differentiable_between_nodes(k: int) -> None:
     x = torch.tensor([-3.0, -0.2, 0.3, 1.0, 5.0], dtype=torch.float64, requires_grad=True)
     if k in (0, len(NODES)):
-        assert not share_at_or_behind(x, NODES, k).requires_grad  # all or nothing, whatever x
+        assert not weight_at_or_behind(x, NODES, k).requires_grad  # all or nothing, whatever x
     else:
-        assert torch.autograd.gradcheck(lambda x: share_at_or_behind(x, NODES, k), x)
+        assert torch.autograd.gradcheck(lambda x: weight_at_or_behind(x, NODES, k), x)

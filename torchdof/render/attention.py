@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .validation import show
+from ..validation import show
 
 __all__ = ["Attention", "box_around", "weight_map"]
 
@@ -18,7 +18,7 @@ Attention = tuple[float, float, float] | Tensor
 """``(x, y, radius)`` in pixels of what the viewer looks at, or a map ``[B, 1, H, W]`` or ``[1, 1, H, W]``, 0 to 1."""
 
 _FADE = 0.25  # of the radius, outside of it
-_ALIGN = 64  # the part is cut where tiles and cells of the whole frame begin
+_ALIGN = 64  # the part is cut where cells of the whole frame begin
 
 
 def weight_map(attention: Any, image: Tensor) -> Tensor:

@@ -1,0 +1,43 @@
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from torch import Tensor
+
+from torchdof.optics.kernel_cache import KernelCache
+
+
+def test_what_was_made_is_kept_and_the_longest_unused_goes_first() -> None:
+    cache, made = KernelCache(25_000), []
+
+    def kernel(name: str, count: int = 1000) -> Tensor:
+        return cache.get(name, lambda: (made.append(name), torch.zeros(count, dtype=torch.float64))[1])
+
+    for name in ("a", "b", "a", "c", "a", "d", "a", "c", "b"):  # 8 kB each: two fit, "a" is used all the time
+        kernel(name)
+    assert made == ["a", "b", "c", "d", "c", "b"]
+    assert cache.bytes <= 25_000
+
+
+def test_what_alone_is_too_large_is_made_each_time_and_drops_nothing() -> None:
+    cache = KernelCache(10_000)
+    small = cache.get("small", lambda: torch.zeros(100))
+    first, second = (cache.get("large", lambda: torch.zeros(10_000)) for _ in range(2))
+    assert first is not second
+    assert cache.get("small", lambda: torch.ones(100)) is small
+
+
+def test_a_view_counts_with_all_that_it_keeps_alive() -> None:
+    cache = KernelCache(10_000)
+    cache.get("view", lambda: torch.zeros(10_000)[:10])
+    assert cache.bytes == 0
+
+
+def test_threads_share_a_cache() -> None:
+    cache = KernelCache(20_000)
+
+    def look(i: int) -> bool:
+        return float(cache.get(i % 7, lambda: torch.full((500,), float(i % 7)))[0]) == i % 7
+
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(look, range(2000)))
+    assert 0 < cache.bytes <= 20_000

@@ -1,0 +1,80 @@
+"""Disocclusion: what is filled in behind blurred surfaces, and behind all layers."""
+
+import pytest
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from torchdof.render.composite import over
+from torchdof.render.convolution import convolve
+from torchdof.render.highlights import threshold
+from torchdof.render.plan import Blur
+from torchdof.render.surfaces import Surface, framed, surfaces_of_image
+
+RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
+
+
+def edge(share: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Red in front of blue; column 31 is red by a share but has the depth of red if that is at least a half."""
+    red = (torch.arange(64) < 31).float()
+    red[31] = share
+    image = (red * RED[:, None] + (1 - red) * BLUE[:, None])[None, :, None].expand(1, 3, 48, 64)
+    coc = torch.where(red >= 0.5, near_px, far_px).expand(1, 1, 48, 64)
+    return image, coc
+
+
+def surfaces(image: Tensor, coc: Tensor, levels: int) -> tuple[Surface, Surface, Tensor]:
+    """What each pixel shows and hides, and what is behind both."""
+    (own, other), behind = surfaces_of_image(image, coc, None, threshold(image), levels)
+    return own, other, behind
+
+
+def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> None:
+    image, coc = edge(1.0, near_px=-12.0)
+    (own, _, _), (other, other_coc, share), behind = surfaces(image, coc, levels=5)
+    reached = (share[0, 0, 24] > 0).nonzero()[:, 0]
+    assert 12 <= 32 - int(reached.min()) <= 32 and int(reached.max()) == 31  # nothing is behind the wall
+    assert torch.equal(own, image)
+    assert torch.allclose(other[0, :, 24, 20:31], BLUE[:, None].expand(3, 11), atol=1e-5)
+    assert float(other_coc[0, 0, 24, 20:31].abs().max()) < 1e-5
+    assert torch.allclose(behind[0, :, 24 // 4, 5:7], BLUE[:, None].expand(3, 2), atol=1e-5)
+
+
+def test_a_highlight_beside_what_is_hidden_is_not_hidden_there_too() -> None:
+    image, coc = edge(1.0, near_px=-12.0)
+    image = image.clone()
+    image[..., 20:28, 32:36] = 500.0
+    _, (other, _, share), behind = surfaces(image, coc, levels=5)
+    assert float(share[0, 0, 24, 26]) > 0
+    most = float(threshold(image).max())
+    assert most < 10.0, "the scene tests nothing"
+    assert float(other[0, :, 24, :32].max()) <= most
+    assert float(behind[0, :, 24 // 4, 5:7].max()) <= most
+
+
+def test_behind_two_blurred_surfaces_lies_the_farthest_around() -> None:
+    green = torch.tensor([0.1, 0.6, 0.1])
+    image, coc = edge(1.0, near_px=-18.0)
+    image, coc = image.clone(), coc.clone()
+    image[..., 24:40], coc[..., 24:40] = green[:, None, None], -12.0  # red in front of green, and a blue wall
+    image[..., 40:], coc[..., 40:] = BLUE[:, None, None], 0.0
+    _, (_, _, share), behind = surfaces(image, coc, levels=6)
+    assert float(share[0, 0, 24, 20]) > 0
+    assert torch.allclose(behind[0, :, 24 // 4, 20 // 4], BLUE, atol=0.02), "the wall, not the surface in between"
+
+
+@pytest.mark.parametrize("size", [(20, 30), (150, 170), (128, 64)])
+def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, int]) -> None:
+    cells = torch.rand(1, 3, size[0] // 4 + 3, size[1] // 4 + 2, generator=torch.Generator().manual_seed(2))
+    behind = functional.interpolate(cells, scale_factor=4.0, mode="bilinear")[..., : size[0], : size[1]]
+    coc = torch.zeros(1, 1, *size)
+    blurs = [Blur(torch.ones(1, 1, 1), 1), Blur(torch.zeros(1, 1, 1), 1)]  # light of the farther layer goes elsewhere
+    for cover in (0.0, 0.75, 1.0):
+        light = torch.full((1, 3, *size), 0.2)
+        surfaces = [
+            Surface(light, coc, torch.full_like(coc, cover)),
+            Surface(light, coc + 9.0, torch.full_like(coc, 1 - cover)),
+        ]
+        frame = framed(surfaces, cells, (0.0, 1.0), blurs, extend=False, stacked=False)
+        shown = over(frame, blurs, convolve)
+        torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)

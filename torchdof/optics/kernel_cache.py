@@ -1,0 +1,67 @@
+"""What is computed once of a lens and kept: bounded by bytes, not by entries, for a kernel takes bytes or megabytes."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, TypeVar
+
+from torch import Tensor
+
+__all__ = ["KernelCache"]
+
+_ENTRY_BYTES = 512  # of a key and what belongs to it
+
+_Key = TypeVar("_Key", bound=Hashable)
+Kept = TypeVar("Kept", Tensor, tuple[Tensor, ...], float)
+
+
+class KernelCache:
+    """Results by what they were made from; beyond a number of bytes the one unused for longest goes. Thread-safe.
+
+    Args:
+        limit_bytes: Of all results together; one that alone is larger is not kept.
+
+    Example:
+        >>> cache = KernelCache(2**20)
+        >>> cache.get(("one", 1), lambda: 1.0), cache.get(("one", 1), lambda: 2.0)
+        (1.0, 1.0)
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        self.limit_bytes, self.bytes = limit_bytes, 0
+        self._entries: OrderedDict[Hashable, tuple[object, int]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
+        """What is kept under a key, made first where there is nothing.
+
+        Two threads that miss at once both make it, and one result is kept.
+        """
+        return self.get_all([key], lambda _: [make()])[0]
+
+    def get_all(self, keys: Sequence[_Key], make: Callable[[list[_Key]], Sequence[Kept]]) -> list[Kept]:
+        """The same for several keys, no two of them alike; ``make`` makes what is missing of them together."""
+        results: dict[_Key, Any] = {}
+        with self._lock:
+            for key in keys:
+                if key in self._entries:
+                    self._entries.move_to_end(key)
+                    results[key] = self._entries[key][0]
+        missing = [key for key in keys if key not in results]
+        if missing:
+            results.update(zip(missing, make(missing), strict=True))
+        with self._lock:
+            for key in missing:
+                size = _ENTRY_BYTES + _bytes(results[key])
+                if key not in self._entries and size <= self.limit_bytes:
+                    self._entries[key] = (results[key], size)
+                    self.bytes += size
+                    while self.bytes > self.limit_bytes:
+                        _, (_, freed) = self._entries.popitem(last=False)
+                        self.bytes -= freed
+        return [results[key] for key in keys]
+
+
+def _bytes(made: Tensor | tuple[Tensor, ...] | float) -> int:
+    tensors = made if isinstance(made, tuple) else (made,)
+    return sum(t.untyped_storage().nbytes() for t in tensors if isinstance(t, Tensor))

@@ -1,0 +1,189 @@
+"""Layers, far to near, to one image: each is scattered with its kernel and composited with what is behind it."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .convolution import CHANNELS
+from .downsampling import downsampled, upsampled
+from .plan import Blur
+from .scatter import fold
+from .surfaces import Frame
+
+__all__ = ["Scatter", "accumulate", "accumulate_once", "over"]
+
+Scatter = Callable[[Tensor, Tensor, int], Tensor]
+"""``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
+
+_LEAST = 1e-6  # share of scattered weight below which nothing is known
+
+
+def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
+    """Normalised "over" of soft layers.
+
+    With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
+    ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
+    Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
+    blurred edge of what is in front. Outside the frame surfaces go on as they are at the border, but their light is
+    unknown and weighs nothing: colours are means over what was seen. Where all layers leave a pixel uncovered, what is
+    behind them shows.
+
+    Args:
+        frame: The surfaces seen in each pixel.
+        blurs: Kernel and resolution of each layer.
+        scatter: How a layer is scattered.
+
+    Reference:
+        Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
+    """
+    colours, each = frame.colours, blurs[0].kernel.shape[0]
+
+    def normalised(layer: Tensor) -> Tensor:
+        """Colour and coverage, from scattered ``m_k I``, ``m_k``, ``M_k`` and the ``m_k`` that was seen."""
+        light_and_weight, visible, seen = layer.tensor_split((colours + each, colours + 2 * each), 1)
+        if seen.shape[1]:  # light that was not seen: the colour of what was, fading out with the last of it
+            light, weight = light_and_weight.tensor_split((colours,), 1)
+            floor = weight.clamp(_LEAST**2, _LEAST)
+            light = light * (weight / torch.maximum(seen, floor))
+            light_and_weight = torch.cat([light, weight * (seen / floor).clamp(max=1.0)], 1)
+        visible = visible.clamp_min(_LEAST)
+        return light_and_weight / (visible if each == 1 else visible.repeat(1, 2, 1, 1))
+
+    def composited(front: Tensor, behind: Tensor) -> Tensor:
+        left = (1.0 - front[:, colours:]).clamp_min(0.0)
+        return torch.addcmul(front, left if each == 1 else left.repeat(1, 2, 1, 1), behind)
+
+    light_and_coverage = _composite_layers(frame, blurs, scatter, composited, normalised)
+    if frame.behind is None:
+        out = _mean(light_and_coverage, colours)
+    else:
+        light, coverage = light_and_coverage.tensor_split((colours,), 1)
+        out = torch.addcmul(light, (1.0 - coverage).clamp_min(0.0), frame.behind)
+    return out[..., : frame.size[0], : frame.size[1]]
+
+
+def accumulate(
+    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, normalize: bool, highlights: Tensor | None = None
+) -> Tensor:
+    """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
+
+    Not normalised, the plain sum is dark at the frame's border and uneven at depth edges. ``highlights`` is light that
+    was extracted from the layers and splat ray by ray; else arguments are those of :func:`over`.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 3.
+    """
+    summed = _composite_layers(frame, blurs, scatter, torch.add)
+    summed = summed[..., : frame.size[0], : frame.size[1]]
+    if highlights is not None:
+        light, weight = summed.tensor_split((frame.colours,), 1)
+        summed = torch.cat([light + highlights, weight], 1)
+    return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
+
+
+def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Tensor:
+    """The same scatter as :func:`accumulate`, as the paper does it: one pass, in which each pixel has its own kernel.
+
+    A pixel's kernel is interpolated between those of the layers around its coc, at full resolution.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 3: (a) read the depth, (b) choose its blur texture, (c) multiply and
+        accumulate.
+    """
+    halo = frame.margin
+    weights = torch.cat([frame.layer(k, halo, visibility=True)[1] for k in range(len(blurs))], 1)
+    kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
+    light = frame.surfaces[0].light
+    known = torch.ones_like(light) if frame.known is None else frame.known.expand_as(light)
+    each = kernels.shape[1]
+    summed = fold(torch.cat([light, known[:, :each]], 1), kernels.repeat(1, min(2, each), 1, 1), halo, weights)
+    summed = summed[..., : frame.size[0], : frame.size[1]]
+    return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
+
+
+def _composite_layers(
+    frame: Frame,
+    blurs: Sequence[Blur],
+    scatter: Scatter,
+    composited: Callable[[Tensor, Tensor], Tensor],
+    normalised: Callable[[Tensor], Tensor] | None = None,
+) -> Tensor:
+    """All layers, far to near, over what is behind them: light ``[B, C, h, w]`` and, after it, its coverage.
+
+    Coverage has one channel, or C where each colour has a kernel of its own. ``composited`` puts what is in front and
+    what is behind it together; ``normalised`` makes light and coverage of a layer's scattered terms, which without it
+    are just that.
+    """
+    order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
+    light = frame.surfaces[0].light
+    picture = light.new_zeros(light.shape[0], frame.colours + blurs[0].kernel.shape[0], *frame.area)
+
+    # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
+    # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
+    most = CHANNELS // (frame.colours + 3) if blurs[0].kernel.shape[0] == 1 else 1
+    runs: dict[tuple[int, bool], list[list[int]]] = {}
+    for k in order:
+        groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and frame.nodes[k] < 0), [[]])
+        widths = [blurs[j].kernel.shape[-1] for j in [*groups[-1], k]]
+        if len(widths) > max(most, 1) or max(widths) ** 2 > 2 * min(widths) ** 2:
+            groups.append([])
+        groups[-1].append(k)
+    for (scale, _), groups in runs.items():
+        part = picture
+        if scale > 1:  # one pixel more on each side, to interpolate from
+            part = picture.new_zeros(*picture.shape[:2], *(n // scale + 2 for n in frame.area))
+        for group in groups:
+
+            def with_group(behind: Tensor, group: list[int] = group) -> Tensor:
+                for layer in _scattered(frame, blurs, scatter, group, normalised is not None):
+                    behind = composited(layer if normalised is None else normalised(layer), behind)
+                return behind
+
+            part = _where_needed(with_group, part, frame, blurs, group)
+
+        def with_run(behind: Tensor, part: Tensor = part, scale: int = scale) -> Tensor:
+            fine = upsampled(part, scale)
+            return composited(fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale], behind)
+
+        if scale > 1:
+            part = _where_needed(with_run, picture, frame, blurs, [k for group in groups for k in group])
+        picture = part
+    return picture
+
+
+def _scattered(
+    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
+) -> Iterator[Tensor]:
+    """Scattered terms of the layers of a group; each has C channels where each colour has a kernel of its own."""
+    halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
+    layers = [frame.layer(k, halo, visibility) for k in group]
+    terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1) for terms in layers for term in terms], 1)
+    terms, channels = downsampled(terms, blurs[group[0]].scale), terms.shape[1] // len(group)
+    kernels = blurs[group[0]].kernel
+    if len(group) > 1 or each > 1:
+        padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in group]
+        kernels = torch.cat([kernel.repeat(channels // each, 1, 1) for kernel in padded])
+    yield from scatter(terms, kernels, half).split(channels, 1)
+
+
+def _where_needed(
+    step: Callable[[Tensor], Tensor], picture: Tensor, frame: Frame, blurs: Sequence[Blur], layers: list[int]
+) -> Tensor:
+    """One step on a picture. A graph cannot choose its work beforehand: in one it is a branch, taken where needed."""
+    if not torch.compiler.is_exporting():
+        return step(picture)
+    ends = (-torch.inf, *frame.nodes, torch.inf)
+    needed = frame.any_between(ends[min(layers)], ends[max(layers) + 2], max(blurs[k].halo for k in layers))
+
+    def dense(picture: Tensor) -> Tensor:  # both branches must lie in memory the same way
+        return step(picture).clone(memory_format=torch.contiguous_format)
+
+    return torch.cond(needed, dense, torch.clone, (picture,))
+
+
+def _mean(summed: Tensor, colours: int) -> Tensor:
+    """Light over its weight; 0 where nothing is known."""
+    light, weight = summed.tensor_split((colours,), 1)
+    return light / torch.where(weight > _LEAST, weight, torch.inf)

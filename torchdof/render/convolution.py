@@ -1,0 +1,58 @@
+"""Scatter of layers by convolution: a scatter with one kernel that a half turn does not change is one.
+
+Light scattered over the frame's border is lost, nothing comes in.
+"""
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ..validation import is_traced
+
+__all__ = ["CHANNELS", "DIRECT_TAPS", "convolve", "widest_float"]
+
+CHANNELS = 16
+"""Channels of one depthwise convolution: on CPUs fewer take as long, in PyTorch and in onnxruntime."""
+
+DIRECT_TAPS = 21 * 21
+"""Taps up to which sums are taken in float32: longer ones of equal terms drift by more than 1e-6."""
+
+_FOURIER_STEP = 128  # lengths of a Fourier transform: those with large prime factors are slow
+
+
+def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
+    """Scatter with one kernel a channel, by convolution.
+
+    Small kernels are applied directly, large ones through a Fourier transform in float64: in float32 a highlight would
+    leave rounding errors all over the frame.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        kernels: ``[1 or C, k, k]``, symmetric under a half turn, k odd.
+        halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
+    """
+    half, channels = kernels.shape[-1] // 2, light.shape[1]
+    if halo > half:
+        spare = halo - half
+        light = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare]
+        halo = half
+    if half == 0:
+        return light * kernels[:, 0, 0, None, None]
+    if (2 * half + 1) ** 2 > DIRECT_TAPS and not is_traced():
+        wide = widest_float(light.device)
+        # what would wrap around falls into the halo
+        area = [-(-(n + 2 * (half - halo)) // _FOURIER_STEP) * _FOURIER_STEP for n in light.shape[-2:]]
+        spectrum = torch.fft.rfft2(light.to(wide), s=area) * torch.fft.rfft2(kernels.to(wide), s=area)
+        rows, columns = (slice(half + halo, half + n - halo) for n in light.shape[-2:])
+        return torch.fft.irfft2(spectrum, s=area)[..., rows, columns].to(light.dtype)
+    spare = -channels % CHANNELS
+    if spare and light.device.type == "cpu":
+        light = functional.pad(light, (0, 0, 0, 0, 0, spare))
+        kernels = functional.pad(kernels, (0, 0, 0, 0, 0, spare)) if kernels.shape[0] > 1 else kernels
+    weights = kernels.expand(light.shape[1], -1, -1).unsqueeze(1)
+    return functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, :channels]
+
+
+def widest_float(device: torch.device) -> torch.dtype:
+    """Type for long sums; not every device has float64."""
+    return torch.float32 if device.type == "mps" else torch.float64

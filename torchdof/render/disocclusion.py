@@ -1,0 +1,204 @@
+"""Disocclusion: what lies hidden behind blurred surfaces, filled in from the farther surfaces around them.
+
+Where a foreground blurs, what is behind it shows through, and no pixel of the image holds it. A hidden sample stands in
+with a weight so small that it speaks only where nothing visible does.
+"""
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from . import pixels
+from .downsampling import downsampled
+from .matting import NEVER_PX
+
+__all__ = ["BEHIND_STEP", "HIDDEN_WEIGHT", "behind_size", "fill_hidden"]
+
+HIDDEN_WEIGHT = 0.003
+"""Weight of a hidden sample against 1 of a visible one."""
+
+_BEHIND_PX = 2.0  # a hidden surface lies at least so much farther, in coc
+_FALL = 0.7  # weight of a level of the pyramid against the finer one before
+_FINE_LEVELS = 2  # of the pyramid that each pixel looks at; the coarser ones are looked at from cells as large as these
+_TOLD_APART = 3  # level of the pyramid whose pixels are told apart when looking for those that may hide something
+
+BEHIND_STEP = 2**_FINE_LEVELS
+"""Light behind both surfaces is known at every so many pixels."""
+
+
+class _Level:
+    """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
+
+    ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
+    pixel looks so far.
+    """
+
+    def __init__(self, values: Tensor, step: int, vote: float | None, least_px: float) -> None:
+        self.height, self.width = values.shape[-2:]
+        self.flat, self.light = values.transpose(0, 1).flatten(1), values[:, :-2]
+        self.step, self.vote, self.least_px = step, vote, least_px
+
+    def behind(self, item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor]:
+        """Light and coc ``[C + 1, P]`` behind places ``[P]`` of the image, and their weight, 0 where nothing is.
+
+        Interpolated linearly among those of the four samples around that lie behind; plain interpolation would mix in
+        the foreground's own colour.
+        """
+        row, column = (row + 0.5) / self.step - 0.5, (column + 0.5) / self.step - 0.5
+        seen = total = torch.zeros_like(coc_px)
+        corners, down, right = pixels.corners(item, row, column, self.height, self.width)
+        shares = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
+        for corner, share in zip(corners, shares, strict=True):
+            sample = self.flat.index_select(1, corner)
+            weight = share * sample[-1] * (sample[-2] > coc_px + _BEHIND_PX)
+            seen, total = seen + sample[:-1] * weight, total + weight
+        total = torch.where(total > 1e-4, total, 0.0)
+        return seen / total.clamp_min(1e-4), total
+
+
+def behind_size(size: int, levels: int) -> int:
+    """Length of an axis of the map of what lies behind both surfaces, for an axis of the image."""
+    return _continued(size, 2**levels) // BEHIND_STEP
+
+
+def fill_hidden(
+    light: Tensor,
+    coc_px: Tensor,
+    other_light: Tensor,
+    other_coc_px: Tensor,
+    share: Tensor,
+    valid: Tensor | None,
+    threshold: Tensor,
+    levels: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Light and coc of what lies behind blurred surfaces, from the farthest surfaces around them.
+
+    A pyramid averages at each step only the farthest of four children. A pixel takes the mean of the levels that show
+    something behind it, finer ones first, and of the four samples around it there only those that do; it looks no
+    farther than its own blur reaches, for deeper inside nothing of what is hidden can show.
+
+    Where that surface is blurred itself, and nothing else reaches a pixel, something lies behind it again: of all that
+    the levels show, the farthest.
+
+    Args:
+        light: Each pixel's own, as :func:`torchdof.render.matting.split_mixed` gives it, ``[B, C, H, W]``.
+        coc_px: Its signed coc ``[B, 1, H, W]``.
+        other_light: Of mixed pixels' second surface, from there as well, as the next two.
+        other_coc_px: ``[B, 1, H, W]``.
+        share: ``[B, 1, H, W]``, 0 where a pixel is not mixed.
+        valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
+        threshold: Largest light that is no highlight's, ``[B, 1, H, W]``; a highlight is nowhere else but in its place.
+        levels: Levels of the pyramid, from 2; the widest look is ``2 ** levels`` pixels.
+
+    Returns:
+        The second sample, mixed or hidden: light, coc and weight (0 where there is none); and light behind both, at
+        every :data:`BEHIND_STEP`-th pixel ``[B, C, h, w]``, for somewhat more than the image.
+    """
+    height, width = coc_px.shape[-2:]
+    ends = (0, _continued(width, 2**levels) - width, 0, _continued(height, 2**levels) - height)
+
+    # the farther surface of each pixel, dimmed to no highlight
+    is_mixed = (share > 0.05) & (other_coc_px > coc_px)
+    far_coc, far_light = torch.where(is_mixed, other_coc_px, coc_px), torch.where(is_mixed, other_light, light)
+    brightest = far_light.amax(1, keepdim=True)
+    is_bright = brightest > threshold
+    far_light = far_light * torch.where(is_bright, threshold / torch.where(is_bright, brightest, 1.0), 1.0)
+    far_weight = torch.where(is_mixed, share, 1.0 - share)
+    if valid is not None:
+        far_coc, far_weight = torch.where(valid > 0, far_coc, -NEVER_PX), far_weight * valid
+    level = (*(functional.pad(t, ends, mode="replicate") for t in (far_light, far_coc, far_weight)),)
+    pyramid = []
+    for _ in range(levels):
+        level = _farthest(*level)
+        pyramid.append(level)
+    looks = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
+
+    # what coarse levels show behind cells is one level of such cells; and the farthest of all is behind both surfaces
+    may_hide = _may_hide(functional.pad(coc_px, ends, mode="replicate"), [far_coc for _, far_coc, _ in pyramid])
+    hides = may_hide[..., :height, :width] & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT)
+    nearest = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-NEVER_PX), BEHIND_STEP)
+    cells = pixels.indices(functional.max_pool2d(functional.pad(hides.to(coc_px.dtype), ends), BEHIND_STEP) > 0)
+    item, row, column = pixels.places(cells, nearest.shape[-2], nearest.shape[-1])
+    centre = (BEHIND_STEP - 1) / 2
+    cell_places = (item, row * BEHIND_STEP + centre, column * BEHIND_STEP + centre, pixels.pick(nearest, cells)[0])
+    total, seen = _look(looks, *cell_places, farthest=True)
+    shown = pixels.indices(total > 0)
+    behind = pixels.put(looks[_FINE_LEVELS - 1].light, cells[shown], seen[:-1].index_select(1, shown))
+    if levels > _FINE_LEVELS:
+        total, seen = _look(looks[_FINE_LEVELS:], *cell_places)
+        values = nearest.new_zeros(nearest.shape[0], len(seen) + 1, *nearest.shape[-2:])
+        values = pixels.put(values, cells, torch.cat([seen, total[None]]))
+        looks = [*looks[:_FINE_LEVELS], _Level(values, BEHIND_STEP, None, looks[_FINE_LEVELS].least_px)]
+
+    # each pixel behind which these levels show something gets it as its second sample
+    hiding = pixels.indices(hides)
+    total, seen = _look(looks, *pixels.places(hiding, height, width), pixels.pick(coc_px, hiding)[0])
+    shown = pixels.indices(total > 0)
+    hiding, seen = hiding[shown], seen.index_select(1, shown)
+    return (
+        pixels.put(other_light, hiding, seen[:-1]),
+        pixels.put(other_coc_px, hiding, seen[-1]),
+        pixels.put(share, hiding, torch.full_like(seen[-1], HIDDEN_WEIGHT)),
+        behind,
+    )
+
+
+def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """One step of the pyramid: of each four children, the mean of those that are farthest."""
+    farthest = functional.interpolate(functional.max_pool2d(coc_px.detach(), 2), scale_factor=2.0, mode="nearest")
+    counts = weight * (coc_px > farthest - _BEHIND_PX)
+    total = downsampled(counts, 2)
+    known = total.clamp_min(1e-9)
+    coc_px = torch.where(total > 0, downsampled(coc_px * counts, 2) / known, -NEVER_PX)
+    return downsampled(light * counts, 2) / known, coc_px, total
+
+
+def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
+    """Pixels for which the coc of a level of the pyramid that they look at may be farther; none too few.
+
+    The image's own coc is continued to whole pixels of the coarsest level.
+    """
+    coarsest = min(len(farthest), _TOLD_APART)
+    near, blur = (functional.max_pool2d(c, 2**coarsest) for c in (-coc_px.detach(), coc_px.detach().abs()))
+    may_hide = torch.zeros_like(near, dtype=torch.bool)
+    for level, coc in enumerate(farthest, 1):
+        around = functional.max_pool2d(coc.detach(), 3, stride=1, padding=1)
+        if level < coarsest:
+            around = functional.max_pool2d(around, 2 ** (coarsest - level))
+        elif level > coarsest:
+            around = functional.interpolate(around, scale_factor=float(2 ** (level - coarsest)), mode="nearest")
+        may_hide = may_hide | ((around > _BEHIND_PX - near) & (blur >= _least_px(level)))
+    return functional.interpolate(may_hide.to(near.dtype), scale_factor=float(2**coarsest), mode="nearest") > 0
+
+
+def _look(
+    levels: list[_Level], item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor, farthest: bool = False
+) -> tuple[Tensor, Tensor]:
+    """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[C + 1, P]``.
+
+    With ``farthest``, of two surfaces only the farther one counts.
+    """
+    total = torch.zeros_like(coc_px)
+    seen = coc_px.new_zeros(levels[0].flat.shape[0] - 1, 1)
+    for level in levels:
+        behind, weight = level.behind(item, row, column, coc_px)
+        vote = weight if level.vote is None else torch.where(weight > 0, level.vote, 0.0)
+        vote = torch.where(level.least_px <= coc_px.abs(), vote, 0.0)
+        if farthest:
+            apart = behind[-1] - seen[-1]
+            vote = torch.where((total > 0) & (apart < -_BEHIND_PX), 0.0, vote)
+            total = torch.where((vote > 0) & (apart > _BEHIND_PX), 0.0, total)
+        total = total + vote
+        seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
+    return total, seen
+
+
+def _least_px(level: int) -> float:
+    """Blur from which on a pixel looks as far as this level."""
+    return 2.0 ** (level - 2)
+
+
+def _continued(size: int, step: int) -> int:
+    """Pixels of an image that is continued for a pyramid."""
+    # in this form exported code knows that the sizes are multiples, and with one more that none of them is 1
+    return (size + 2 * step - 1) // step * step

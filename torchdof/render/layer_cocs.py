@@ -1,0 +1,122 @@
+"""Where the layers of a scene are put on the blur axis: at its ends, its planes and its borders, and in between.
+
+Distances are those of :mod:`torchdof.render.layer_weights`' blur axis.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .layer_weights import blur_axis
+
+__all__ = ["border_nodes", "ends", "finest", "on_axis", "plane_nodes", "spaced_nodes", "spacing"]
+
+_FINEST = 0.5
+_FINEST_PARTS = 40.0
+_WIDE = _FINEST * _FINEST_PARTS  # from which on the finest distance grows
+_SAMPLES = 2**16  # pixels that tell where planes are
+_SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next two: errors stay below the tolerance
+_SPACING_POWER = 0.8  # of the tolerance
+_LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consists of two layers
+
+
+def on_axis(coc_px: Tensor) -> Tensor:
+    """Places of pixels on the blur axis, finite, shaped as ``coc_px``."""
+    coc = coc_px.detach()
+    # a kernel far larger than the frame is the same everywhere in it
+    reach = 4.0 * max(coc.shape[-2:]) + 4.0
+    return blur_axis(torch.where(torch.isnan(coc), 0.0, coc).clamp(-reach, reach))
+
+
+def finest(x: float) -> float:
+    """Least distance between layers at a place that is worth anything: half a pixel, or a fortieth of the blur."""
+    return max(_FINEST, abs(x) / _FINEST_PARTS)
+
+
+def spacing(x: float, tolerance: float) -> float:
+    """Distance on the blur axis from a node at ``x`` to the next one outwards."""
+    times = tolerance * 255.0
+    loose = times**_SPACING_POWER if times <= _LOOSE else max(_LOOSE**_SPACING_POWER, math.sqrt(times))
+    return max(finest(x), _SPACING * loose * max(abs(x) + 0.5, 1.0) ** 0.75)
+
+
+def spaced_nodes(low: float, high: float, tolerance: float) -> tuple[float, ...]:
+    """Nodes outwards from focus by :func:`spacing`, the last on each side at or beyond the given end."""
+    nodes = [0.0]
+    for sign, limit in ((-1, -low), (1, high)):
+        x = 0.0
+        while x < limit:
+            x += spacing(x, tolerance)
+            nodes.append(sign * x)
+    return tuple(sorted(nodes))
+
+
+def ends(x: Tensor) -> tuple[float, float]:
+    """Nearest and farthest place."""
+    low, high = torch.stack(torch.aminmax(x)).tolist()
+    return low, high
+
+
+def plane_nodes(x: Tensor, tolerance: float) -> list[float]:
+    """Places at which many pixels lie and few around them: planes that face the camera, and distant backgrounds.
+
+    Few may lie as far around as the next layer would be at this tolerance.
+    """
+    step = max(1, math.isqrt(x.numel() // _SAMPLES))
+    return _crowded(x[..., ::step, ::step].flatten(), width=0.2, least_share=0.01, tolerance=tolerance)
+
+
+def border_nodes(x: Tensor) -> list[float]:
+    """Places at which much of the frame's border lies.
+
+    Surfaces go on beyond the frame as they are at its border. Light from there is not known; what stands for it is
+    light of the same layer, which therefore must not reach far into the frame.
+    """
+    border = torch.cat([x[..., 0, :], x[..., -1, :], x[..., 0], x[..., -1]], -1).flatten()
+    return _crowded(border, width=1.0, least_share=0.03)
+
+
+def _crowded(x: Tensor, width: float, least_share: float, tolerance: float | None = None) -> list[float]:
+    """Places at which at least so large a share of all places ``[n]`` lies, and 16, the most crowded first.
+
+    What counts as one place is ``width`` finest distances wide, three bins of the histogram. With a tolerance, half of
+    what lies within a layer's spacing of such a place must lie at it.
+    """
+    bins = torch.round(_in_finest(x) * (3.0 / width)).long()
+    first = int(bins.min())
+    counts = torch.bincount(bins - first)
+    sums = functional.pad(counts.cumsum(0), (1, 0)).tolist()
+
+    def count_within(i: int, reach: int) -> int:
+        return int(sums[min(i + reach + 1, len(counts))] - sums[max(i - reach, 0)])
+
+    places: list[float] = []
+    least = max(least_share * len(x), 16)
+    crowds = {i: count_within(i, 1) for i in range(len(counts))}
+    for i, count in sorted(crowds.items(), key=lambda item: -item[1]):
+        if count < least:
+            break
+        place = _from_finest((first + i) * width / 3.0)
+        if tolerance is not None:
+            reach = round(1.5 * spacing(place, tolerance) / (finest(place) * width))
+            if 2 * count < count_within(i, reach):
+                continue
+        if all(abs(place - other) > 0.6 * finest(place) for other in places):
+            # one that occurs: its pixels then lie in no other layer
+            places.append(float(x[(bins - first - i).abs() <= 1].median()))
+    return places
+
+
+def _in_finest(x: Tensor) -> Tensor:
+    """Places in finest distances from focus."""
+    steps = x.abs().clamp(max=_WIDE) / _FINEST + _FINEST_PARTS * (x.abs() / _WIDE).clamp_min(1.0).log()
+    return steps * x.sign()
+
+
+def _from_finest(steps: float) -> float:
+    """The place so many finest distances from focus."""
+    if abs(steps) <= _FINEST_PARTS:
+        return steps * _FINEST
+    return math.copysign(_WIDE * math.exp(abs(steps) / _FINEST_PARTS - 1.0), steps)

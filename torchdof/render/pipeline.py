@@ -1,0 +1,220 @@
+"""The chain: an image's surfaces and its highlights, the layers they lie in, scattered and composited."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ..options import NAMED, Options
+from ..validation import is_traced
+from . import compiled, composite, highlights
+from .attention import Attention, box_around, weight_map
+from .convolution import convolve
+from .matting import split_mixed
+from .plan import Blur, Plan
+from .scatter import fold
+from .surfaces import Frame, Surface, framed, surfaces_of_image
+
+__all__ = ["Tiling", "blur", "blur_attended", "blur_stack", "tiling"]
+
+_REACH = 4.0  # blur radii within which what lies around a pixel can change it: its light, and what is filled in behind
+_SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
+
+
+class Tiling(NamedTuple):
+    """How an exported graph goes over a frame: ``render`` takes it, its kernels and what renders one piece of it.
+
+    ``align`` tells what the frame must be a multiple of, given the pixels that the widest kernel reaches.
+    """
+
+    align: Callable[[int], int]
+    render: Callable[[Frame, Sequence[Blur], Callable[[Frame, Sequence[Blur]], Tensor]], Tensor]
+
+
+tiling: ContextVar[Tiling | None] = ContextVar("tiling", default=None)
+"""Set by whoever exports a graph; frames are rendered whole else."""
+
+
+def blur(
+    image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options, behind: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """Depth of field of checked arguments, as :func:`torchdof.blur_by_coc` has them; ``behind`` is background and coc.
+
+    Without a plan each item gets its own.
+    """
+    wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
+    maps = [image, coc_px, *(behind or ())]
+    maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]
+    if plan is None and is_traced():
+        # numbers that the graph is made for: those that differ between two modules would be variables in it
+        max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
+        plan = Plan.all(max_coc_px, tolerance)
+    elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
+        plan = Plan.still(torch.cat(maps[1::2]), options.tolerance)
+    if plan is not None:
+        return _render_item(plan, options, *maps).to(image.dtype)
+    # each item has its own layers, as it would have alone
+    items = []
+    for item in zip(*(t.split(1) for t in maps), strict=True):
+        items.append(_render_item(Plan.of_scene(torch.cat(item[1::2]), options.tolerance), options, *item))
+    return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
+
+
+def blur_attended(
+    image: Tensor,
+    coc_px: Tensor,
+    plan: Plan | None,
+    options: Options,
+    behind: tuple[Tensor, Tensor] | None,
+    attention: Attention | None,
+) -> Tensor:
+    """:func:`blur` that keeps the tolerance where the viewer looks; elsewhere that of a draft is enough."""
+    if attention is None:
+        return blur(image, coc_px, plan, options, behind)
+    weight = weight_map(attention, image)
+    loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED["draft"]))
+    known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
+    box = box_around(weight, _REACH * float(known.abs().amax()))
+    if box is None or loose.tolerance == options.tolerance:
+        return blur(image, coc_px, None, loose, behind)
+    part = (..., *box)
+    if image[part].shape == image.shape and bool((weight == 1).all()):
+        return blur(image, coc_px, None, options, behind)
+    around = blur(image, coc_px, None, loose, behind)
+    behind_part = None if behind is None else (behind[0][part], behind[1][part])
+    looked_at = blur(image[part], coc_px[part], None, options, behind_part)
+    rows, columns = box
+    ends = (columns.start, image.shape[-1] - columns.stop, rows.start, image.shape[-2] - rows.stop)
+    return torch.lerp(around, functional.pad(looked_at, ends), functional.pad(weight[part], ends).to(image.dtype))
+
+
+def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
+    """Depth of field of checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
+    wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
+    light, coc = rgba.to(wide), coc_px.to(wide)
+    cover = light[:, :, -1:].clamp(0.0, 1.0)
+    valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
+    cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
+    light = torch.where(valid, light / cover.clamp_min(1e-12), 0.0)
+    moves = torch.is_grad_enabled() and coc.requires_grad
+    plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), options.tolerance)
+    plan = Plan(plan.nodes, plan.tolerance, rays=False)
+    order = coc.argsort(1)  # near to far
+    light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
+    return _render_item(plan, options, light, coc, cover=cover).to(rgba.dtype)
+
+
+def _render_item(
+    plan: Plan,
+    options: Options,
+    light: Tensor,
+    coc: Tensor,
+    behind_light: Tensor | None = None,
+    behind_coc: Tensor | None = None,
+    cover: Tensor | None = None,
+) -> Tensor:
+    """The picture ``[B, C, H, W]`` of float maps with a plan: the one entry to both engines.
+
+    Args:
+        plan: Layers.
+        options: Options.
+        light: An image ``[B, C, H, W]``; with ``cover`` a stack ``[B, N, C, H, W]``, near to far.
+        coc: Its signed coc ``[B, 1, H, W]``; of a stack ``[B, N, 1, H, W]``.
+        behind_light: What is seen where the nearer surfaces of the image are taken away, if it is known.
+        behind_coc: Its coc.
+        cover: How much of each pixel each layer of a stack covers, ``[B, N, 1, H, W]``.
+    """
+    if plan.nodes != (0.0,):
+        picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover)
+        if picture is not None:
+            return picture
+    low, high = plan.coc_px[0], plan.coc_px[-1]  # beyond, blurs are alike, and differences of huge ones would cancel
+    if cover is not None:
+        coc = coc.clamp(low, high)
+        stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
+        # what no layer covers is seen through all of them
+        stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], high)))
+        return _composite(stack, None, plan, options, stacked=True)
+    if plan.nodes == (0.0,):
+        # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
+        return light + 0.0 * torch.nan_to_num(coc) if torch.is_grad_enabled() and coc.requires_grad else light.clone()
+    image, valid, weight = light, None, None
+    if not options.check:
+        valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
+        coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
+    coc = coc.clamp(low, high)
+
+    # what is a highlight; without occlusion it matters only where a light is too bright for a coarse layer
+    crisp_px = plan.crisp_px if options.method == "layered" else math.inf
+    coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
+    limit = None
+    if len(plan.nodes) > 1 and (options.occlusion or (coarse and bool((light.detach() > 1.0).any()))):
+        limit = highlights.threshold(light, weight)
+
+    # the surfaces of each pixel, and what is behind all of them
+    surfaces, behind = [Surface(light, coc, weight)], None
+    if behind_light is not None and behind_coc is not None:
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc.clamp(low, high), options)
+    elif options.occlusion and limit is not None:
+        widest = max(2.0, *(abs(c) for c in plan.coc_px))
+        levels = min(math.ceil(math.log2(widest)) + 1, 7)
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels)
+
+    # the highlights of these, ray by ray
+    splats = None
+    if limit is not None and plan.rays:
+        extracted = [highlights.extract(s, limit, coc if options.occlusion else None, crisp_px) for s in surfaces]
+        surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
+        splats = highlights.splat(rays, coc, options.table, options.occlusion) if rays else None
+
+    out = _composite(surfaces, behind, plan, options, behind_light is not None, splats)
+    return out if valid is None else torch.where(valid, out, image)
+
+
+def _before_background(surface: Surface, behind: Tensor, behind_coc: Tensor, options: Options) -> list[Surface]:
+    """Surfaces of an image in front of a known background, near to far."""
+    light, coc, weight = surface
+    own, other, other_coc, share = split_mixed(light, coc, weight)
+    # what shows past a nearer surface of a mixed pixel is the background's to tell
+    own_weight, share = 1.0 - share, torch.where(other_coc < coc, share, 0.0)
+    if weight is not None:
+        own_weight, share = own_weight * weight, share * weight
+    apart = (behind_coc - coc - _SAME_PX).clamp(0.0, 1.0)  # else the image itself shows it
+    behind_weight = apart + (1.0 - apart) * share
+    if not options.check:
+        valid = torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
+        behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
+    shown = [Surface(other, other_coc, share), Surface(own, coc, own_weight)]
+    return [*shown, Surface(behind, torch.maximum(behind_coc, coc), behind_weight)]
+
+
+def _composite(
+    surfaces: list[Surface],
+    behind: Tensor | None,
+    plan: Plan,
+    options: Options,
+    stacked: bool,
+    splats: Tensor | None = None,
+) -> Tensor:
+    """Surfaces, and the light of highlights, to a picture."""
+    light = surfaces[0].light
+    layered, tiles = options.method == "layered", tiling.get() if torch.compiler.is_exporting() else None
+    blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
+    align = None if tiles is None else tiles.align
+    frame = framed(surfaces, behind, plan.nodes, blurs, options.border == "extend", stacked, align)
+
+    def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
+        scatter = convolve if layered else fold
+        if options.occlusion:
+            out = composite.over(frame, blurs, scatter)
+            return out if splats is None else out + splats
+        if not layered:
+            return composite.accumulate_once(frame, blurs, options.normalize)
+        return composite.accumulate(frame, blurs, scatter, options.normalize, splats)
+
+    return picture(frame, blurs) if tiles is None else tiles.render(frame, blurs, picture)

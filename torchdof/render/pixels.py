@@ -1,0 +1,56 @@
+"""Single pixels of maps ``[B, C, H, W]`` by their flat index: ``(item * H + row) * W + column``.
+
+Depth edges, hidden surfaces and highlights concern few pixels; these are looked at as lists ``[P]``.
+"""
+
+import torch
+from torch import Tensor
+
+__all__ = ["around", "corners", "indices", "pick", "places", "put"]
+
+
+def indices(mask: Tensor) -> Tensor:
+    """Indices of the pixels of a mask ``[B, 1, H, W]`` that are set: ``[P]``."""
+    return mask.flatten().nonzero()[:, 0]
+
+
+def places(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Item, row and column of pixels."""
+    line = pixels // width
+    item = line // height
+    return item, line - item * height, pixels - line * width
+
+
+def pick(values: Tensor, pixels: Tensor) -> Tensor:
+    """Values ``[B, C, H, W]`` at pixels of any shape ``[...]``: ``[C, ...]``."""
+    picked = values.transpose(0, 1).flatten(1).index_select(1, pixels.flatten())
+    return picked.unflatten(1, pixels.shape)
+
+
+def put(values: Tensor, pixels: Tensor, new: Tensor) -> Tensor:
+    """A copy of ``[B, C, H, W]`` with new values ``[C, P]`` (or ``[P]``, for one channel) at pixels ``[P]``."""
+    batch, channels, height, width = values.shape
+    flat = values.transpose(0, 1).flatten(1).index_copy(1, pixels, new.reshape(channels, -1).to(values.dtype))
+    return flat.unflatten(1, (batch, height, width)).transpose(0, 1)
+
+
+def around(pixels: Tensor, like: Tensor, reach: int) -> Tensor:
+    """The pixels up to ``reach`` around each, row by row, those beyond the border on it: ``[(2 reach + 1)^2, P]``."""
+    height, width = like.shape[-2:]
+    item, row, column = places(pixels, height, width)
+    offsets = torch.arange(-reach, reach + 1, device=pixels.device)[:, None]
+    lines = ((row + offsets).clamp(0, height - 1) + item * height) * width
+    columns = (column + offsets).clamp(0, width - 1)
+    return (lines[:, None] + columns).flatten(0, 1)
+
+
+def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) -> tuple[list[Tensor], Tensor, Tensor]:
+    """The four pixels around places, for linear interpolation, and how far down and right of the first the places lie.
+
+    Values go on beyond the border as they are at it. An axis of one pixel has no next one, and gives it no weight.
+    """
+    row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
+    top, left = row.floor().clamp(max=max(0, height - 2)), column.floor().clamp(max=max(0, width - 2))
+    first = (item * height + top.long()) * width + left.long()
+    below, beside = min(1, height - 1) * width, min(1, width - 1)
+    return [first, first + beside, first + below, first + (below + beside)], row - top, column - left

@@ -1,0 +1,219 @@
+"""What a scene needs: the layers to render it with, for a tolerance, and their kernels."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..optics.blur_table import BlurTable
+from ..optics.kernel_cache import KernelCache
+from . import layer_cocs
+from .downsampling import shrink
+from .layer_weights import from_blur_axis, weight_at_or_behind
+
+__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
+
+KERNELS_PER_PX = 32
+"""Of radius, for highlights."""
+
+_COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
+_kernels = KernelCache(256 * 2**20)
+
+
+@dataclasses.dataclass(frozen=True)
+class Blur:
+    """How one layer is scattered.
+
+    Args:
+        kernel: ``[1 or C, k, k]``, in pixels of the layer's resolution.
+        scale: The layer is convolved at every ``scale``-th pixel.
+    """
+
+    kernel: Tensor
+    scale: int
+
+    @property
+    def half(self) -> int:
+        """Pixels of the layer's resolution that the kernel reaches to each side."""
+        return self.kernel.shape[-1] // 2
+
+    @property
+    def halo(self) -> int:
+        """Pixels of the image around a window that the layer needs."""
+        return self.half if self.scale == 1 else self.scale * (self.half + 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Layers of a rendering, near to far; ``print`` tells them.
+
+    Args:
+        nodes: Places of the layers on the blur axis (see :mod:`torchdof.render.layer_weights`), strictly increasing.
+        tolerance: What the plan was made for.
+        rays: Highlights are traced (:mod:`torchdof.render.highlights`) where layers would not do; False leaves them in
+            their layers, as plans for every scene do.
+        pixels: Share of the scene's pixels that each layer carries, where it was asked for.
+    """
+
+    nodes: tuple[float, ...]
+    tolerance: float
+    rays: bool = True
+    pixels: tuple[float, ...] | None = dataclasses.field(default=None, compare=False, repr=False)
+
+    @classmethod
+    def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
+        """Layers for this scene: they span the coc that occur, with one on each end, and lie close at those of borders.
+
+        A scene ``[B, 1, H, W]`` of one plane gets one layer, and its kernel is exact. NaN is left out.
+        """
+        x = layer_cocs.on_axis(coc_px)
+        low, high = layer_cocs.ends(x)
+        if high <= low:
+            return cls((low,), tolerance)
+        nodes = [low, high]
+
+        def add(node: float, gap: float) -> None:
+            if low < node < high and min(abs(node - other) for other in nodes) > gap:
+                nodes.append(node)
+
+        for plane in layer_cocs.plane_nodes(x, tolerance):
+            add(plane, 0.2 * layer_cocs.finest(plane))
+        for border in layer_cocs.border_nodes(x):
+            finest = layer_cocs.finest(border)
+            if layer_cocs.spacing(border, tolerance) > 2.5 * finest:
+                for node in (border, border - finest, border + finest):
+                    add(node, 0.6 * finest)
+        for node in layer_cocs.spaced_nodes(low, high, tolerance):
+            add(node, 0.0 if node == 0.0 else 0.3 * layer_cocs.spacing(node, tolerance))
+        return cls(tuple(sorted(nodes)), tolerance)
+
+    @classmethod
+    def still(cls, coc_px: Tensor, tolerance: float) -> "Plan":
+        """Layers that reach as far as this scene does but do not move with it: for gradients."""
+        return cls(layer_cocs.spaced_nodes(*layer_cocs.ends(layer_cocs.on_axis(coc_px)), tolerance), tolerance)
+
+    @classmethod
+    def all(cls, max_coc_px: float, tolerance: float) -> "Plan":
+        """Layers for every scene up to a radius: the plan of a compiled or exported module."""
+        reach = max_coc_px - 0.5
+        last = reach - 0.3 * layer_cocs.spacing(reach, tolerance)
+        inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance) if abs(x) < last]
+        return cls((-reach, *inner, reach), tolerance, rays=False)
+
+    def of_pixels(self, coc_px: Tensor) -> "Plan":
+        """The same plan, told which share of a scene's pixels each layer carries: ``[B, 1, H, W]``."""
+        x = layer_cocs.on_axis(coc_px).clamp(self.nodes[0], self.nodes[-1])
+        behind = [float(weight_at_or_behind(x, self.nodes, k).double().mean()) for k in range(len(self.nodes) + 1)]
+        pixels = tuple(behind[k] - behind[k + 1] for k in range(len(self.nodes)))
+        return dataclasses.replace(self, pixels=pixels)
+
+    def __str__(self) -> str:
+        lines = [f"{len(self.nodes)} layers, near to far, tolerance {255 * self.tolerance:.3g}/255"]
+        lines.append(f"{'coc px':>8} {'radius':>7} {'at':>5}" + (f" {'pixels':>7}" if self.pixels else ""))
+        for k, coc in enumerate(self.coc_px):
+            scale = self._scale(coc) if len(self.nodes) > 1 else 1
+            share = f" {self.pixels[k]:7.1%}" if self.pixels else ""
+            lines.append(f"{coc:8.2f} {abs(coc):7.2f} {'full' if scale == 1 else f'1/{scale}':>5}{share}")
+        return "\n".join(lines)
+
+    @property
+    def coc_px(self) -> tuple[float, ...]:
+        """Signed coc of the layers, near to far."""
+        return tuple(from_blur_axis(x) for x in self.nodes)
+
+    @property
+    def crisp_px(self) -> float:
+        """Radius from which on light is blurred at a coarser resolution, all or in part; that softens highlights."""
+        coarse = [abs(coc) for coc in self.coc_px if self._scale(coc) > 1]
+        finer = [abs(coc) for coc in self.coc_px if abs(coc) < min(coarse, default=0.0)]
+        return math.inf if not coarse else max(finer, default=0.0)
+
+    def blurs(
+        self, table: BlurTable, size: tuple[int, int], dtype: torch.dtype, device: torch.device, coarse: bool
+    ) -> list[Blur]:
+        """Kernel and resolution of each layer for a frame of ``size`` (height, width).
+
+        Kernels are cut to what reaches from one pixel of the frame to another. Traced code holds them as constants, so
+        a table that is tied to the width of the image ties it as well.
+        """
+        width = 1 if table.unit == "relative" else int(size[1])
+        coarse = coarse and len(self.nodes) > 1  # a plane is exact
+        scales = tuple(self._scale(coc) if coarse else 1 for coc in self.coc_px)
+        if torch.compiler.is_compiling():  # no names of this process's, such as a cache's keys, in what is compiled
+            shapes = _constant_shapes(table, self.coc_px, width, scales)
+            flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
+            parts = flat.split([math.prod(shape) for shape in shapes])
+            longest = [(torch.sym_max(*size) + s - 1) // s for s in scales]
+            bank = [_masked(k.reshape(shape), n) for k, shape, n in zip(parts, shapes, longest, strict=True)]
+        else:
+            lens = table.fingerprint()
+            bank = []
+            for coc, scale in zip(self.coc_px, scales, strict=True):
+                longest_px = -(-max(size) // scale)
+                reach = functools.partial(table.reach_px, coc / scale, width / scale)
+                reach_px = _kernels.get((lens, coc, width, scale), reach)
+                window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
+                bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
+        return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+
+    def _scale(self, coc_px: float) -> int:
+        """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
+        reach = abs(coc_px) * math.sqrt(self.tolerance * 255.0)
+        return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
+
+
+def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:
+    """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, of signed coc ``[n]``.
+
+    Each is that of the nearest 1/32 px where no gradient asks for more. They are cut to what reaches within a frame
+    whose longer side is ``longest`` pixels.
+    """
+    if torch.is_grad_enabled() and coc_px.requires_grad:
+        kernels = table.kernels(coc_px, width)
+    else:
+        steps = (coc_px.double() * KERNELS_PER_PX).round() / KERNELS_PER_PX
+        radii, which = torch.unique(steps, return_inverse=True)
+        kernels = table.kernels(radii.cpu(), width).to(coc_px.device)[which]
+    spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
+    return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
+
+
+def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, window: int | None) -> Tensor:
+    """Kernel ``[1 or C, k, k]`` of a coc at every ``scale``-th pixel; ``lens`` is the table's fingerprint."""
+
+    @torch.inference_mode(False)  # what is kept must serve autograd as well
+    def made() -> Tensor:
+        coc = coc_px / scale
+        if scale > 1:  # averaging and interpolation blur as well
+            coc *= shrink(table, coc, width / scale, scale)
+        return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0].clone()
+
+    return _kernels.get((lens, coc_px, width, scale, window), made)
+
+
+def _constant_shapes(
+    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]
+) -> tuple[tuple[int, ...], ...]:
+    lens = table.fingerprint()
+    return tuple(tuple(_kernel(table, lens, c, width, s, None).shape) for c, s in zip(coc_px, scales, strict=True))
+
+
+def _constant_kernels(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> Tensor:
+    lens = table.fingerprint()
+    kernels = [_kernel(table, lens, c, width, s, None) for c, s in zip(coc_px, scales, strict=True)]
+    return torch.cat([kernel.flatten() for kernel in kernels])
+
+
+for _constant in (_constant_shapes, _constant_kernels):  # one result each, for a compiled graph holds one of a function
+    # what torch.compiler.assume_constant_result does, without importing the whole compiler for it
+    _constant._dynamo_marked_constant = True  # type: ignore[union-attr]
+
+
+def _masked(kernel: Tensor, longest: int) -> Tensor:
+    """A kernel of traced code, which keeps its size: taps that reach beyond a frame ``longest`` pixels long are 0."""
+    half = kernel.shape[-1] // 2
+    within = (torch.arange(-half, half + 1, device=kernel.device).abs() < longest).to(kernel.dtype)
+    return kernel * within * within[:, None]

@@ -1,0 +1,53 @@
+"""The paper's scatter, literally: every pixel's light, multiplied into a kernel centred on the pixel, accumulated.
+
+Light scattered over the frame's border is lost, nothing comes in.
+"""
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ..validation import is_traced
+from .convolution import DIRECT_TAPS, widest_float
+
+__all__ = ["fold"]
+
+_COLUMN_BYTES = 256 * 2**20
+
+
+def fold(light: Tensor, kernels: Tensor, halo: int = 0, weights: Tensor | None = None) -> Tensor:
+    """Columns of pixel light times kernel, summed where they fall by ``fold``.
+
+    Works on so many rows at once that the columns stay within 256 MB. Sums of large kernels are taken in float64.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        kernels: ``[1 or C, k, k]``, k odd; or, with weights, a bank of them ``[n, 1 or C, k, k]``.
+        halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
+        weights: How much of each kernel of the bank a pixel is scattered with, ``[B, n, H, W]``.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 3, steps (a) to (c). The adjoint is ``unfold``.
+    """
+    batch, channels, height, width = light.shape
+    if weights is None:
+        kernels, weights = kernels.unsqueeze(0), light.new_ones(1, 1, 1, 1).expand(batch, 1, height, width)
+    size, wide = kernels.shape[-1], widest_float(light.device)
+    half = size // 2
+    if size * size > DIRECT_TAPS and light.dtype != wide and not is_traced():
+        return fold(light.to(wide), kernels.to(wide), halo, weights.to(wide)).to(light.dtype)
+    rows = max(1, _COLUMN_BYTES // (batch * channels * size * size * width * light.element_size()))
+    strips = []
+    for top in range(0, height, rows):
+        strip, weight = (t[:, :, top : top + rows] for t in (light, weights))
+        taps = torch.einsum("bnp,nct->bctp", weight.flatten(2), kernels.flatten(2))  # every pixel's own kernel
+        columns = strip.flatten(2).unsqueeze(2) * taps  # [B, C, k*k, pixels]
+        area = (strip.shape[-2] + 2 * half, width + 2 * half)
+        strips.append((top, functional.fold(columns.flatten(1, 2), area, (size, size))))
+    scattered = strips[0][1]
+    if len(strips) > 1:
+        scattered = light.new_zeros(batch, channels, height + 2 * half, width + 2 * half)
+        for top, strip in strips:
+            scattered[:, :, top : top + strip.shape[-2]] += strip
+    inset = half + halo
+    return scattered[:, :, inset : inset + height - 2 * halo, inset : inset + width - 2 * halo]

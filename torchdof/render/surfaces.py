@@ -1,0 +1,234 @@
+"""The surfaces that each pixel shows and hides, and the frame that they make, continued over its border."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ..validation import is_traced
+from .disocclusion import BEHIND_STEP, behind_size, fill_hidden
+from .downsampling import upsampled
+from .layer_weights import blur_axis, weight_at_or_behind
+from .matting import split_mixed
+from .plan import Blur
+
+__all__ = ["Frame", "Placed", "Surface", "framed", "surfaces_of_image"]
+
+
+class Surface(NamedTuple):
+    """What a surface contributes to each pixel: light ``[B, C, H, W]``, signed coc and weight ``[B, 1, H, W]``.
+
+    The weight is the share of the pixel that it covers; None is 1.
+    """
+
+    light: Tensor
+    coc_px: Tensor
+    weight: Tensor | None = None
+
+
+class Placed(NamedTuple):
+    """A surface continued over the frame's border; ``x`` is its place on the blur axis."""
+
+    light: Tensor
+    x: Tensor
+    weight: Tensor | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """Surfaces of a frame, continued over its border; what the layers scatter is cut out of it.
+
+    Args:
+        surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area.
+        nodes: Places of the layers on the blur axis, near to far.
+        known: 1 where light was seen, 0 where it is unknown, ``[1 or B, 1, ...]`` as they are; None: all is known.
+        behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
+        margin: Pixels on each side, as many as the widest kernel reaches.
+        area: Height and width, continued to whole blocks of the coarsest layer.
+        size: Height and width of the image.
+        stacked: The surfaces of a pixel, near to far, each cover it by their weight, whatever the others do. False:
+            their weights are shares of the pixel.
+    """
+
+    surfaces: Sequence[Placed]
+    nodes: Sequence[float]
+    known: Tensor | None
+    behind: Tensor | None
+    margin: int
+    area: tuple[int, int]
+    size: tuple[int, int]
+    stacked: bool = False
+
+    @property
+    def colours(self) -> int:
+        """C."""
+        return int(self.surfaces[0].light.shape[1])
+
+    def cut(self, values: Tensor, halo: int) -> Tensor:
+        """The part of a map of the frame that reaches so far beyond its area."""
+        start = self.margin - halo
+        return values[..., start : start + self.area[0] + 2 * halo, start : start + self.area[1] + 2 * halo]
+
+    def occupied(self) -> list[bool]:
+        """Whether anything lies in each layer; in traced code, which cannot look, anything may."""
+        count = len(self.nodes)
+        if is_traced():
+            return [True] * count
+        x = torch.stack([s.x for s in self.surfaces])
+        axis = x.new_tensor(self.nodes)
+        nearer = (torch.bucketize(x, axis, right=True) - 1).clamp(0, count - 1)  # the node at or before
+        counts = torch.bincount((2 * nearer + (x > axis[nearer])).flatten(), minlength=2 * count).tolist()
+        return [any(counts[max(2 * k - 1, 0) : 2 * k + 2]) for k in range(count)]
+
+    def any_between(self, low: float, high: float, halo: int) -> Tensor:
+        """Whether anything, up to so far beyond the area, lies between two places on the blur axis: a bool tensor."""
+        places = [self.cut(s.x, halo) for s in self.surfaces]
+        return torch.stack([((x > low) & (x < high)).any() for x in places]).any()
+
+    def layer(self, k: int, halo: int, visibility: bool) -> list[Tensor]:
+        """What layer k scatters, with so many pixels beyond the area: light ``m_k I`` and the weight ``m_k`` seen.
+
+        With visibility all of ``m_k``, then ``M_k``, the weight at or behind the layer; and what of ``m_k`` was seen,
+        where some was not.
+        """
+        surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
+        known = None if self.known is None else self.cut(self.known, halo)
+        light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, self.nodes, k)
+        if not visibility:
+            return [light, weight if known is None else weight * known]
+        return [light, weight, behind] if known is None else [light, weight, behind, weight * known]
+
+
+def _mixed(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
+    """``m_k I``, ``m_k`` and ``M_k`` of surfaces that share their pixels: each is a sum over them."""
+    sums: list[Tensor] = []
+    for light, x, cover in surfaces:
+        behind = weight_at_or_behind(x, nodes, k)
+        own = behind - weight_at_or_behind(x, nodes, k + 1)
+        if cover is not None:
+            behind, own = behind * cover, own * cover
+        terms = [light * own, own, behind]
+        sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms
+    return sums[0], sums[1], sums[2]
+
+
+def _stacked(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of surfaces that cover a pixel independently, near to far.
+
+    A pixel counts for layer k as far as what is at or behind it is known, but for what that has in front.
+    """
+    visible = torch.ones_like(surfaces[0].x)
+    left = unknown = visible
+    stopped = []
+    for _, x, weight in surfaces:
+        behind = weight_at_or_behind(x, nodes, k)
+        own = behind - weight_at_or_behind(x, nodes, k + 1)
+        cover = torch.ones_like(x) if weight is None else weight
+        passes = torch.where(behind > 0, 1.0 - cover * (1.0 - behind), 1.0)  # what layers in front leave
+        stops = cover * own / passes.clamp_min(1e-6)  # of what arrives at the surface in this layer
+        stopped.append(left * stops)
+        left, visible = left * (1.0 - stops), visible * passes
+        unknown = torch.where(behind > 0, unknown * (1.0 - cover), unknown)
+    light = torch.stack([s.light * (visible * part) for s, part in zip(surfaces, stopped, strict=True)]).sum(0)
+    return light, visible * torch.stack(stopped).sum(0), visible * (1.0 - unknown)
+
+
+def framed(
+    surfaces: Sequence[Surface],
+    behind: Tensor | None,
+    nodes: Sequence[float],
+    blurs: Sequence[Blur],
+    extend: bool,
+    stacked: bool,
+    align: Callable[[int], int] | None = None,
+) -> Frame:
+    """Surfaces of an image as a frame: they go on beyond the border as they are at it; light there is 0 and unknown.
+
+    Args:
+        surfaces: Near to far if stacked.
+        nodes: As in :class:`Frame`; surfaces beyond the outermost ones belong to these.
+        behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
+        blurs: Kernel and resolution of each layer.
+        extend: Continue light over the border as well, as if it were known.
+        stacked: As in :class:`Frame`.
+        align: What the area must be a multiple of, given the margin; None: the coarsest layer's pixel.
+    """
+    coarsest = max(blur.scale for blur in blurs)
+    margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
+    multiple = coarsest if align is None else align(margin)
+    size = (surfaces[0].light.shape[-2], surfaces[0].light.shape[-1])
+    height, width = ((n + multiple - 1) // multiple * multiple for n in size)
+    beyond = (0, width - size[1], 0, height - size[0])  # right and below, to whole blocks
+    ends = (margin, margin + beyond[1], margin, margin + beyond[3])
+    placed = []
+    for light, coc, weight in surfaces:
+        light = functional.pad(light, ends, mode="replicate" if extend else "constant")
+        x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
+        placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
+    known = None if extend else functional.pad(torch.ones_like(surfaces[0].coc_px[:1]), ends)
+    if behind is not None:
+        behind = upsampled(behind, BEHIND_STEP)[..., : size[0], : size[1]]
+        behind = functional.pad(behind, beyond, mode="replicate")
+    return Frame(placed, nodes, known, behind, margin, (height, width), size, stacked)
+
+
+def surfaces_of_image(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
+) -> tuple[list[Surface], Tensor]:
+    """What each pixel shows, and what is mixed into it or hidden behind it; and light behind both.
+
+    Arguments and what is behind are those of :func:`torchdof.render.disocclusion.fill_hidden`.
+    """
+    compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
+    maps = (_operator if compiling else _split_and_fill)(light, coc_px, valid, threshold, levels)
+    own, own_weight, other, other_coc, other_weight, behind = maps
+    return [Surface(own, coc_px, own_weight), Surface(other, other_coc, other_weight)], behind
+
+
+def _split_and_fill(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
+) -> tuple[Tensor, ...]:
+    own, other, other_coc, share = split_mixed(light, coc_px, valid)
+    own_weight = 1.0 - share
+    other, other_coc, share, behind = fill_hidden(own, coc_px, other, other_coc, share, valid, threshold, levels)
+    if valid is not None:
+        own_weight, share = own_weight * valid, share * valid
+    return own, own_weight, other, other_coc, share, behind
+
+
+# How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
+@torch.library.custom_op("torchdof::surfaces", mutates_args=())
+def _operator(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    maps = (t.contiguous() for t in _split_and_fill(light, coc_px, valid, threshold, levels))
+    own, own_weight, other, other_coc, other_weight, behind = maps
+    return own, own_weight, other, other_coc, other_weight, behind
+
+
+@_operator.register_fake
+def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int) -> tuple[Tensor, ...]:
+    colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
+    behind = light.new_empty(*light.shape[:2], *(behind_size(n, levels) for n in light.shape[-2:]))
+    return colour, single, *(torch.empty_like(t) for t in (colour, single, single)), behind
+
+
+def _remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:
+    *maps, context.levels = inputs
+    context.save_for_backward(*maps)
+
+
+def _backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+    light, coc_px, valid, threshold = context.saved_tensors
+    with torch.enable_grad():
+        light, coc_px = light.detach().requires_grad_(), coc_px.detach().requires_grad_()
+        outputs = _split_and_fill(light, coc_px, valid, threshold, context.levels)
+        wanted = [(o, g) for o, g in zip(outputs, gradients, strict=True) if o.requires_grad]
+        back = torch.autograd.grad([o for o, _ in wanted], [light, coc_px], [g for _, g in wanted], allow_unused=True)
+    return (*back, None, None, None)
+
+
+_operator.register_autograd(_backward, setup_context=_remember)
