@@ -32,7 +32,7 @@ def main() -> None:
 
     session = onnxruntime.InferenceSession(arguments.model, providers=["CPUExecutionProvider"])
     facts = session.get_modelmeta().custom_metadata_map
-    print(f"table {json.loads(facts['torchdof.optics.blur_table'])}, options {json.loads(facts['torchdof.options'])}")
+    print(f"table {json.loads(facts['torchdof.table'])}, options {json.loads(facts['torchdof.options'])}")
 
     light = read_image(arguments.image)
     depth = read_depth(arguments.depth, arguments.disparity_scale, arguments.disparity_offset)

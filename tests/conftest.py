@@ -1,7 +1,10 @@
+import functools
 import importlib.util
 import os
+import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -13,16 +16,23 @@ settings.register_profile("many", parent=settings.get_profile("local"), max_exam
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "local"))
 
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # a core for each worker, and for what it starts
+    os.environ["OMP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
+
+
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> None:
     torch.manual_seed(0)
 
 
+@functools.cache
 def _beside(name: str) -> ModuleType:
     """A module of shared helpers in this folder: tests are imported one by one, not as a package."""
     spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).with_name(f"{name}.py"))
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
@@ -37,3 +47,30 @@ def loops() -> ModuleType:
 def tolerances() -> dict[torch.dtype, dict[str, float]]:
     """Type -> rtol and atol, for `assert_close(a, b, **tolerances[a.dtype])`."""
     return _beside("tolerances").TOLERANCES
+
+
+@pytest.fixture(scope="session")
+def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of all workers of this run."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "shared"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def layered(shared_folder: Path) -> Any:
+    """An exported module with occlusion, by convolution at resolutions down to a sixteenth."""
+    return _beside("exported").export_once("layered", shared_folder)
+
+
+@pytest.fixture(scope="session")
+def fold(shared_folder: Path) -> Any:
+    """An exported module with occlusion, by the literal scatter."""
+    return _beside("exported").export_once("fold", shared_folder)
+
+
+@pytest.fixture(scope="session")
+def plain(shared_folder: Path) -> Any:
+    """An exported module without occlusion, which is traced in a few seconds."""
+    return _beside("exported").export_once("plain", shared_folder)

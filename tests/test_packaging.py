@@ -3,7 +3,6 @@
 import doctest
 import importlib
 import importlib.metadata
-import pkgutil
 from pathlib import Path
 
 import pytest
@@ -12,14 +11,17 @@ from typer.testing import CliRunner
 import torchdof
 from torchdof.cli.main import app
 
+ROOT = Path(__file__).parents[1]
+FOLDERS = {"torchdof": "torchdof", "fit": "torchdof.fit", "export": "torchdof.export"}
 MODULES = sorted(
-    module.name
-    for module in pkgutil.walk_packages(torchdof.__path__, "torchdof.")
-    if module.name != "torchdof.__main__"
+    ".".join([package, *path.relative_to(ROOT / folder).with_suffix("").parts]).removesuffix(".__init__")
+    for folder, package in FOLDERS.items()
+    for path in (ROOT / folder).rglob("*.py")
+    if path.name != "__main__.py"
 )
 
 
-@pytest.mark.parametrize("name", ["torchdof", *MODULES])
+@pytest.mark.parametrize("name", MODULES)
 def test_examples_in_docstrings_run(name: str) -> None:
     failed, _ = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
     assert failed == 0

@@ -247,7 +247,7 @@ def test_bad_arguments_are_refused_in_a_sentence(
 
 
 def test_an_exported_file_has_its_row() -> None:
-    subject = shipped(64, 160)
+    subject = shipped(64, 96)
     found = [s for s in speed.settings(subject, ["onnxruntime"]) if s.runtime == "onnxruntime"]
     assert [(s.name, s.occlusion) for s in found] == [("onnx 1/255", True), ("onnx 1/255", False)]
     wanted = speed.exact(subject, occlusion=False)

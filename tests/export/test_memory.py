@@ -22,9 +22,9 @@ RENDER = """
 import json, sys
 import numpy as np
 from torchdof.bench import memory
-from torchdof.export import timing
-session = timing.session(sys.argv[1], threads=1)
-feed = timing.feed(session, (int(sys.argv[2]), int(sys.argv[3])), "blurred background")
+from torchdof.bench import exported
+session = exported.session(sys.argv[1], threads=1)
+feed = exported.feed(session, (int(sys.argv[2]), int(sys.argv[3])), "blurred background")
 (out,) = session.run(None, feed)
 print(json.dumps({"peak_gb": memory.peak_mb() * 2**20 / 1e9}))
 np.savez(sys.argv[4], out=out, **feed)

@@ -343,38 +343,52 @@ torchdof.cli.main.app(sys.argv[1:])
 
 
 CUT = """
-import resource, signal, sys, torch
+import os, resource, signal, sys, torch
 from torchdof.io.images import Picture, read_image, write_image
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-name, sample = sys.argv[1:]
 picture = Picture(torch.linspace(0, 1, 3 * 30 * 40).reshape(1, 3, 30, 40))
-write_image("whole" + name, picture, sample=sample)
-size = len(open("whole" + name, "rb").read())
-for limit in (size - 1, size - 3, size // 2, 100):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-    try:
-        write_image(name, picture, sample=sample)
-        print("written")
-    except OSError as error:
-        print("refused:", error)
+for folder in sys.argv[1:]:
+    name, sample = folder.split()
+    os.chdir(folder)
+    write_image("whole" + name, picture, sample=sample)
+    size = len(open("whole" + name, "rb").read())
+    for limit in (size - 1, size - 3, size // 2, 100):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        try:
+            write_image(name, picture, sample=sample)
+            print(folder, "written")
+        except OSError as error:
+            print(folder, "refused:", error)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    os.chdir("..")
 """
+KINDS = [(".png", "8"), (".png", "16"), (".exr", "half"), (".exr", "float"), (".tif", "float"), (".hdr", "float"),
+         (".pfm", "float"), (".jpg", "8")]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """Where a picture of each kind was written four times to a disk that was too full, in a folder each."""
+    folder = tmp_path_factory.mktemp("cut")
+    folders = [f"x{suffix} {sample}" for suffix, sample in KINDS]
+    for name in folders:
+        (folder / name).mkdir()
+        (folder / name / name.split()[0]).write_text("old")
+    call = [sys.executable, "-c", CUT, *folders]
+    return folder, subprocess.run(call, cwd=folder, capture_output=True, text=True, timeout=120)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files")
-@pytest.mark.parametrize(
-    ("suffix", "sample"),
-    [(".png", "8"), (".png", "16"), (".exr", "half"), (".exr", "float"), (".tif", "float"), (".hdr", "float"),
-     (".pfm", "float"), (".jpg", "8")],
-)  # fmt: skip
-def test_a_disk_that_is_full_at_the_last_byte_is_noticed(tmp_path: Path, suffix: str, sample: str) -> None:
-    (tmp_path / f"x{suffix}").write_text("old")
-    run = subprocess.run(
-        [sys.executable, "-c", CUT, f"x{suffix}", sample], cwd=tmp_path, capture_output=True, text=True, timeout=60
-    )
-    said = run.stdout.splitlines()
-    assert len(said) == 4 and all(line.startswith("refused:") for line in said), run.stdout + run.stderr
-    assert (tmp_path / f"x{suffix}").read_text() == "old"
-    assert sorted(p.name for p in tmp_path.iterdir()) == [f"wholex{suffix}", f"x{suffix}"]
+@pytest.mark.parametrize(("suffix", "sample"), KINDS)
+def test_a_disk_that_is_full_at_the_last_byte_is_noticed(
+    cut: tuple[Path, subprocess.CompletedProcess[str]], suffix: str, sample: str
+) -> None:
+    folder, run = cut
+    name = f"x{suffix} {sample}"
+    said = [line.removeprefix(name) for line in run.stdout.splitlines() if line.startswith(name)]
+    assert len(said) == 4 and all(line.startswith(" refused:") for line in said), run.stdout + run.stderr
+    assert (folder / name / f"x{suffix}").read_text() == "old"
+    assert sorted(p.name for p in (folder / name).iterdir()) == [f"wholex{suffix}", f"x{suffix}"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files")

@@ -466,26 +466,42 @@ def test_failed_rename_leaves_the_old_file_and_nothing_else(tmp_path: Path, monk
     assert [p.name for p in tmp_path.iterdir()] == ["x.png"]
 
 
-@pytest.mark.hard
-@pytest.mark.parametrize(
-    ("suffix", "sample"),
-    [(".png", "16"), (".jpg", "8"), (".tif", "float"), (".exr", "half"), (".hdr", "float"), (".pfm", "float")],
-)
-def test_full_disk_is_an_error_and_leaves_the_old_file(tmp_path: Path, suffix: str, sample: str) -> None:
-    (tmp_path / f"x{suffix}").write_text("old")
-    script = f"""
-import resource, signal, torch
+FULL_DISK = """
+import os, resource, signal, sys, torch
 from torchdof.io.images import Picture, write_image
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
-try:
-    write_image("x{suffix}", Picture(torch.rand(1, 3, 200, 300)), sample="{sample}")
-except OSError as error:
-    print("refused:", error)
+for kind in sys.argv[1:]:
+    suffix, sample = kind.split()
+    os.chdir(suffix[1:])
+    try:
+        write_image("x" + suffix, Picture(torch.rand(1, 3, 200, 300)), sample=sample)
+        print(suffix, "written")
+    except OSError as error:
+        print(suffix, "refused:", error)
+    os.chdir("..")
 """
-    run = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert "refused:" in run.stdout, run.stderr
-    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [(f"x{suffix}", "old")]
+KINDS = {".png": "16", ".jpg": "8", ".tif": "float", ".exr": "half", ".hdr": "float", ".pfm": "float"}
+
+
+@pytest.fixture(scope="module")
+def full_disk(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Where a file of each kind was overwritten on a disk that filled up, in a folder each, and what was said."""
+    folder = tmp_path_factory.mktemp("full_disk")
+    for suffix in KINDS:
+        (folder / suffix[1:]).mkdir()
+        (folder / suffix[1:] / f"x{suffix}").write_text("old")
+    call = [sys.executable, "-c", FULL_DISK, *(" ".join(kind) for kind in KINDS.items())]
+    run = subprocess.run(call, cwd=folder, capture_output=True, text=True, check=False)
+    return folder, run.stdout + run.stderr
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize("suffix", KINDS)
+def test_full_disk_is_an_error_and_leaves_the_old_file(full_disk: tuple[Path, str], suffix: str) -> None:
+    folder, said = full_disk
+    assert f"{suffix} refused:" in said, said
+    assert [(p.name, p.read_text()) for p in (folder / suffix[1:]).iterdir()] == [(f"x{suffix}", "old")]
 
 
 def test_whole_file_follows_a_link_and_keeps_it(tmp_path: Path) -> None:

@@ -1,0 +1,55 @@
+"""Modules with their exported files, written once in a run of the tests: tracing takes longer than everything else."""
+
+import dataclasses
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from filelock import FileLock
+from torch import Tensor
+
+import torchdof
+from torchdof.export import Verification, to_onnx
+from torchdof.export.verification import session
+from torchdof.render.plan import Plan
+
+CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
+MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
+    # with occlusion, by convolution at resolutions down to a sixteenth
+    "layered": lambda: torchdof.DepthOfField(CAMERA, tolerance=64 / 255, max_coc_px=32.0, check=False),
+    # with occlusion, by the literal scatter
+    "fold": lambda: torchdof.DepthOfField(CAMERA, tolerance=16 / 255, max_coc_px=2.5, method="fold", check=False),
+    # without occlusion, which is traced in a few seconds
+    "plain": lambda: torchdof.DepthOfField(CAMERA, tolerance=16 / 255, max_coc_px=2.5, occlusion=False, check=False),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """A module, its file and how they compare."""
+
+    dof: torchdof.DepthOfField
+    path: Path
+    verification: Verification
+
+    def render(self, *tensors: Tensor) -> Tensor:
+        """What onnxruntime makes of the file."""
+        runner = session(self.path)
+        feed = {v.name: t.numpy() for v, t in zip(runner.get_inputs(), tensors, strict=True)}
+        return torch.from_numpy(np.asarray(runner.run(None, feed)[0]))
+
+    def eager(self, *tensors: Tensor) -> Tensor:
+        """What PyTorch makes of the module, with the layers of the file."""
+        with torch.no_grad():
+            return self.dof(*tensors, plan=Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance))
+
+
+def export_once(name: str, folder: Path) -> Exported:
+    """The module of that name and its file in a folder; whichever process asks first writes it."""
+    dof, path, told = MODULES[name](), folder / f"{name}.onnx", folder / f"{name}.verification"
+    with FileLock(folder / f"{name}.lock"):
+        if not told.exists():
+            told.write_bytes(pickle.dumps(to_onnx(dof, path)))
+    return Exported(dof, path, pickle.loads(told.read_bytes()))
