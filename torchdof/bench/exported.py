@@ -46,7 +46,7 @@ def measure_file(path: str, size: tuple[int, int], scene: str, threads: int = 2,
 def feed(session: onnxruntime.InferenceSession, size: tuple[int, int], scene: str) -> dict[str, np.ndarray]:
     """Inputs of a scene: an image of noise, and depths that reach to the largest radius of the file."""
     facts = session.get_modelmeta().custom_metadata_map
-    camera, reach = json.loads(facts["torchdof.optics.camera"]), json.loads(facts["torchdof.options"])["max_coc_px"]
+    camera, reach = json.loads(facts["torchdof.camera"]), json.loads(facts["torchdof.options"])["max_coc_px"]
     height, width = size
     share = np.zeros((1, 1, height, width), np.float32)  # of the largest radius
     if scene == "blurred background":
@@ -113,7 +113,7 @@ def _torch_seconds(path: str, size: tuple[int, int], scene: str, threads: int, r
     runner = session(path, threads)
     facts = runner.get_modelmeta().custom_metadata_map
     dof = DepthOfField(
-        Camera(**json.loads(facts["torchdof.optics.camera"])), **json.loads(facts["torchdof.options"]), check=False
+        Camera(**json.loads(facts["torchdof.camera"])), **json.loads(facts["torchdof.options"]), check=False
     )
     tensors = [torch.from_numpy(value) for value in feed(runner, size, scene).values()]
     if len(tensors) != 4:
