@@ -106,8 +106,10 @@ class Forward:
         from scipy.fft import irfft2, rfft2
 
         size = kernels.shape[-1]
+        padded = np.zeros((*kernels.shape[:-2], *self.grid))
+        padded[..., :size, :size] = kernels
         # the kernel's centre goes to pixel (0, 0) of the cyclic grid
-        wrapped = np.roll(_padded(kernels, self.grid), (-(size // 2), -(size // 2)), (-2, -1))
+        wrapped = np.roll(padded, (-(size // 2), -(size // 2)), (-2, -1))
         blurred = irfft2(source * rfft2(wrapped), self.grid)[..., : self.data.shape[0], : self.data.shape[1]]
         flat = blurred.reshape(*blurred.shape[:-2], -1)
         return np.asarray(flat if whole else flat[..., self.flat])
@@ -325,9 +327,3 @@ def without_level(columns: Array, shaped: Array) -> Array:
     basis = np.stack([np.ones_like(shaped), shaped - shaped.mean()], axis=1)
     basis = basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
     return np.asarray(columns - basis @ (basis.T @ columns))
-
-
-def _padded(kernels: Array, grid: tuple[int, ...]) -> Array:
-    padded = np.zeros((*kernels.shape[:-2], *grid))
-    padded[..., : kernels.shape[-2], : kernels.shape[-1]] = kernels
-    return padded

@@ -118,9 +118,10 @@ def check_reach(
         text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
         warn(OutsideMeasuredWarning(text, number=factors["coc"]))
     for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
-        measured_at = _known(table.provenance.get(name))
+        measured_at: Any = table.provenance.get(name)
         asked = float(getattr(camera, name))
-        if measured_at is None or math.isinf(asked):
+        known = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
+        if not known or not 0 < measured_at < math.inf or math.isinf(asked):
             continue
         factors[name] = asked / measured_at
         if max(factors[name], 1 / factors[name]) > most:
@@ -130,8 +131,3 @@ def check_reach(
             )
             warn(OutsideMeasuredWarning(text, number=factors[name]))
     return factors
-
-
-def _known(value: Any) -> float | None:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if number and 0 < value < math.inf else None
