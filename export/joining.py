@@ -107,11 +107,11 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
         raise ValueError(
             f"depth_model uses opset {_opset(model)}, dof_model {opset}: export that with opset={_opset(model)}"
         )
-    given = [d.dim_value for d in inputs[0].type.tensor_type.shape.dim]
+    shape = [d.dim_value for d in inputs[0].type.tensor_type.shape.dim]
     rank = len(model.graph.output[0].type.tensor_type.shape.dim)
-    if len(given) != 4 or given[1] not in (0, 3) or rank not in (3, 4):
+    if len(shape) != 4 or shape[1] not in (0, 3) or rank not in (3, 4):
         raise ValueError(
-            f"depth_model must map [B, 3, h, w] to [B, h, w] or [B, 1, h, w], it takes {given} and gives rank {rank}"
+            f"depth_model must map [B, 3, h, w] to [B, h, w] or [B, 1, h, w], it takes {shape} and gives rank {rank}"
         )
     if _opset(model) < opset:
         model = onnx.version_converter.convert_version(model, opset)
@@ -119,7 +119,7 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
         model = onnx.ModelProto.FromString(model.SerializeToString())
     model.ir_version = ir
     del model.graph.value_info[:]  # its names of sizes are not ours
-    return model, (given[2], given[3]) if given[2] and given[3] else None, rank
+    return model, (shape[2], shape[3]) if shape[2] and shape[3] else None, rank
 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:

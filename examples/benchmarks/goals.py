@@ -285,11 +285,11 @@ def _lines(figures: Sequence[Figure]) -> list[list[str]]:
 
 
 def _remark(figures: Sequence[Figure], repeat: int) -> str:
-    asked = [figure for figure in figures if not math.isnan(figure.goal)]
+    with_goal = [figure for figure in figures if not math.isnan(figure.goal)]
     return (
         f"Median and spread (interquartile range) of {repeat} turns after one more, each figure from within the turns; "
         "the errors from one rendering, memory and time of the largest frame from two. Y: one depthwise 17 x 17 "
-        f"convolution of 1 x 16 x 540 x 960. Goals missed: {sum(f.missed for f in asked)} of {len(asked)}."
+        f"convolution of 1 x 16 x 540 x 960. Goals missed: {sum(f.missed for f in with_goal)} of {len(with_goal)}."
     )
 
 

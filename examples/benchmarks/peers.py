@@ -197,11 +197,11 @@ def compare(scenes: Path, folder: Path, out: Path | None, repeat: int) -> None:
     progress, others = Console(stderr=True), read_peers(folder)
     cases = list(read_scenes(scenes))
     problems = {peer.name: _wrong(peer) for peer in others}
-    mine = ours()
-    for peer in mine:
+    own_settings = ours()
+    for peer in own_settings:
         if (failed := check(peer)) is not None:
             raise ValueError(f"{peer.name}: {failed}")
-    compared = [*mine, *(peer for peer in others if problems[peer.name] is None)]
+    compared = [*own_settings, *(peer for peer in others if problems[peer.name] is None)]
     rows: list[CaseTiming] = []
     for scene in track(cases, "cases", console=progress, transient=True, disable=not progress.is_terminal):
         rows += measure_case(scene, compared, repeat)
@@ -209,9 +209,8 @@ def compare(scenes: Path, folder: Path, out: Path | None, repeat: int) -> None:
     tables = _tables(rows)
     for table in (tables[1], tables[2], tables[0]):  # the summary is what remains on the screen
         table.show()
-    remarks = [
-        f"{machine(f'threads for each renderer: {torch.get_num_threads()}')}. Timed renderings of each, in turns, after one more: {repeat}."
-    ]
+    hardware = machine(f"threads for each renderer: {torch.get_num_threads()}")
+    remarks = [f"{hardware}. Timed renderings of each, in turns, after one more: {repeat}."]
     remarks += [f"{peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared]
     remarks += [f"{name}: {reason}" for name, reason in absent.items()]
     for line in remarks:

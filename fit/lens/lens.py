@@ -114,8 +114,8 @@ class Lens:
             )
         for i in range(len(self.radius)):
             for name, value in columns.items():
-                if wrong := prescription.wrong(name, float(value[i])):
-                    raise ValueError(f"surface {i}: {wrong}")
+                if problem := prescription.fault(name, float(value[i])):
+                    raise ValueError(f"surface {i}: {problem}")
         if self.index[-1] != 1.0:
             raise ValueError(f"the index behind the last surface must be 1 (air), got {self.index[-1]:g}")
 

@@ -116,9 +116,9 @@ class Forward:
 
     def kernels(self, family: str, params: dict[str, Array]) -> Array:
         """Kernels `[n, k, k]` for parameters `[n]`, as wide as they need and at most as wide as the window."""
-        given = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
-        half = min(int(np.ceil(support(family, given))) + 1, self.half)
-        return pixel_kernels(family, given, 2 * half + 1).numpy()
+        tensors = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
+        half = min(int(np.ceil(support(family, tensors))) + 1, self.half)
+        return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 
     def solve(self, family: str, tolerance: float = 1e-7) -> Solution:
         """Fit one family from several starts (or from `start`, and from the moments beside it).
@@ -298,8 +298,8 @@ class Forward:
         return [table[n][0] for n in names], [table[n][1] for n in names]
 
     def _start(self, names: tuple[str, ...], seed: dict[str, float]) -> list[float]:
-        rest = self.moves({})
-        return [float(seed[n]) if n in seed else rest[n] for n in names]
+        unmoved = self.moves({})
+        return [float(seed[n]) if n in seed else unmoved[n] for n in names]
 
     def _seeds(self, family: str) -> list[dict[str, float]]:
         """Starts from the second moments: what the blur added to the dot's own, per axis."""

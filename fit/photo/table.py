@@ -209,9 +209,9 @@ def _keys(captures: Captures, fits: list[BlurFit]) -> tuple[list[float], str]:
 
 def rms_radius(fit: BlurFit) -> float:
     """Root of a kernel's mean squared radius, in the fit's unit; over a uniform disc it is its radius / sqrt(2)."""
-    given = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
-    r = np.linspace(0, support(fit.family, given) + 1e-9, 4001)
-    f = profile(fit.family, torch.from_numpy(r), given).numpy()
+    params = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
+    r = np.linspace(0, support(fit.family, params) + 1e-9, 4001)
+    f = profile(fit.family, torch.from_numpy(r), params).numpy()
     return float(np.sqrt((f * r**3).sum() / (f * r).sum()))
 
 

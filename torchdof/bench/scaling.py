@@ -77,10 +77,10 @@ def measure_scans(scene: BenchScene, repeat: int, unit: float, console: Console 
             medians_and_spreads.append(
                 median_and_spread(times(functools.partial(render_scene, scanned, setting), repeat))
             )
-        (median, spread), (plain, plain_spread) = medians_and_spreads
+        (median, spread), (without, without_spread) = medians_and_spreads
         radius, pixels = scanned.radius_px, width * height
         with_occlusion = (median, spread, median / unit, 1e9 * median / pixels)
-        rows.append(ScanCost(scan, width, height, radius, *with_occlusion, plain, plain_spread, plain / unit))
+        rows.append(ScanCost(scan, width, height, radius, *with_occlusion, without, without_spread, without / unit))
     return rows
 
 

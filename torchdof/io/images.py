@@ -110,7 +110,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     sample: PixelType = "half" if all(source.samples[k] == "half" for k in indices) else source.samples[indices[0]]
     transfer = transfer or default_transfer(sample)
     pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]  # [H, W, C] -> [1, C, H, W]
-    pixels = decode(pixels / source.one, transfer, names[-1] == "A", source.straight_alpha)
+    pixels = decode(pixels / source.white, transfer, names[-1] == "A", source.straight_alpha)
     depth = None
     same_size = [p for p in parts if p.values.shape[:2] == source.values.shape[:2]]
     depth_place = depth_channel([(p.label, p.names) for p in same_size])
