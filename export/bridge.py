@@ -87,15 +87,15 @@ _INVERSE = {
     most = ReduceMax(values, axes)
     range = Sub(most, least)
     tiny = Constant<value_float = 1e-12>()
-    some_range = Max(range, tiny)
+    positive_range = Max(range, tiny)
     above = Sub(values, least)
-    share = Div(above, some_range)
+    fraction = Div(above, positive_range)
     near_column = Unsqueeze(near_m, axes)
     far_column = Unsqueeze(far_m, axes)
     near_inverse = Reciprocal(near_column)
     far_inverse = Reciprocal(far_column)
     span = Sub(near_inverse, far_inverse)
-    climbed = Mul(share, span)
+    climbed = Mul(fraction, span)
     inverse = Add(climbed, far_inverse)
 """,
 }

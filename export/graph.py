@@ -73,8 +73,8 @@ class _Pinned(BlurTable):
     """A table whose kernels are those of one image width, whatever the width of the image at hand."""
 
     def __init__(self, table: BlurTable, width: int) -> None:
-        rest = {k: v for k, v in table.to_dict().items() if k not in ("schema", "version", "family", "coc", "params")}
-        super().__init__(table.family, table.coc, table.node_params, **rest)
+        fields = {k: v for k, v in table.to_dict().items() if k not in ("schema", "version", "family", "coc", "params")}
+        super().__init__(table.family, table.coc, table.node_params, **fields)
         self._scale = super()._px_per_unit(width)
         self.unit = "relative"  # to the plan: not tied to the width
 

@@ -87,7 +87,10 @@ def chain(
     facts["chain"] = {"estimate": estimate, "scale": scale, "shift": shift, "size": size}
     facts["chain"] |= {"mean": list(mean), "std": list(std)}
     write_facts(joint, facts)
-    _write(joint, parts, size or (42, 56), path)
+    with whole_file(path) as part:
+        onnx.save_model(joint, part, format="protobuf")
+        check_format(joint, str(part))
+        _compare(joint, str(part), parts, size or (42, 56))
 
 
 def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, tuple[int, int] | None, int]:
@@ -104,11 +107,11 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
         raise ValueError(
             f"depth_model uses opset {_opset(model)}, dof_model {opset}: export that with opset={_opset(model)}"
         )
-    given = [d.dim_value for d in inputs[0].type.tensor_type.shape.dim]
+    shape = [d.dim_value for d in inputs[0].type.tensor_type.shape.dim]
     rank = len(model.graph.output[0].type.tensor_type.shape.dim)
-    if len(given) != 4 or given[1] not in (0, 3) or rank not in (3, 4):
+    if len(shape) != 4 or shape[1] not in (0, 3) or rank not in (3, 4):
         raise ValueError(
-            f"depth_model must map [B, 3, h, w] to [B, h, w] or [B, 1, h, w], it takes {given} and gives rank {rank}"
+            f"depth_model must map [B, 3, h, w] to [B, h, w] or [B, 1, h, w], it takes {shape} and gives rank {rank}"
         )
     if _opset(model) < opset:
         model = onnx.version_converter.convert_version(model, opset)
@@ -116,15 +119,19 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
         model = onnx.ModelProto.FromString(model.SerializeToString())
     model.ir_version = ir
     del model.graph.value_info[:]  # its names of sizes are not ours
-    return model, (given[2], given[3]) if given[2] and given[3] else None, rank
+    return model, (shape[2], shape[3]) if shape[2] and shape[3] else None, rank
 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
     names = ("encode/", "estimator/", "decode/", "dof/")
     encode, estimator, decode, dof = (_prefixed(part, name) for part, name in zip(parts, names, strict=True))
-    taken, given = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"
-    joint = onnx.compose.merge_models(encode, estimator, [("encode/encoded", taken)], outputs=[given, "encode/light"])
-    joint = onnx.compose.merge_models(joint, decode, [(given, "decode/estimate"), ("encode/light", "decode/light")])
+    estimator_input, estimator_output = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"
+    joint = onnx.compose.merge_models(
+        encode, estimator, [("encode/encoded", estimator_input)], outputs=[estimator_output, "encode/light"]
+    )
+    joint = onnx.compose.merge_models(
+        joint, decode, [(estimator_output, "decode/estimate"), ("encode/light", "decode/light")]
+    )
     io_map = [("decode/depth", "dof/depth"), ("decode/image", "dof/image")]
     joint = onnx.compose.merge_models(joint, dof, io_map, outputs=[f"dof/{OUTPUT}", "decode/depth"])
     graph = onnx_ir.from_proto(joint)
@@ -144,13 +151,6 @@ def _prefixed(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
         for value in {id(value): value for value in values}.values():
             value.name = f"{prefix}{value.name}"
     return onnx_ir.to_proto(copy)
-
-
-def _write(joint: onnx.ModelProto, parts: Sequence[onnx.ModelProto], size: tuple[int, int], path: Path) -> None:
-    with whole_file(path) as part:
-        onnx.save_model(joint, part, format="protobuf")
-        check_format(joint, str(part))
-        _compare(joint, str(part), parts, size)
 
 
 def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto], size: tuple[int, int]) -> None:

@@ -192,9 +192,9 @@ def _check_origin(facts: dict, dof: DepthOfField) -> None:
 def _check_interface(model: onnx.ModelProto, inputs: str) -> int:
     """Names, types and free sizes; returns the channels."""
     channels = model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
-    one, many = ("B", 1, "H", "W"), ("B", channels, "H", "W")
+    single, colours = ("B", 1, "H", "W"), ("B", channels, "H", "W")
     lens = (("B",), ("B",)) if inputs == "depth" else ()
-    expected = [*zip(INPUTS[inputs], (many, one, *lens), strict=True), (OUTPUT, many)]
+    expected = [*zip(INPUTS[inputs], (colours, single, *lens), strict=True), (OUTPUT, colours)]
     got = []
     for value in (*model.graph.input, *model.graph.output):
         kind = value.type.tensor_type

@@ -49,7 +49,9 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         zorder=1,
     )
     if forward:
-        r, level = _averaged(*fit.curve)
+        bins = np.floor(fit.curve[0] * 2 + 0.5).astype(int)  # half a unit wide
+        count = np.bincount(bins)
+        r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
         axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
         line = np.linspace(0, fit.samples[0].max(), 400)
         shape = evaluate(fit.family, line, fit.kernel_params())
@@ -57,7 +59,8 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
     else:
         axes.plot(*fit.curve, color=_MODEL, label=f"fitted {fit.family}", zorder=3)
     axes.set(xlabel=f"r [{unit}]", ylabel="level above background" if forward else "blur strength", ylim=(0, None))
-    axes.set_title(title or f"{fit.family}: {_values(fit)}", fontsize=9)
+    values = ", ".join(f"{k} = {v:.4g} ± {fit.stderr[k]:.1g}" for k, v in fit.params.items() if not np.ndim(v))
+    axes.set_title(title or f"{fit.family}: {values}", fontsize=9)
     axes.legend(frameon=False, fontsize=8)
     return figure
 
@@ -150,14 +153,3 @@ def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]
     figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     return figure, figure.subplots(1, columns)
-
-
-def _averaged(r: Array, level: Array) -> tuple[Array, Array]:
-    bins = np.floor(r * 2 + 0.5).astype(int)
-    count = np.bincount(bins)
-    kept = count > 0
-    return (np.bincount(bins, r)[kept] / count[kept]), (np.bincount(bins, level)[kept] / count[kept])
-
-
-def _values(fit: BlurFit) -> str:
-    return ", ".join(f"{k} = {v:.4g} ± {fit.stderr[k]:.1g}" for k, v in fit.params.items() if not np.ndim(v))

@@ -53,7 +53,7 @@ def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = N
         file: named in errors.
 
     Raises:
-        FitError: it is not an array of real numbers, too small, or so bright or dark that squares have no room.
+        FitError: it is not an array of real numbers, too small, or so bright or dark that squares overflow.
         NonFiniteError: NaN or infinity among its pixels.
     """
     try:

@@ -101,10 +101,10 @@ class Options:
             >>> Options.of(table=None, tolerance="preview") == Options(tolerance=4 / 255)
             True
         """
-        given: dict[str, Any] = dict(arguments)
-        if "tolerance" in given:
-            given["tolerance"] = tolerance_of(given["tolerance"])
-        return cls(_DISC if table is None else table, **given)
+        values: dict[str, Any] = dict(arguments)
+        if "tolerance" in values:
+            values["tolerance"] = tolerance_of(values["tolerance"])
+        return cls(_DISC if table is None else table, **values)
 
     def arguments(self) -> dict[str, Any]:
         """These options as keyword arguments of :class:`torchdof.DepthOfField` or :func:`torchdof.blur_by_coc`."""
@@ -115,7 +115,11 @@ OPTION_NAMES = tuple(field.name for field in dataclasses.fields(Options))  # a c
 
 
 class OptionArguments(TypedDict, total=False):
-    """What a caller may write for each of :class:`Options` beside the table; a tolerance may be a name too."""
+    """The same names for type checkers: what a caller may write beside the table; a tolerance may be a name too.
+
+    They can read these off nothing but a class of this kind, so the names stand here once more, without their meaning
+    and their defaults; a test holds the two together.
+    """
 
     tolerance: Tolerance
     occlusion: bool
@@ -133,18 +137,18 @@ def spells_options(function: _Spelled) -> _Spelled:
     """
     called: Any = function.__init__ if inspect.isclass(function) else function
     signature = inspect.signature(called)
-    kept = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    own = {p.name for p in kept}
+    own_parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    own_names = {p.name for p in own_parameters}
     kinds = OptionArguments.__annotations__
     spelled = [
         inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=kinds[f.name])
         for f in dataclasses.fields(Options)
         if f.name in kinds
     ]
-    called.__signature__ = signature.replace(parameters=[*kept, *spelled])
+    called.__signature__ = signature.replace(parameters=[*own_parameters, *spelled])
     if function.__doc__ and Options.__doc__:
         meanings = inspect.cleandoc(Options.__doc__).partition("Args:\n")[2].partition("\n\n")[0]
-        lines = [line for line in textwrap.dedent(meanings).splitlines() if line.partition(":")[0] not in own]
+        lines = [line for line in textwrap.dedent(meanings).splitlines() if line.partition(":")[0] not in own_names]
         shown = []
         for line in function.__doc__.splitlines():
             if line.lstrip().startswith("**options:"):
@@ -190,7 +194,7 @@ def tolerance_of_text(text: str) -> float:
         return tolerance_of(text)
 
 
-def read_state(given: Any) -> tuple[Camera, Options]:
+def read_state(state: Any) -> tuple[Camera, Options]:
     """What a module's state describes.
 
     Returns:
@@ -200,29 +204,29 @@ def read_state(given: Any) -> tuple[Camera, Options]:
         ValueError: Naming the field that is missing, unknown or makes no sense.
     """
     names = ["camera", *(field.name for field in dataclasses.fields(Options))]
-    if not isinstance(given, Mapping):
-        raise ValueError(f"the state of a DepthOfField must be a dict, as state_dict() gives, got {show(given)}")
-    _fields("the state of a DepthOfField", given, names)
-    camera = given["camera"]
+    if not isinstance(state, Mapping):
+        raise ValueError(f"the state of a DepthOfField must be a dict, as state_dict() gives, got {show(state)}")
+    _fields("the state of a DepthOfField", state, names)
+    camera = state["camera"]
     if not isinstance(camera, Mapping):
         raise ValueError(f"camera of the state must be a dict, got {show(camera)}")
     _fields("camera of the state", camera, list(Camera.__dataclass_fields__))
     try:
-        made = Camera(**camera)
+        restored_camera = Camera(**camera)
     except ValueError as error:
         raise ValueError(f"camera of the state: {error}") from error
     try:
-        table = BlurTable.from_dict(given["table"])
+        table = BlurTable.from_dict(state["table"])
     except ValueError as error:
         raise ValueError(f"table of the state: {error}") from error
     try:
-        return made, Options(**{**{name: given[name] for name in names[1:]}, "table": table})
+        return restored_camera, Options(**{**{name: state[name] for name in names[1:]}, "table": table})
     except ValueError as error:
         raise ValueError(f"the state of a DepthOfField: {error}") from error
 
 
-def _fields(what: str, given: Mapping[str, Any], names: list[str]) -> None:
-    missing, unknown = [n for n in names if n not in given], [n for n in given if n not in names]
+def _fields(what: str, fields: Mapping[str, Any], names: list[str]) -> None:
+    missing, unknown = [n for n in names if n not in fields], [n for n in fields if n not in names]
     if missing or unknown:
-        wrong = f"{missing[0]!r} is missing" if missing else f"{show(unknown[0])} is not one of them"
-        raise ValueError(f"{what} must have the fields {', '.join(names)}; {wrong}")
+        problem = f"{missing[0]!r} is missing" if missing else f"{show(unknown[0])} is not one of them"
+        raise ValueError(f"{what} must have the fields {', '.join(names)}; {problem}")

@@ -26,9 +26,9 @@ from rich.progress import track
 from torch import Tensor
 
 from torchdof.bench import memory
-from torchdof.bench.inputs import Subject, shipped
+from torchdof.bench.inputs import BenchScene, shipped
 from torchdof.bench.report import Report, ReportTable, csv_of, existing_folder, machine
-from torchdof.bench.speed import Setting, exact, render_subject, unit_work
+from torchdof.bench.speed import Setting, exact, render_scene, unit_work
 from torchdof.bench.timer import in_turns, median_and_spread, timed, times
 from torchdof.cli.errors import told_in_one_sentence
 from torchdof.module import blur_by_coc
@@ -36,7 +36,7 @@ from torchdof.reference import metrics
 from torchdof.reference.scenes import read_scenes
 from torchdof.validation import whole
 
-__all__ = ["Figure", "compare", "measure_goals", "subjects"]
+__all__ = ["Figure", "compare", "measure_goals", "bench_scenes"]
 
 _FRAME, _HALF, _DOUBLE, _LARGEST = (1080, 1920), (540, 960), (2160, 3840), (4320, 7680)  # height, width
 _CROP_PX, _FOLD_PX = 512, 64
@@ -79,7 +79,7 @@ class Figure:
         return self.value < self.goal if self.at_least else self.value > self.goal
 
 
-def subjects(scenes: Path) -> list[Subject]:
+def bench_scenes(scenes: Path) -> list[BenchScene]:
     """What is measured: the built-in scene, and of each scene of a folder the setting in the middle.
 
     Raises:
@@ -90,10 +90,10 @@ def subjects(scenes: Path) -> list[Subject]:
     for _, settings in itertools.groupby(read_scenes(scenes), lambda scene: scene.name.rpartition("/")[0]):
         cases = list(settings)
         middle = cases[len(cases) // 2]
-        subject = Subject(middle.name, middle.image, middle.coc_px).resized(*_FRAME)
-        if not subject.radius_px > 0:
-            raise ValueError(f"{subject.name}: is all in focus; goals are for scenes with blur, leave it out")
-        measured.append(subject)
+        scene = BenchScene(middle.name, middle.image, middle.coc_px).resized(*_FRAME)
+        if not scene.radius_px > 0:
+            raise ValueError(f"{scene.name}: is all in focus; goals are for scenes with blur, leave it out")
+        measured.append(scene)
     return measured
 
 
@@ -112,7 +112,7 @@ def compare(scenes: Path, out: Path | None, repeat: int) -> None:
     whole("--repeat", repeat, 1, 10000)
     progress, figures = Console(stderr=True), []
     works = [
-        *(functools.partial(measure_goals, subject, repeat) for subject in subjects(scenes)),
+        *(functools.partial(measure_goals, scene, repeat) for scene in bench_scenes(scenes)),
         functools.partial(_quad, repeat),
     ]
     for work in track(works, "scenes", console=progress, transient=True, disable=not progress.is_terminal):
@@ -125,35 +125,37 @@ def compare(scenes: Path, out: Path | None, repeat: int) -> None:
         figures.append(dataclasses.replace(mean, value=sum(over) / len(over)))
         _show(figures[-1:])
     if out is not None:
-        _report(figures, repeat).write(out)
+        remark = f"{_remark(figures, repeat)} They are bold."
+        table = ReportTable("Figures", _lines(figures))
+        Report("goals", "Cost beside the goals", [f"{machine()}.", remark, table], csv_of(figures)).write(out)
     Console().print(f"{machine()}. {_remark(figures, repeat)}", markup=False, highlight=False)
 
 
-def measure_goals(subject: Subject, repeat: int) -> list[Figure]:
+def measure_goals(scene: BenchScene, repeat: int) -> list[Figure]:
     """Every figure of one scene.
 
     Args:
-        subject: A frame of 1920 x 1080, not all in focus.
+        scene: A frame of 1920 x 1080, not all in focus.
         repeat: How many turns, after one more.
     """
     parts = (
-        _errors(subject),
-        _frames(subject, repeat),
-        _beside_gegl(subject, repeat),
-        _busy(subject, repeat),
-        _crops(subject, repeat),
-        _sizes(subject, repeat),
+        _errors(scene),
+        _frames(scene, repeat),
+        _beside_gegl(scene, repeat),
+        _busy(scene, repeat),
+        _crops(scene, repeat),
+        _sizes(scene, repeat),
     )
-    return [dataclasses.replace(figure, scene=subject.name) for part in parts for figure in part]
+    return [dataclasses.replace(figure, scene=scene.name) for part in parts for figure in part]
 
 
-def _errors(subject: Subject) -> Iterator[Figure]:
+def _errors(scene: BenchScene) -> Iterator[Figure]:
     """Whether the renderings that are timed are right."""
-    subject, size = subject.blurred(_USUAL_PX), _size(_FRAME)
+    scene, size = scene.blurred(_USUAL_PX), _size(_FRAME)
     for occlusion in (True, False):
         shown, wanted = (
             metrics.display(image)
-            for image in (render_subject(subject, Setting("layered", occlusion, _FINE)), exact(subject, occlusion))
+            for image in (render_scene(scene, Setting("layered", occlusion, _FINE)), exact(scene, occlusion))
         )
         error = (shown.double() - wanted.double()).abs()
         rms, rare = math.sqrt(float(error.square().mean())), float(torch.quantile(error, 0.999))
@@ -162,27 +164,27 @@ def _errors(subject: Subject) -> Iterator[Figure]:
         yield _figure(f"{what}, of 99.9 % of all values", "of 255", [255 * rare], 255 * _FINE * _WITHIN)
 
 
-def _frames(subject: Subject, repeat: int) -> Iterator[Figure]:
+def _frames(scene: BenchScene, repeat: int) -> Iterator[Figure]:
     """A frame by its radius, in Y and beside other tolerances, radii and methods."""
     works: dict[Hashable, Callable[[], object]] = {"Y": unit_work()}
-    works["in focus"] = functools.partial(render_subject, subject.blurred(0.0), Setting("layered", True, _FINE))
-    usual = subject.blurred(_USUAL_PX)
+    works["in focus"] = functools.partial(render_scene, scene.blurred(0.0), Setting("layered", True, _FINE))
+    usual = scene.blurred(_USUAL_PX)
     part = usual.crop(_FOLD_PX, widest=True)  # its kernels are as large as the frame's
     for occlusion in (True, False):
         setting = Setting("layered", occlusion, _FINE)
         for radius in _RADII:
-            works[radius, occlusion] = functools.partial(render_subject, subject.blurred(radius), setting)
-        works["loose", occlusion] = functools.partial(render_subject, usual, Setting("layered", occlusion, _LOOSE))
-        works["fold", occlusion] = functools.partial(render_subject, part, Setting("fold", occlusion, _FINE))
+            works[radius, occlusion] = functools.partial(render_scene, scene.blurred(radius), setting)
+        works["loose", occlusion] = functools.partial(render_scene, usual, Setting("layered", occlusion, _LOOSE))
+        works["fold", occlusion] = functools.partial(render_scene, part, Setting("fold", occlusion, _FINE))
     for radius in _RADII[:3]:
         works[radius, "draft"] = functools.partial(
-            render_subject, subject.blurred(radius), Setting("layered", False, _DRAFT)
+            render_scene, scene.blurred(radius), Setting("layered", False, _DRAFT)
         )
     timings = in_turns(works, repeat)
     frame = _size(_FRAME)
     yield _figure("Y", "ms", [1e3 * seconds for seconds in timings["Y"]])
     yield _figure(f"{frame}, all in focus", "Y", _ratios(timings, "in focus", "Y"), 0.2)
-    usual_y = _OCCLUSION_Y.get(subject.name.partition("/")[0], _USUAL_Y)
+    usual_y = _OCCLUSION_Y.get(scene.name.partition("/")[0], _USUAL_Y)
     for occlusion, goals in ((True, usual_y), (False, (_WITHOUT_Y,) * 3)):
         for radius, goal in zip(_RADII, (*goals, math.nan), strict=True):
             what = f"{frame}, {radius:g} px{_without(occlusion)}"
@@ -200,7 +202,7 @@ def _frames(subject: Subject, repeat: int) -> Iterator[Figure]:
         yield _figure(f"layered faster than fold, by pixel{_without(occlusion)}", "times", fold, 50.0, at_least=True)
 
 
-def _beside_gegl(subject: Subject, repeat: int) -> Iterator[Figure]:
+def _beside_gegl(scene: BenchScene, repeat: int) -> Iterator[Figure]:
     """A frame with occlusion beside GEGL's lens-blur, where that is installed."""
     spec = importlib.util.spec_from_file_location("gegl", Path(__file__).parent / "peers" / "gegl.py")
     if spec is None or spec.loader is None:
@@ -210,8 +212,8 @@ def _beside_gegl(subject: Subject, repeat: int) -> Iterator[Figure]:
     if gegl.available() is not None:
         return
     for radius in _RADII[:3]:
-        blurred = subject.blurred(radius)
-        render = functools.partial(render_subject, blurred, Setting("layered", True, _FINE))
+        blurred = scene.blurred(radius)
+        render = functools.partial(render_scene, blurred, Setting("layered", True, _FINE))
         works: dict[Hashable, Callable[[], float]] = {
             "ours": functools.partial(lambda work: timed(work)[1], render),
             "GEGL": functools.partial(lambda s: gegl.blur(s.image, s.coc_px)[1], blurred),
@@ -220,9 +222,9 @@ def _beside_gegl(subject: Subject, repeat: int) -> Iterator[Figure]:
         yield _figure(f"{radius:g} px{_OVER_GEGL}", "times", _ratios(timings, "ours", "GEGL"))
 
 
-def _busy(subject: Subject, repeat: int) -> Iterator[Figure]:
+def _busy(scene: BenchScene, repeat: int) -> Iterator[Figure]:
     """A frame while two other processes each keep a core busy, over the same in quiet."""
-    work = functools.partial(render_subject, subject.blurred(_USUAL_PX), Setting("layered", True, _FINE))
+    work = functools.partial(render_scene, scene.blurred(_USUAL_PX), Setting("layered", True, _FINE))
     quiet = times(work, repeat)
     others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
     try:
@@ -235,10 +237,10 @@ def _busy(subject: Subject, repeat: int) -> Iterator[Figure]:
     yield _figure(what, "times", [a / b for a, b in zip(busy, quiet, strict=True)], _BUSY_TIMES)
 
 
-def _crops(subject: Subject, repeat: int) -> Iterator[Figure]:
+def _crops(scene: BenchScene, repeat: int) -> Iterator[Figure]:
     """A crop, and what gradients cost on it."""
-    part = subject.blurred(_CROP_RADIUS_PX).crop(_CROP_PX)
-    wide = subject.blurred(_USUAL_PX).crop(_CROP_PX)
+    part = scene.blurred(_CROP_RADIUS_PX).crop(_CROP_PX)
+    wide = scene.blurred(_USUAL_PX).crop(_CROP_PX)
     image, coc_px = (x.clone().requires_grad_() for x in (wide.image, wide.coc_px))
 
     def forward() -> Tensor:
@@ -247,7 +249,8 @@ def _crops(subject: Subject, repeat: int) -> Iterator[Figure]:
     timings = in_turns(
         {
             **{
-                seen: functools.partial(render_subject, part, Setting("layered", seen, _FINE)) for seen in (True, False)
+                occlusion: functools.partial(render_scene, part, Setting("layered", occlusion, _FINE))
+                for occlusion in (True, False)
             },
             "forward": forward,
             "both": lambda: torch.autograd.grad(forward().square().mean(), (image, coc_px)),
@@ -262,34 +265,34 @@ def _crops(subject: Subject, repeat: int) -> Iterator[Figure]:
     yield _figure(f"{crop}, {_USUAL_PX:g} px: forward and backward over forward", "times", both, 4.0)
 
 
-def _sizes(subject: Subject, repeat: int) -> Iterator[Figure]:
+def _sizes(scene: BenchScene, repeat: int) -> Iterator[Figure]:
     """Larger frames, and several of them."""
     setting = Setting("layered", True, _FINE)
-    usual = subject.blurred(_USUAL_PX)
-    one = usual.resized(*_HALF).blurred(_USUAL_PX)
+    usual = scene.blurred(_USUAL_PX)
+    smaller = usual.resized(*_HALF).blurred(_USUAL_PX)
     flips: list[list[int]] = [[], [-1], [-2], [-2, -1]]
-    items = [dataclasses.replace(one, image=one.image.flip(f), coc_px=one.coc_px.flip(f)) for f in flips]
+    items = [dataclasses.replace(smaller, image=smaller.image.flip(f), coc_px=smaller.coc_px.flip(f)) for f in flips]
 
     def batch() -> Tensor:
         with torch.inference_mode():
             return blur_by_coc(*(torch.cat([getattr(i, x) for i in items]) for x in ("image", "coc_px")))
 
     works: dict[Hashable, Callable[[], object]] = {
-        "frame": functools.partial(render_subject, usual, setting),
-        "double": functools.partial(render_subject, usual.resized(*_DOUBLE), setting),
+        "frame": functools.partial(render_scene, usual, setting),
+        "double": functools.partial(render_scene, usual.resized(*_DOUBLE), setting),
         "batch": batch,
-        "alone": lambda: [render_subject(item, setting) for item in items],
+        "alone": lambda: [render_scene(item, setting) for item in items],
     }
     timings = in_turns(works, repeat)
     yield _figure(
         f"{_size(_DOUBLE)} over {_size(_FRAME)}, twice the radius", "times", _ratios(timings, "double", "frame"), 4.2
     )
     yield _figure(f"{len(items)} x {_size(_HALF)} over one by one", "times", _ratios(timings, "batch", "alone"), 1.0)
-    largest = subject.resized(*_LARGEST).blurred(_WIDE_PX)
+    largest = scene.resized(*_LARGEST).blurred(_WIDE_PX)
     peaks, seconds = [], []
     for _ in range(2):
         held = memory.reset_peak()
-        seconds.append(timed(functools.partial(render_subject, largest, setting))[1])
+        seconds.append(timed(functools.partial(render_scene, largest, setting))[1])
         peaks.append((memory.peak_mb() - held) / 1024)
     what = f"{_size(_LARGEST)}, {_WIDE_PX:g} px"
     yield _figure(f"{what}: memory on top of the frame", "GiB", peaks, 5.0)
@@ -301,11 +304,11 @@ def _quad(repeat: int) -> list[Figure]:
     n = _CROP_PX
     image = torch.zeros(1, 3, n, n)
     image[..., 2 * n // 5 : 3 * n // 5, 2 * n // 5 : 3 * n // 5] = 1.0
-    subject = Subject("quad on black", image, torch.full((1, 1, n, n), _CROP_RADIUS_PX))
-    timings = in_turns({"": functools.partial(render_subject, subject, Setting("layered", True, _FINE))}, repeat)
+    scene = BenchScene("quad on black", image, torch.full((1, 1, n, n), _CROP_RADIUS_PX))
+    timings = in_turns({"": functools.partial(render_scene, scene, Setting("layered", True, _FINE))}, repeat)
     milliseconds = [1e3 * seconds for seconds in timings[""]]
     what = f"{_size((n, n))}, {_CROP_RADIUS_PX:g} px everywhere"
-    return [dataclasses.replace(_figure(what, "ms", milliseconds, 26.4), scene=subject.name)]
+    return [dataclasses.replace(_figure(what, "ms", milliseconds, 26.4), scene=scene.name)]
 
 
 def _ratios(timings: Mapping[Hashable, Sequence[float]], over: Hashable, under: Hashable) -> list[float]:
@@ -345,18 +348,12 @@ def _lines(figures: Sequence[Figure]) -> list[list[str]]:
 
 
 def _remark(figures: Sequence[Figure], repeat: int) -> str:
-    asked = [figure for figure in figures if not math.isnan(figure.goal)]
+    with_goal = [figure for figure in figures if not math.isnan(figure.goal)]
     return (
         f"Median and spread (interquartile range) of {repeat} turns after one more, each figure from within the turns; "
         "the errors from one rendering, memory and time of the largest frame from two. Y: one depthwise 17 x 17 "
-        f"convolution of 1 x 16 x 540 x 960. Goals missed: {sum(f.missed for f in asked)} of {len(asked)}."
+        f"convolution of 1 x 16 x 540 x 960. Goals missed: {sum(f.missed for f in with_goal)} of {len(with_goal)}."
     )
-
-
-def _report(figures: Sequence[Figure], repeat: int) -> Report:
-    remark = f"{_remark(figures, repeat)} They are bold."
-    table = ReportTable("Figures", _lines(figures))
-    return Report("goals", "Cost beside the goals", [f"{machine()}.", remark, table], csv_of(figures))
 
 
 def _show(figures: Sequence[Figure]) -> None:

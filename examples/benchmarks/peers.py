@@ -196,27 +196,28 @@ def compare(scenes: Path, folder: Path, out: Path | None, repeat: int) -> None:
     whole("--repeat", repeat, 1, 10000)
     progress, others = Console(stderr=True), read_peers(folder)
     cases = list(read_scenes(scenes))
-    wrong = {peer.name: _wrong(peer) for peer in others}
-    mine = ours()
-    for peer in mine:
+    problems = {peer.name: _wrong(peer) for peer in others}
+    own_settings = ours()
+    for peer in own_settings:
         if (failed := check(peer)) is not None:
             raise ValueError(f"{peer.name}: {failed}")
-    compared = [*mine, *(peer for peer in others if wrong[peer.name] is None)]
+    compared = [*own_settings, *(peer for peer in others if problems[peer.name] is None)]
     rows: list[CaseTiming] = []
     for scene in track(cases, "cases", console=progress, transient=True, disable=not progress.is_terminal):
         rows += measure_case(scene, compared, repeat)
-    absent = {name: reason for name, reason in wrong.items() if reason is not None}
+    absent = {name: reason for name, reason in problems.items() if reason is not None}
     tables = _tables(rows)
     for table in (tables[1], tables[2], tables[0]):  # the summary is what remains on the screen
         table.show()
-    told = [f"{_machine()}. Timed renderings of each, in turns, after one more: {repeat}."]
-    told += [f"{peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared]
-    told += [f"{name}: {reason}" for name, reason in absent.items()]
-    for line in told:
+    hardware = machine(f"threads for each renderer: {torch.get_num_threads()}")
+    remarks = [f"{hardware}. Timed renderings of each, in turns, after one more: {repeat}."]
+    remarks += [f"{peer.name}{peer.version and f' ({peer.version})'}: {peer.note}" for peer in compared]
+    remarks += [f"{name}: {reason}" for name, reason in absent.items()]
+    for line in remarks:
         Console().print(line, markup=False, highlight=False)
     if out is not None:
-        notes = "\n".join(f"- {line}" for line in told[1:])
-        Report("peers", "Beside other tools", [told[0], notes, *tables], csv_of(rows)).write(out)
+        notes = "\n".join(f"- {line}" for line in remarks[1:])
+        Report("peers", "Beside other tools", [remarks[0], notes, *tables], csv_of(rows)).write(out)
 
 
 def _wrong(peer: Peer) -> str | None:
@@ -242,13 +243,10 @@ def _times(rows: Sequence[CaseTiming]) -> list[list[str]]:
     """Lines of the table of times: a case each."""
     lines: dict[str, list[str]] = {}
     for row in rows:
-        lines.setdefault(row.case, [row.case]).append(_milliseconds(row))
+        digits = 0 if row.median_s >= 0.1 else 1
+        cell = f"{1e3 * row.median_s:.{digits}f} ± {1e3 * row.spread_s:.{digits}f}"
+        lines.setdefault(row.case, [row.case]).append(cell)
     return list(lines.values())
-
-
-def _milliseconds(row: CaseTiming) -> str:
-    digits = 0 if row.median_s >= 0.1 else 1
-    return f"{1e3 * row.median_s:.{digits}f} ± {1e3 * row.spread_s:.{digits}f}"
 
 
 def _errors(rows: Sequence[CaseTiming]) -> list[list[str]]:
@@ -279,10 +277,6 @@ _SUMMARY = ("", "time over ours", "ours nearer by dB", "ours faster", "ours near
 _TIMES = "Milliseconds: median and spread (interquartile range)"
 _ERRORS = "PSNR in dB against the truth: display-encoded (clipped to [0, 1], sRGB curve), peak 1, whole frame"
 _RATIOS = f"Against ours at {_LEVELS[-1]:g}/255: median over the cases (least to greatest)"
-
-
-def _machine() -> str:
-    return machine(f"threads for each renderer: {torch.get_num_threads()}")
 
 
 def _tables(rows: Sequence[CaseTiming]) -> list[ReportTable]:

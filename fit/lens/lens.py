@@ -114,8 +114,8 @@ class Lens:
             )
         for i in range(len(self.radius)):
             for name, value in columns.items():
-                if wrong := prescription.wrong(name, float(value[i])):
-                    raise ValueError(f"surface {i}: {wrong}")
+                if problem := prescription.fault(name, float(value[i])):
+                    raise ValueError(f"surface {i}: {problem}")
         if self.index[-1] != 1.0:
             raise ValueError(f"the index behind the last surface must be 1 (air), got {self.index[-1]:g}")
 
@@ -164,8 +164,8 @@ class Lens:
         if wavelength_um is not None:
             if not 0.3 <= wavelength_um <= 1.2:
                 raise ValueError(f"wavelength_um must be in micrometres, 0.3 to 1.2, got {wavelength_um}")
-            share = (wavelength_um**-2 - D_UM**-2) / (F_UM**-2 - C_UM**-2)
-            index = index + (index - 1.0) / self.abbe * share
+            dispersion = (wavelength_um**-2 - D_UM**-2) / (F_UM**-2 - C_UM**-2)
+            index = index + (index - 1.0) / self.abbe * dispersion
         return np.concatenate([[1.0], index])
 
     def matrix(self, first: int, last: int, wavelength_um: float | None = None) -> Array:
@@ -190,7 +190,9 @@ class Lens:
         if c >= 0:
             raise ValueError(f"lens {self.name!r} must have a positive focal length: it does not converge light")
         focal = -1.0 / c
-        front = self._to_stop(wavelength_um)
+        front = self.matrix(0, self.stop, wavelength_um)  # to the stop
+        if self.stop > 0:
+            front = np.array([[1.0, self.thickness[self.stop - 1]], [0.0, 1.0]]) @ front
         rear = self.matrix(self.stop, last, wavelength_um)
         aperture = self.diameter[self.stop]
         entrance = aperture / abs(front[0, 0])
@@ -241,12 +243,6 @@ class Lens:
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
         return prescription.lines(self.radius, self.thickness, self.index, self.abbe, self.diameter, self.stop)
-
-    def _to_stop(self, wavelength_um: float | None) -> Array:
-        if self.stop == 0:
-            return np.eye(2)
-        front = self.matrix(0, self.stop, wavelength_um)
-        return np.array([[1.0, self.thickness[self.stop - 1]], [0.0, 1.0]]) @ front
 
 
 def _check_positive(name: str, value: float) -> None:

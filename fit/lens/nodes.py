@@ -37,18 +37,18 @@ _NARROW = 0.01  # pixels of coc; an interval that narrow is not divided
 
 @dataclass(frozen=True, eq=False)
 class NodeEquations:
-    """A traced spot as a quadratic form: profile values v miss it by ``v @ gram @ v - 2 pull @ v + own`` (squared)."""
+    """A traced spot as a quadratic form: values v miss it, squared, by ``v @ gram @ v - 2 pull @ v + constant``."""
 
     radius: float
     gram: Array
     pull: Array
-    own: float
+    constant: float
     histogram: Array
     area: Array
 
     def error(self, values: Array) -> float:
         """Weighted squared error of profile values."""
-        return max(float(values @ self.gram @ values - 2.0 * self.pull @ values + self.own), 0.0)
+        return max(float(values @ self.gram @ values - 2.0 * self.pull @ values + self.constant), 0.0)
 
 
 class Tracer:
@@ -79,19 +79,19 @@ class Tracer:
 
     def equations(self, coc: float, radius: float) -> NodeEquations:
         """The equations of the spot at a coc, for profiles that end at ``radius`` pixels."""
-        r, light, seen = self.traced(coc)
+        r, light, spot_transfer = self.traced(coc)
         basis, area = _hats(self.frequency, radius, self.points)
         basis = basis * self.weight[:, None]
         # all light, whatever the frequencies say
         heavy = 1e4 * self.weight.max() ** 2
         gram = basis.T @ basis + heavy * np.outer(area, area)
-        pull = basis.T @ (seen * self.weight) + heavy * area
+        pull = basis.T @ (spot_transfer * self.weight) + heavy * area
         place = np.minimum(r / radius, 1.0) * (self.points - 1)
         low = np.minimum(place.astype(int), self.points - 2)
-        part = place - low
-        ring = np.bincount(low, light * (1 - part), self.points) + np.bincount(low + 1, light * part, self.points)
-        own = float(((seen * self.weight) ** 2).sum() + heavy)
-        return NodeEquations(radius, gram, pull, own, ring / area, area)
+        upper = place - low
+        ring = np.bincount(low, light * (1 - upper), self.points) + np.bincount(low + 1, light * upper, self.points)
+        constant = float(((spot_transfer * self.weight) ** 2).sum() + heavy)
+        return NodeEquations(radius, gram, pull, constant, ring / area, area)
 
     def relative(self, error: float) -> float:
         """Root of a squared error over that of a kernel that passes no light."""
@@ -165,22 +165,22 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
     # every spot: the node to its left, its share of the way to the next one, its equations
     spots = [(i, 0.0, node) for i, node in enumerate(nodes)]
     for i in range(len(places) - 1):
-        for share in _BETWEEN:
-            radius = (1 - share) * nodes[i].radius + share * nodes[i + 1].radius
-            spots.append((i, share, tracer.equations((1 - share) * places[i] + share * places[i + 1], radius)))
+        for fraction in _BETWEEN:
+            radius = (1 - fraction) * nodes[i].radius + fraction * nodes[i + 1].radius
+            spots.append((i, fraction, tracer.equations((1 - fraction) * places[i] + fraction * places[i + 1], radius)))
     focus = int(np.argmin(np.abs(places)))
     order = [*range(focus), *range(len(places) - 1, focus - 1, -1)]
     for sweep in range(_SWEEPS):
         for i in order if sweep % 2 == 0 else order[::-1]:
             gram, pull = np.zeros_like(nodes[i].gram), np.zeros_like(nodes[i].pull)
-            for left, share, spot in spots:
-                mine = 1 - share if left == i else share if left + 1 == i else 0.0
-                if mine > 0.0:
-                    gram += mine * mine * spot.gram
-                    pull += mine * spot.pull
-                    if mine < 1.0:
+            for left, fraction, spot in spots:
+                weight = 1 - fraction if left == i else fraction if left + 1 == i else 0.0
+                if weight > 0.0:
+                    gram += weight * weight * spot.gram
+                    pull += weight * spot.pull
+                    if weight < 1.0:
                         neighbour = values[left + 1 if left == i else left]
-                        pull -= mine * (1 - mine) * (spot.gram @ neighbour)
+                        pull -= weight * (1 - weight) * (spot.gram @ neighbour)
             values[i] = _non_negative(nodes[i], gram, pull, nodes[i].histogram)
     radii = np.array([node.radius for node in nodes]) * tracer.pixel
     residual = np.array([tracer.relative(n.error(v)) for n, v in zip(nodes, values, strict=True)])
@@ -194,8 +194,8 @@ def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[di
     for side in (range(focus), range(len(places) - 1, focus - 1, -1)):
         before: tuple[dict[str, float], float] | None = None
         for i in side:
-            r, light, seen = tracer.traced(places[i])
-            params, error = fit_shape(family, tracer.frequency, tracer.weight, seen, r, light, before)
+            r, light, spot_transfer = tracer.traced(places[i])
+            params, error = fit_shape(family, tracer.frequency, tracer.weight, spot_transfer, r, light, before)
             before, fitted[i] = (params, float(r.max())), (params, tracer.relative(error))
     columns = {
         key: np.array([fitted[i][0][key] for i in range(len(places))]) * (tracer.pixel if key in LENGTHS else 1.0)

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..result import Array
 
-__all__ = ["COLUMNS", "lines", "parse", "wrong"]
+__all__ = ["COLUMNS", "fault", "lines", "parse"]
 
 COLUMNS = ("radius", "thickness", "index", "diameter")
 """The columns of a line."""
@@ -63,7 +63,7 @@ def parse(text: str) -> tuple[dict[str, Array], int, str]:
                 raise ValueError(f"line {number}, column index: the stop does not change the index, write 0")
             stop, radius, (index, abbe) = len(rows), math.inf, before
         for column, value in zip(COLUMNS, (radius, thickness, index, diameter), strict=True):
-            if problem := wrong(column, value):
+            if problem := fault(column, value):
                 raise ValueError(f"line {number}, column {column}: {problem}")
         rows.append([radius, thickness, index, abbe, diameter])
     if stop is None:
@@ -97,7 +97,7 @@ def _number(text: str, column: str, line: int) -> tuple[float, float]:
     return pair
 
 
-def wrong(column: str, value: float) -> str:
+def fault(column: str, value: float) -> str:
     """What is wrong with a number of a column, or nothing."""
     if column == "radius" and (math.isnan(value) or value == 0.0):
         return f"radius must be a number other than 0, got {value:g}"

@@ -91,9 +91,9 @@ def _trace_chunk(lens: Lens, index: Array, vertices: Array, position: Array, dir
         if math.isfinite(radius):
             # sphere through the vertex: the crossing nearest to it
             half = w - (x * u + y * v) / radius
-            room = half * half - (x * x + y * y) / (radius * radius)
-            alive &= (room >= 0) & (half > 0)
-            run = (x * x + y * y) / radius / np.where(alive, half + np.sqrt(np.maximum(room, 0.0)), 1.0)
+            discriminant = half * half - (x * x + y * y) / (radius * radius)
+            alive &= (discriminant >= 0) & (half > 0)
+            run = (x * x + y * y) / radius / np.where(alive, half + np.sqrt(np.maximum(discriminant, 0.0)), 1.0)
             x, y, z = x + run * u, y + run * v, run * w
         if clip:
             alive &= x * x + y * y <= (lens.diameter[i] / 2) ** 2

@@ -27,7 +27,7 @@ def fit_shape(
     family: str,
     frequency: Array,
     weight: Array,
-    seen: Array,
+    spot_transfer: Array,
     r: Array,
     light: Array,
     before: tuple[dict[str, float], float] | None = None,
@@ -38,7 +38,7 @@ def fit_shape(
         family: A key of :data:`torchdof.optics.psf.FAMILIES` other than ``"radial"``.
         frequency: Frequencies ``[F]`` in cycles a pixel, > 0.
         weight: Weight of each.
-        seen: The spot's transfer function there.
+        spot_transfer: The spot's transfer function there.
         r: Distances of its hits from the centre ``[R]``, in pixels.
         light: Share of the light of each hit.
         before: A neighbour's parameters and outermost radius: the start, scaled to this spot's radius, and a weak pull.
@@ -52,8 +52,8 @@ def fit_shape(
     Example:
         >>> r = 5.0 * np.sqrt((np.arange(2000) + 0.5) / 2000)  # a disc of radius 5
         >>> frequency, light = np.linspace(0.01, 0.5, 50), np.full(2000, 1 / 2000)
-        >>> seen = j0(2 * np.pi * np.outer(frequency, r)) @ light
-        >>> params, _ = fit_shape("disc", frequency, np.ones(50), seen, r, light)
+        >>> spot_transfer = j0(2 * np.pi * np.outer(frequency, r)) @ light
+        >>> params, _ = fit_shape("disc", frequency, np.ones(50), spot_transfer, r, light)
         >>> round(params["radius"], 2)
         5.0
     """
@@ -82,18 +82,18 @@ def fit_shape(
         if family == "disc":
             phase = 2.0 * np.pi * params["radius"] * frequency
             return np.asarray(2.0 * j1(phase) / phase)
-        share = profile(family, torch.from_numpy(fine), params).numpy() * fine
-        return np.asarray(waves @ (share / share.sum()))
+        ring_light = profile(family, torch.from_numpy(fine), params).numpy() * fine
+        return np.asarray(waves @ (ring_light / ring_light.sum()))
 
     def difference(scaled: Array) -> Array:
-        wrong = weight * (transfer(scaled) - seen)
-        return wrong if before is None else np.concatenate([wrong, _KEEP * (scaled - starts[0])])
+        misfit = weight * (transfer(scaled) - spot_transfer)
+        return misfit if before is None else np.concatenate([misfit, _KEEP * (scaled - starts[0])])
 
-    room = 1e-6 * (high - low)
+    margin = 1e-6 * (high - low)
     fits = [
-        least_squares(difference, np.clip(start, low + room, high - room), bounds=(low, high), max_nfev=_TRIES)
+        least_squares(difference, np.clip(start, low + margin, high - margin), bounds=(low, high), max_nfev=_TRIES)
         for start in starts
     ]
     best = min(fits, key=lambda fit: fit.cost).x
-    error = float(((weight * (transfer(best) - seen)) ** 2).sum())
+    error = float(((weight * (transfer(best) - spot_transfer)) ** 2).sum())
     return {name: float(value) for name, value in zip(names, best * spans, strict=True)}, error

@@ -110,10 +110,10 @@ def trace_table(
     )
 
     def spot(wavelength_um: float | None, coc: float) -> Spot:
-        z_m = _distance_m(coc, focal, f_number, focus_m)
+        dioptres = 1.0 / focus_m - coc / _coc_per_dioptre(focal, f_number, focus_m)
         return point_spread(
             stopped,
-            z_m,
+            1.0 / dioptres if dioptres > 1e-9 else math.inf,
             sensor,
             field_mm=field_mm,
             rays=count,
@@ -131,8 +131,8 @@ def trace_table(
         if wavelength is not None:
             tracer = Tracer(partial(spot, wavelength), points, pixel)
         fitted.append(fit_radial(tracer, places) if family == "radial" else fit_shapes(tracer, places, family))
-    params = {key: [_rounded(one[0][key]) for one in fitted] for key in FAMILIES[family]}
-    residual = np.sqrt(np.mean([one[1] ** 2 for one in fitted], axis=0))
+    params = {key: [_rounded(channel[0][key]) for channel in fitted] for key in FAMILIES[family]}
+    residual = np.sqrt(np.mean([channel[1] ** 2 for channel in fitted], axis=0))
     provenance = {
         "lens": lens.name,
         "source": lens.source,
@@ -205,11 +205,6 @@ def _coc_per_dioptre(focal: float, f_number: float, focus_m: float) -> float:
     if not focus_m > focal / 1000.0:
         raise ValueError(f"focus_m must be longer than the focal length ({focal / 1000:.4g} m), got {focus_m}")
     return focal / (2.0 * f_number) * focal / 1000.0 / (1.0 - focal / 1000.0 / focus_m)
-
-
-def _distance_m(coc: float, focal: float, f_number: float, focus_m: float) -> float:
-    dioptres = 1.0 / focus_m - coc / _coc_per_dioptre(focal, f_number, focus_m)
-    return 1.0 / dioptres if dioptres > 1e-9 else math.inf
 
 
 def _rounded(values: Array, digits: int = 6) -> Any:

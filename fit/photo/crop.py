@@ -96,22 +96,22 @@ def _windows(still: Array, moved: Array, first: Dot, second: Dot, files: tuple[s
     """The same odd square around either dot, wide enough for the blur."""
     needed = max(first.reach, second.reach) + 2
     half = int(math.ceil(_MARGIN * needed)) + 8
-    room = min(min(_room(still, first), _room(moved, second)), half)
-    if room < needed:
-        worse = 0 if _room(still, first) < first.reach + 2 else 1
+    half_width = min(min(_pixels_to_edge(still, first), _pixels_to_edge(moved, second)), half)
+    if half_width < needed:
+        worse = 0 if _pixels_to_edge(still, first) < first.reach + 2 else 1
         raise WindowError(
-            f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame's edge is {room} px away",
+            f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half_width} px",
             file=files[worse],
             number=needed,
         )
     cut = []
     for picture, dot, file in ((still, first, files[0]), (moved, second, files[1])):
         x, y = int(round(dot.x)), int(round(dot.y))
-        window = picture[y - room : y + room + 1, x - room : x + room + 1].copy()
+        window = picture[y - half_width : y + half_width + 1, x - half_width : x + half_width + 1].copy()
         inside = find_dots(window, file=file)
         if len(inside) > 1:
             raise SeveralDotsError(
-                f"{len(inside)} dots in a window of {2 * room + 1} px: print the dots farther apart than their blur",
+                f"{len(inside)} dots in a window of {window.shape[0]} px: print the dots farther apart than their blur",
                 file=file,
                 number=float(len(inside)),
             )
@@ -119,7 +119,7 @@ def _windows(still: Array, moved: Array, first: Dot, second: Dot, files: tuple[s
     return cut[0], cut[1]
 
 
-def _room(picture: Array, dot: Dot) -> int:
+def _pixels_to_edge(picture: Array, dot: Dot) -> int:
     """Whole pixels between a dot's pixel and the nearest edge of the picture."""
     x, y = int(round(dot.x)), int(round(dot.y))
     return min(x, y, picture.shape[1] - 1 - x, picture.shape[0] - 1 - y)

@@ -23,15 +23,10 @@ def kernel_lists(solution: Solution) -> dict[str, Array]:
 def bic_of(pair: Forward, solution: Solution) -> float:
     """Bayesian information criterion of a solution."""
     floor = pair.values.size * (1e-6 * pair.unit) ** 2
-    return information_criterion(
-        solution.squares + floor, pair.values.size, _free_parameters(solution) + len(pair.fit_moves) + 2
-    )
-
-
-def _free_parameters(solution: Solution) -> int:
+    free = len(FAMILIES[solution.family])
     if solution.family == "radial":
-        return int(np.sum(np.asarray(solution.params["values"]) > 0))
-    return len(FAMILIES[solution.family])
+        free = int(np.sum(np.asarray(solution.params["values"]) > 0))
+    return information_criterion(solution.squares + floor, pair.values.size, free + len(pair.fit_moves) + 2)
 
 
 def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
@@ -76,9 +71,9 @@ def _own_noise(pair: Forward, solution: Solution, near: Mask) -> float:
     """Noise of the blurred picture's pixels where the light is: what varies from pixel to pixel in the residual."""
     residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
     rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
-    both = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
+    mixed_differences = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
     inside = near[1:-1, 1:-1]
-    noise = float(np.sqrt(np.mean(both[inside] ** 2))) if inside.any() else 0.0
+    noise = float(np.sqrt(np.mean(mixed_differences[inside] ** 2))) if inside.any() else 0.0
     return max(noise, noise_of(pair.data))
 
 

@@ -1,4 +1,4 @@
-"""What to doubt about a forward fit: its residual, its roundness, its window, its bounds."""
+"""What may be wrong with a forward fit: its residual, its roundness, its window, its bounds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .dot_model import Edge, soft_edge
 from .forward import Forward, Solution
 from .ratio import polar_samples
 
-__all__ = ["EXPLAINED", "asymmetry_of", "doubt_forward", "doubt_linearity", "signal_pixels"]
+__all__ = ["EXPLAINED", "asymmetry_of", "check_fit", "check_linearity", "signal_pixels"]
 
 EXPLAINED = 1.15
 """Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
@@ -34,7 +34,7 @@ _MATTERS = 0.005
 _UNEVEN = 0.3
 _SPOT, _SPOT_MATTERS = 8.0, 0.003
 _MAGNIFIED = 0.08
-_OUTSIDE_REFUSED, _OUTSIDE_DOUBTED = 0.05, 0.005
+_OUTSIDE_REFUSED, _OUTSIDE_WARNED = 0.05, 0.005
 
 
 def signal_pixels(pair: Forward) -> Mask:
@@ -57,7 +57,7 @@ def asymmetry_of(pair: Forward, solution: Solution) -> float:
     return float(np.sqrt(varying / whole)) if whole > 0 else np.inf
 
 
-def doubt_forward(
+def check_fit(
     pair: Forward,
     solution: Solution,
     fit: BlurFit,
@@ -91,7 +91,7 @@ def doubt_forward(
             file=file,
             number=outside,
         )
-    if outside > _OUTSIDE_DOUBTED:
+    if outside > _OUTSIDE_WARNED:
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {_size(pair)}; cut a larger one"
         warn(WindowWarning(text, file=file, number=outside), stacklevel)
     ratio = freest.residual_over_noise
@@ -109,7 +109,7 @@ def doubt_forward(
             "linear, not sRGB encoded?"
         )
         warn(MagnificationWarning(text, file=file, number=change), stacklevel)
-    _doubt_spots(pair, solution, file, stacklevel + 1)
+    _check_spots(pair, solution, file, stacklevel + 1)
     if fit.asymmetry > _UNEVEN:
         text = (
             f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle, which no family here "
@@ -117,10 +117,10 @@ def doubt_forward(
         )
         warn(AsymmetryWarning(text, file=file, number=fit.asymmetry), stacklevel)
     if solution.family != "radial":
-        _doubt_parameters(pair, solution, file, stacklevel + 1)
+        _check_parameters(pair, solution, file, stacklevel + 1)
 
 
-def doubt_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
+def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
     """Warn where a sharp picture shows that it is not in linear light: by its noise, or by its dot's edge."""
     inside = noise_inside(still, dot)
     # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
@@ -152,7 +152,7 @@ def _outside(pair: Forward, solution: Solution) -> float:
     return 1 - inside / total if total > 0 else 1.0
 
 
-def _doubt_spots(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:
+def _check_spots(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:
     """Warn about light beyond the dot's blur, which no family has: too little of it shows in the residual."""
     from scipy.ndimage import gaussian_filter
 
@@ -161,10 +161,10 @@ def _doubt_spots(pair: Forward, solution: Solution, file: str | None, stacklevel
     beyond = (distance > pair.data_dot.reach + 4) & pair.used
     if not beyond.any():
         return
-    left = gaussian_filter(np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0), 2.0)
-    left = np.where(beyond, left, -np.inf)
-    y, x = np.unravel_index(int(np.argmax(left)), left.shape)
-    height, peak = float(left[y, x]), pair.data_dot.peak
+    remaining = gaussian_filter(np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0), 2.0)
+    remaining = np.where(beyond, remaining, -np.inf)
+    y, x = np.unravel_index(int(np.argmax(remaining)), remaining.shape)
+    height, peak = float(remaining[y, x]), pair.data_dot.peak
     # smoothing by sigma = 2 px leaves 0.14 of white noise
     if height > max(_SPOT * 0.14 * noise_of(pair.data), _SPOT_MATTERS * peak):
         text = (
@@ -175,7 +175,7 @@ def _doubt_spots(pair: Forward, solution: Solution, file: str | None, stacklevel
         warn(ResidualWarning(text, file=file, number=height / peak), stacklevel)
 
 
-def _doubt_parameters(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:
+def _check_parameters(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:
     low, high = pair.bounds(solution.names)
     for name, least, most in zip(solution.names, low, high, strict=True):
         value = solution.params.get(name, solution.moves.get(name, 0.0))
@@ -202,10 +202,10 @@ def _size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     """The kernel's rms radius and its standard error, px; single parameters may trade with each other."""
     shape = list(solution.params)
     steps = {n: 1e-3 * max(abs(float(solution.params[n])), 0.1) for n in shape}
-    given = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
+    varied = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
     for i, n in enumerate(shape):
-        given[n][i + 1] += steps[n]
-    kernels = pair.kernels(solution.family, given)
+        varied[n][i + 1] += steps[n]
+    kernels = pair.kernels(solution.family, varied)
     away = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
     rms = np.sqrt((kernels * (away[:, None] ** 2 + away[None, :] ** 2)).sum((1, 2)))
     slope = np.array([(rms[i + 1] - rms[0]) / steps[n] for i, n in enumerate(shape)])

@@ -41,13 +41,20 @@ def fit_distances(
         One fit a pair.
     """
     fits: dict[int, BlurFit] = {}
-    for i, before in _towards_focus([p.distance_m for p in pairs], focus_m):
-        start = _scaled(fits[before], pairs[before], pairs[i], focus_m) if before is not None else None
-        fits[i] = fit_one(pairs[i], focus_m, family, start)
-        done(pairs[i], fits[i])
+    near = [i for i, pair in enumerate(pairs) if pair.distance_m < focus_m]
+    far = [i for i, pair in enumerate(pairs) if pair.distance_m > focus_m][::-1]
+    for side in (near, far):  # from both ends towards focus, each from its neighbour's fit
+        start = None
+        for k, i in enumerate(side):
+            if start is not None:
+                before, after = (abs(1 / focus_m - 1 / pairs[j].distance_m) for j in (side[k - 1], i))
+                params = {n: v * after / before if n in LENGTHS else v for n, v in start.params.items()}
+                start = replace(start, params=params)
+            start = fits[i] = fit_one(pairs[i], focus_m, family, start)
+            done(pairs[i], fits[i])
     if smooth:
-        join = _aligned if family == "radial" else _together
-        fits = join(pairs, focus_m, family, fits)
+        refine = _refine_aligned if family == "radial" else _refine_together
+        fits = refine(pairs, focus_m, family, fits)
     return [fits[i] for i in range(len(pairs))]
 
 
@@ -76,20 +83,7 @@ def fit_one(
     )
 
 
-def _towards_focus(distances: list[float], focus_m: float) -> list[tuple[int, int | None]]:
-    """Indices from both ends towards focus, each with the neighbour it starts from."""
-    near = [i for i, d in enumerate(distances) if d < focus_m]
-    far = [i for i, d in enumerate(distances) if d > focus_m][::-1]
-    return [(i, side[k - 1] if k else None) for side in (near, far) for k, i in enumerate(side)]
-
-
-def _scaled(fit: BlurFit, before: Capture, after: Capture, focus_m: float) -> BlurFit:
-    ratio = abs(1 / focus_m - 1 / after.distance_m) / abs(1 / focus_m - 1 / before.distance_m)
-    params = {k: v * ratio if k in LENGTHS else v for k, v in fit.params.items()}
-    return replace(fit, params=params)
-
-
-def _together(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
+def _refine_together(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
     """Fit every pair once more, expecting what its neighbours on the same side of focus say.
 
     Parameters that trade with each other (a rim's height and its steepness) are thus told alike at all distances,
@@ -114,7 +108,7 @@ def _together(pairs: list[Capture], focus_m: float, family: str, fits: dict[int,
     return fits
 
 
-def _aligned(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
+def _refine_aligned(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:
     """Fit free profiles once more, each up to a radius on one line over the circle of confusion.
 
     Between nodes a table mixes values at equal shares of the radius: shapes are alike there only if the radii follow
@@ -153,12 +147,12 @@ def _expected(
     """Value and standard deviation expected of a parameter: on the line between the neighbours, as the table has it."""
     length = name in LENGTHS
     if inner is None or outer is None:
-        only = outer if inner is None else inner
-        value = float(fits[only].params[name]) * (abs(place[i] / place[only]) if length else 1.0)  # type: ignore[index]
+        neighbour = outer if inner is None else inner
+        value = float(fits[neighbour].params[name]) * (abs(place[i] / place[neighbour]) if length else 1.0)  # type: ignore[index]
         loose = 3.0
     else:
-        share = (place[i] - place[inner]) / (place[outer] - place[inner])
-        value = float((1 - share) * fits[inner].params[name] + share * fits[outer].params[name])
+        fraction = (place[i] - place[inner]) / (place[outer] - place[inner])
+        value = float((1 - fraction) * fits[inner].params[name] + fraction * fits[outer].params[name])
         loose = 1.0
     size = max(float(fits[i].params[n]) for n in fits[i].params if n in LENGTHS)
     deviation = {"b": 0.1, "m": 0.3}.get(name, 0.05 * size + 0.05)

@@ -174,9 +174,9 @@ def noise_inside(picture: Array, dot: Dot) -> tuple[float, int] | None:
 def noise_of(picture: Array) -> float:
     """Standard deviation of a pixel's noise, from second differences that a smooth picture does not have."""
     rows = picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]
-    both = rows[2:] - 2 * rows[1:-1] + rows[:-2]
+    mixed_differences = rows[2:] - 2 * rows[1:-1] + rows[:-2]
     # the border is where a dot's own edges are not
     frame = max(3, min(picture.shape) // 5)
-    edge = np.ones(both.shape, dtype=bool)
+    edge = np.ones(mixed_differences.shape, dtype=bool)
     edge[frame:-frame, frame:-frame] = False
-    return float(1.4826 * np.median(np.abs(both[edge])) / 6.0)
+    return float(1.4826 * np.median(np.abs(mixed_differences[edge])) / 6.0)

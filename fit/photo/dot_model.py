@@ -89,8 +89,8 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
 
     def model(_: Array, *p: float) -> Array:
         dx, dy, radius, softness, level = p[:5]
-        share = draw_edge(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
-        return np.minimum(level * (share ** p[5] if fit_exponent else share), top)
+        coverage = draw_edge(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
+        return np.minimum(level * (coverage ** p[5] if fit_exponent else coverage), top)
 
     def jacobian(_: Array, *p: float) -> Array:
         params: Array = np.array(p, dtype=np.float64)

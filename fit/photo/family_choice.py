@@ -79,20 +79,16 @@ def choose(
         The family, one sentence saying why, and the PSNR of each family.
     """
     reach = {f: natural_psnr(kernels[f], kernels["radial"]) for f in COST if f in kernels}
-    listed = ", ".join(f"{f} {_db(reach[f])}" for f in reach if f != "radial")
+    reached = ", ".join(f"{f} {reach[f]:.1f} dB" for f in reach if f != "radial")
     for family in COST[:-1]:
         if family in reach and reach[family] >= accuracy_db:
-            return family, f"the cheapest with {accuracy_db:g} dB on a natural image ({listed})", reach
+            return family, f"the cheapest with {accuracy_db:g} dB on a natural image ({reached})", reach
     smooth: Sequence[str] = [f for f in COST[:-1] if f in reach]
     if smooth:
         likeliest = min(smooth, key=lambda f: bic[f])
         if bic[likeliest] <= bic["radial"]:
-            return likeliest, f"the noise hides what is missing to {accuracy_db:g} dB, lowest BIC ({listed})", reach
-    return "radial", f"no cheaper family reaches {accuracy_db:g} dB on a natural image ({listed})", reach
-
-
-def _db(value: float) -> str:
-    return f"{value:.1f} dB"
+            return likeliest, f"the noise hides what is missing to {accuracy_db:g} dB, lowest BIC ({reached})", reach
+    return "radial", f"no cheaper family reaches {accuracy_db:g} dB on a natural image ({reached})", reach
 
 
 def _spectrum(kernel: Array, width: int) -> Array:

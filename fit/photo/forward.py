@@ -106,17 +106,19 @@ class Forward:
         from scipy.fft import irfft2, rfft2
 
         size = kernels.shape[-1]
+        padded = np.zeros((*kernels.shape[:-2], *self.grid))
+        padded[..., :size, :size] = kernels
         # the kernel's centre goes to pixel (0, 0) of the cyclic grid
-        wrapped = np.roll(_padded(kernels, self.grid), (-(size // 2), -(size // 2)), (-2, -1))
+        wrapped = np.roll(padded, (-(size // 2), -(size // 2)), (-2, -1))
         blurred = irfft2(source * rfft2(wrapped), self.grid)[..., : self.data.shape[0], : self.data.shape[1]]
         flat = blurred.reshape(*blurred.shape[:-2], -1)
         return np.asarray(flat if whole else flat[..., self.flat])
 
     def kernels(self, family: str, params: dict[str, Array]) -> Array:
         """Kernels `[n, k, k]` for parameters `[n]`, as wide as they need and at most as wide as the window."""
-        given = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
-        half = min(int(np.ceil(support(family, given))) + 1, self.half)
-        return pixel_kernels(family, given, 2 * half + 1).numpy()
+        tensors = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
+        half = min(int(np.ceil(support(family, tensors))) + 1, self.half)
+        return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 
     def solve(self, family: str, tolerance: float = 1e-7) -> Solution:
         """Fit one family from several starts (or from `start`, and from the moments beside it).
@@ -296,8 +298,8 @@ class Forward:
         return [table[n][0] for n in names], [table[n][1] for n in names]
 
     def _start(self, names: tuple[str, ...], seed: dict[str, float]) -> list[float]:
-        rest = self.moves({})
-        return [float(seed[n]) if n in seed else rest[n] for n in names]
+        unmoved = self.moves({})
+        return [float(seed[n]) if n in seed else unmoved[n] for n in names]
 
     def _seeds(self, family: str) -> list[dict[str, float]]:
         """Starts from the second moments: what the blur added to the dot's own, per axis."""
@@ -325,9 +327,3 @@ def without_level(columns: Array, shaped: Array) -> Array:
     basis = np.stack([np.ones_like(shaped), shaped - shaped.mean()], axis=1)
     basis = basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
     return np.asarray(columns - basis @ (basis.T @ columns))
-
-
-def _padded(kernels: Array, grid: tuple[int, ...]) -> Array:
-    padded = np.zeros((*kernels.shape[:-2], *grid))
-    padded[..., : kernels.shape[-2], : kernels.shape[-1]] = kernels
-    return padded

@@ -16,7 +16,7 @@ from ..problems import FitError, NotInFocusWarning, SaturatedWarning, warn
 from ..result import Array, BlurFit
 from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
-from .diagnostics import EXPLAINED, doubt_forward, doubt_linearity
+from .diagnostics import EXPLAINED, check_fit, check_linearity
 from .dot import find_dot
 from .dot_model import soft_edge
 from .family_choice import COST, choose
@@ -106,7 +106,10 @@ def fit_pair(
         ('disc', 8.0)
     """
     _check_options(family, model, source, magnification, accuracy_db, fit_magnification, white, start, prior)
-    _check_radial(knots, reach)
+    if knots is not None:
+        a_count("knots", knots, 2, 1000)
+    if reach is not None:
+        a_number("reach", reach, 0, unit="pixels")
     data = a_picture("blurred", blurred, _SMALLEST_WINDOW, files[1])
     still = None if sharp is None else a_picture("sharp", sharp, _SMALLEST_WINDOW, files[0])
     if still is not None and still.shape != data.shape:
@@ -117,12 +120,16 @@ def fit_pair(
     if model == "ratio":
         if still is None:
             raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
-        return _ratio(still, data, "ring" if family == "auto" else family)
+        r, strength, spokes = blur_strength(still, data)
+        fit = fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes)
+        return replace(fit, model="ratio")
     pair = _prepare(still, data, source, magnification, white, files)
     if start is not None and start.family in FAMILIES:
         pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
     pair.prior = dict(prior or {})
-    held = _held(pair, fit_magnification, sharp is None)
+    # whether the magnification is settled before the fit: a point has none
+    held = True if sharp is None else None if fit_magnification is None else not fit_magnification
+    pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
     why, psnr = "", dict[str, float]()
     if family in ("auto", "radial"):
         solutions = {"radial": _solve_radial(pair, held, knots, reach)}
@@ -134,7 +141,7 @@ def fit_pair(
             pair.fit_moves, solutions[family] = ALL_MOVES, free
     fit = describe(pair, solutions[family], why)
     # a family that was chosen for being cheap is not to blame for what the free profile explains
-    doubt_forward(pair, solutions[family], fit, files, describe(pair, solutions["radial"], "") if why else fit)
+    check_fit(pair, solutions[family], fit, files, describe(pair, solutions["radial"], "") if why else fit)
     return replace(fit, psnr=psnr)
 
 
@@ -153,14 +160,14 @@ def _check_options(
         raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
     texts = isinstance(model, str) and isinstance(source, str)
     if not texts or model not in get_args(Model) or source not in get_args(SourceKind):
-        told = f"got {show(model)}, {show(source)}"
-        raise FitError(f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; {told}")
+        got = f"got {show(model)}, {show(source)}"
+        raise FitError(f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; {got}")
     try:
         # beyond this the dot of one picture is not seen in the other
         a_number("magnification", magnification, 1e-3, 1e3)
     except FitError:
-        told = f"got {show(magnification)}"
-        raise FitError(f"magnification must be positive (0.001 to 1000), {told}") from None
+        got = f"got {show(magnification)}"
+        raise FitError(f"magnification must be positive (0.001 to 1000), {got}") from None
     a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
     if white is not None:
         a_number("white", white, -1e100, 1e100)
@@ -174,18 +181,6 @@ def _check_options(
     for name, (mean, deviation) in (prior or {}).items():
         a_number(f"the expected {name}", mean, -1e100, 1e100)
         a_number(f"the deviation of {name}", deviation, 0)
-
-
-def _check_radial(knots: Any, reach: Any) -> None:
-    if knots is not None:
-        a_count("knots", knots, 2, 1000)
-    if reach is not None:
-        a_number("reach", reach, 0, unit="pixels")
-
-
-def _ratio(still: Array, data: Array, family: str) -> BlurFit:
-    r, strength, spokes = blur_strength(still, data)
-    return replace(fit_profile(r, strength, family, groups=spokes), model="ratio")
 
 
 def _prepare(
@@ -216,7 +211,7 @@ def _prepare(
             stacklevel=4,
         )
     if not clipped:
-        doubt_linearity(still, dot, edge, files[0])
+        check_linearity(still, dot, edge, files[0])
     if clipped:
         warn(
             SaturatedWarning(
@@ -235,13 +230,6 @@ def _prepare(
     return Forward(PictureOfDot.of(still, dot), data, used, data_dot, magnification)
 
 
-def _held(pair: Forward, fit_magnification: bool | None, point: bool) -> bool | None:
-    """Whether the magnification is settled before the fit: a point has none."""
-    held = True if point else None if fit_magnification is None else not fit_magnification
-    pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
-    return held
-
-
 def _with_magnification(pair: Forward) -> Forward:
     return replace(pair, fit_moves=ALL_MOVES)
 
@@ -256,7 +244,9 @@ def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
 def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: float | None) -> Solution:
     """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`."""
     soft = pair.solve("softm")
-    reach = _reach(pair, soft) if reach is None else min(reach, pair.half - 1.0)
+    if reach is None:  # a little beyond what the soft disc says
+        reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
+    reach = min(reach, pair.half - 1.0)
     solution = solve_radial(pair, soft, reach, knots)
     if held is None:
         free = solve_radial(_with_magnification(pair), solution, reach, knots)
@@ -277,9 +267,3 @@ def _choose(pair: Forward, solutions: dict[str, Solution], accuracy_db: float) -
         pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
         solutions[family] = pair.solve(family)
     return family, why, psnr
-
-
-def _reach(pair: Forward, soft: Solution) -> float:
-    """Where a free profile may end: a little beyond what the soft disc says."""
-    reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
-    return min(reach, pair.half - 1.0)

@@ -89,7 +89,8 @@ def fit_profile(
     order = np.argsort(radii, kind="stable")
     unit, peak = float(radii.max()), float(np.abs(values).max())
     x, y = radii[order] / unit, values[order] / peak
-    noise = _noise(y)
+    # from differences of neighbours in r: what no smooth curve can explain
+    noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
     _refuse_flat(x, y, noise)
     if family == "radial":
         params, covariance, names, curve = _fit_radial(x, y, knots)
@@ -101,7 +102,12 @@ def fit_profile(
     scale = np.array([unit if n in _LENGTHS else peak if n == "N" or n.startswith("values") else 1.0 for n in names])
     covariance = covariance * np.outer(scale, scale)
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    real, stderr = _named(family, params * scale, spread, names, unit)
+    real: dict[str, float | Array] = {"values": params * scale, "radius": unit}
+    stderr: dict[str, float | Array] = {"values": spread, "radius": 0.0}
+    if family != "radial":
+        real = {name: float(value) for name, value in zip(names, params * scale, strict=True)}
+        stderr = {name: float(error) for name, error in zip(names, spread, strict=True)}
+    line = np.linspace(0.0, unit, 257)
     fit = BlurFit(
         family=family,
         params=real,
@@ -114,10 +120,10 @@ def fit_profile(
         count=y.size,
         model="profile",
         samples=np.stack([radii, values]),
-        curve=_curve(family, real, unit),
+        curve=np.stack([line, evaluate(family, line, real)]),
     )
     if family in _ORDER:
-        _doubt(fit, unit)
+        _warn_if_undetermined(fit, unit)
     return fit
 
 
@@ -168,19 +174,14 @@ def _checked_groups(groups: ArrayLike, count: int) -> Array:
     return array
 
 
-def _noise(y: Array) -> float:
-    """Noise from differences of neighbours in r: what no smooth curve can explain."""
-    return float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
-
-
 def _refuse_flat(x: Array, y: Array, noise: float) -> None:
     level = y - y.mean()
     bent = np.stack([np.ones_like(x), x, x * x], axis=1)
-    rest = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
-    explained, left = float(level @ level - rest @ rest), float(rest @ rest)
+    residual = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
+    explained, unexplained = float(level @ level - residual @ residual), float(residual @ residual)
     variation = float(np.sqrt(max(explained, 0.0) / y.size))
     # Fisher's test of a parabola against a constant: 8 is one chance in 1500
-    if variation < 1e-8 or explained / 2 < _BENT * left / (y.size - 3):
+    if variation < 1e-8 or explained / 2 < _BENT * unexplained / (y.size - 3):
         raise FlatProfileError(
             f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
             "farther out, or move the paper farther from focus",
@@ -281,21 +282,7 @@ def hat_functions(x: Array, count: int) -> Array:
     return np.clip(1 - distance, 0, None) * (x <= 1)[:, None]
 
 
-def _named(
-    family: str, values: Array, spread: Array, names: tuple[str, ...], unit: float
-) -> tuple[dict[str, float | Array], dict[str, float | Array]]:
-    if family == "radial":
-        return {"values": values, "radius": unit}, {"values": spread, "radius": 0.0}
-    pairs = list(zip(names, values, spread, strict=True))
-    return {n: float(v) for n, v, _ in pairs}, {n: float(s) for n, _, s in pairs}
-
-
-def _curve(family: str, params: dict[str, float | Array], unit: float) -> Array:
-    line = np.linspace(0.0, unit, 257)
-    return np.stack([line, evaluate(family, line, params)])
-
-
-def _doubt(fit: BlurFit, unit: float) -> None:
+def _warn_if_undetermined(fit: BlurFit, unit: float) -> None:
     loose: Sequence[str] = [n for n in ("r_c", "sigma", "radius") if n in fit.params]
     for name in loose:
         value, error = float(fit.params[name]), float(fit.stderr[name])

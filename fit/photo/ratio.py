@@ -52,8 +52,8 @@ def polar_samples(
         try:
             a_number(name, value, 0.0, most)
         except FitError:
-            told = f"got {show(radius)}, {show(spacing)}, {show(step_deg)}"
-            raise FitError(f"radius, spacing and step_deg must be positive, {told}") from None
+            got = f"got {show(radius)}, {show(spacing)}, {show(step_deg)}"
+            raise FitError(f"radius, spacing and step_deg must be positive, {got}") from None
     if radius / spacing * 360 / step_deg > 1e7:
         raise FitError(f"spacing and step_deg must give at most 10 million samples, got {spacing:g} and {step_deg:g}")
     r = np.arange(0.0, radius + 1e-9, spacing)

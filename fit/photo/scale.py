@@ -81,8 +81,8 @@ def check_reach(
         width_px: width of the image.
 
     Returns:
-        What was found: "coc" (largest circle of confusion of the scene over the largest measured on its side),
-        "f_number" and "focus_m" (asked for over measured; 1 where the table does not know).
+        Each over what was measured: "coc" (the largest circle of confusion of the scene over the largest measured on
+        its side), "f_number" and "focus_m" (1 where the table does not know).
 
     Raises:
         FitError: the depths are not 0 < near <= far.
@@ -92,8 +92,8 @@ def check_reach(
 
     Example:
         >>> table = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="mm", sensor_width_mm=36.0)
-        >>> found = check_reach(table, Camera(f_number=8.0), near_m=1.5, far_m=3.0)
-        >>> found["coc"] < 1
+        >>> factors = check_reach(table, Camera(f_number=8.0), near_m=1.5, far_m=3.0)
+        >>> factors["coc"] < 1
         True
     """
     for what, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
@@ -118,20 +118,16 @@ def check_reach(
         text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
         warn(OutsideMeasuredWarning(text, number=factors["coc"]))
     for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
-        measured_at = _known(table.provenance.get(name))
-        asked = float(getattr(camera, name))
-        if measured_at is None or math.isinf(asked):
+        measured_at: Any = table.provenance.get(name)
+        used_at = float(getattr(camera, name))
+        known = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
+        if not known or not 0 < measured_at < math.inf or math.isinf(used_at):
             continue
-        factors[name] = asked / measured_at
+        factors[name] = used_at / measured_at
         if max(factors[name], 1 / factors[name]) > most:
             text = (
-                f"the table was measured at {name} {measured_at:g} and is used at {asked:g}; the size of the blur is "
+                f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}; the size of the blur is "
                 "right, its shape is that of the measured one"
             )
             warn(OutsideMeasuredWarning(text, number=factors[name]))
     return factors
-
-
-def _known(value: Any) -> float | None:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return float(value) if number and 0 < value < math.inf else None

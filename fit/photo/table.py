@@ -89,7 +89,7 @@ def fit_captures(
     progress: Callable[[int, int, str], None] | None = None,
     command: str = "torchdof.fit.fit_table",
 ) -> TableFit:
-    """Fit every distance and join the fits.
+    """Fit every distance, and make one table of the fits.
 
     Nodes are keyed by the thin lens's signed circle of confusion at their distance. Where focal length and f-number
     are known it is the camera's; else its scale is measured: the radius of the uniform disc with the fitted kernels'
@@ -138,7 +138,13 @@ def fit_captures(
 
     ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
     coc_px, scale = _keys(captures, ordered)
-    params = _nodes(ordered, family)
+    if family == "radial":
+        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
+        radius = np.array([float(f.params["radius"]) for f in ordered])
+        values = np.stack([np.asarray(f.params["values"]) for f in ordered]) * radius[:, None] ** 2
+        params = {"values": values, "radius": radius}
+    else:
+        params = {n: np.array([float(f.params[n]) for f in ordered]) for n in FAMILIES[family]}
     if len(pairs) == 1:
         text = (
             f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
@@ -203,24 +209,10 @@ def _keys(captures: Captures, fits: list[BlurFit]) -> tuple[list[float], str]:
 
 def rms_radius(fit: BlurFit) -> float:
     """Root of a kernel's mean squared radius, in the fit's unit; over a uniform disc it is its radius / sqrt(2)."""
-    given = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
-    r = np.linspace(0, support(fit.family, given) + 1e-9, 4001)
-    f = profile(fit.family, torch.from_numpy(r), given).numpy()
+    params = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
+    r = np.linspace(0, support(fit.family, params) + 1e-9, 4001)
+    f = profile(fit.family, torch.from_numpy(r), params).numpy()
     return float(np.sqrt((f * r**3).sum() / (f * r).sum()))
-
-
-def _nodes(fits: list[BlurFit], family: str) -> dict[str, Array]:
-    """Parameters at the nodes in px: `[n]`, "values" `[n, knots]`."""
-    if family == "radial":
-        return _radial_nodes(fits)
-    return {n: np.array([float(f.params[n]) for f in fits]) for n in FAMILIES[family]}
-
-
-def _radial_nodes(fits: list[BlurFit]) -> dict[str, Array]:
-    """Free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change."""
-    radius = np.array([float(f.params["radius"]) for f in fits])
-    values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
-    return {"values": values, "radius": radius}
 
 
 def _table(

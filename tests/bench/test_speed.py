@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from torchdof import Camera, DepthOfField
 from torchdof.bench import scaling, speed
-from torchdof.bench.inputs import Subject, shipped
+from torchdof.bench.inputs import BenchScene, shipped
 from torchdof.cli.bench import from_files
 from torchdof.cli.main import app
 from torchdof.cli.settings import RenderSettings
@@ -41,14 +41,14 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def measured() -> tuple[list[speed.SettingCost], Subject]:
+def measured() -> tuple[list[speed.SettingCost], BenchScene]:
     subject = shipped(48, 96)
     # blurred enough for coarse layers to show
-    subject = Subject("wide", subject.image, 5.0 * subject.coc_px)
+    subject = BenchScene("wide", subject.image, 5.0 * subject.coc_px)
     return speed.measure_all(subject, repeat=1)[0], subject
 
 
-def test_every_setting_has_its_row(measured: tuple[list[speed.SettingCost], Subject]) -> None:
+def test_every_setting_has_its_row(measured: tuple[list[speed.SettingCost], BenchScene]) -> None:
     rows, _ = measured
     assert [r.setting.name for r in rows] == [*LEVELS, *LEVELS, "1/255 looked at", "fold 1/255", "fold 1/255"]
     assert [r.setting.occlusion for r in rows] == [True] * 6 + [False] * 6 + [True, True, False]
@@ -57,7 +57,7 @@ def test_every_setting_has_its_row(measured: tuple[list[speed.SettingCost], Subj
     assert all(r.keeps for r in rows)
 
 
-def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed.SettingCost], Subject]) -> None:
+def test_errors_are_those_against_the_exact_rendering(measured: tuple[list[speed.SettingCost], BenchScene]) -> None:
     rows, subject = measured
     for r in (r for r in rows if r.setting.method == "layered" and not r.setting.attention):
         out, wanted = (
@@ -158,7 +158,7 @@ def test_the_built_in_scene_is_blurred_alike_before_and_behind_the_focus() -> No
 
 def test_fold_gets_a_crop_whose_columns_fit() -> None:
     image, coc = torch.rand(1, 3, 200, 300), torch.full((1, 1, 200, 300), 60.0)
-    subject = Subject("x", image, coc)
+    subject = BenchScene("x", image, coc)
     crops = [s for s in speed.settings(subject) if s.method == "fold"]
     assert [s.occlusion for s in crops] == [True, False]
     side = crops[0].side
@@ -283,7 +283,7 @@ def test_scans_change_the_radius_or_the_frame_alone() -> None:
     widest = [float(s.coc_px.abs().max()) / s.image.shape[-1] for _, s in scenes[5:]]
     assert widest == pytest.approx([widest[-1]] * 3, rel=0.05)
     assert torch.equal(scenes[-1][1].image, subject.image)
-    assert scaling.scenes(Subject("sharp", subject.image, torch.zeros(1, 1, 64, 128))) == []
+    assert scaling.scenes(BenchScene("sharp", subject.image, torch.zeros(1, 1, 64, 128))) == []
 
 
 def test_the_scan_is_printed_and_written(files: tuple[Path, Path], tmp_path: Path) -> None:

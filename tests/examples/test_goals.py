@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from examples.benchmarks import goals
 from examples.benchmarks.goals import Figure
 from torchdof.bench import speed
-from torchdof.bench.inputs import Subject, shipped
+from torchdof.bench.inputs import BenchScene, shipped
 from torchdof.reference.scenes import read_scenes
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
@@ -75,7 +75,7 @@ def test_of_each_scene_the_setting_in_the_middle_is_measured(tmp_path: Path, sma
     (only,) = data["truths"]
     data["truths"] = [{**only, "index": k, "aperture_radius_m": (k + 1) * only["aperture_radius_m"]} for k in range(3)]
     meta.write_text(json.dumps(data))
-    found = {subject.name: subject for subject in goals.subjects(tmp_path / "scenes")}
+    found = {subject.name: subject for subject in goals.bench_scenes(tmp_path / "scenes")}
     assert "room/1" in found and len(found) == 1 + len(list(DATA.rglob("meta.json")))
     assert all(subject.image.shape[-2:] == (72, 128) for subject in found.values())
     twice = next(scene for scene in read_scenes(tmp_path / "scenes") if scene.name == "room/1")
@@ -92,7 +92,7 @@ def test_each_work_renders_what_its_figure_says(small: None, monkeypatch: pytest
     subject = shipped(72, 128)
     rendered: list[tuple[tuple[int, ...], float, speed.Setting]] = []
 
-    def noted(scene: Subject, setting: speed.Setting) -> None:
+    def noted(scene: BenchScene, setting: speed.Setting) -> None:
         rendered.append((tuple(scene.image.shape[-2:]), round(scene.radius_px, 3), setting))
 
     def times(works: Mapping[Hashable, Callable[[], object]], _: int) -> dict[Hashable, list[float]]:
@@ -101,7 +101,7 @@ def test_each_work_renders_what_its_figure_says(small: None, monkeypatch: pytest
                 work()
         return {name: [float(k + 1)] for k, name in enumerate(works)}
 
-    monkeypatch.setattr(goals, "render_subject", noted)
+    monkeypatch.setattr(goals, "render_scene", noted)
     monkeypatch.setattr(goals, "in_turns", times)
     figures = {figure.what: figure for figure in goals._frames(subject, 1)}
     frame, fine = (72, 128), speed.Setting("layered", True, 1 / 255)
@@ -135,7 +135,7 @@ def test_errors_are_those_of_what_is_timed(small: None, monkeypatch: pytest.Monk
     right = list(goals._errors(subject))
     assert [figure.missed for figure in right] == [False] * 4
     assert 0 < right[0].value < right[1].value
-    monkeypatch.setattr(goals, "render_subject", lambda scene, setting: speed.exact(scene, setting.occlusion) + 0.1)
+    monkeypatch.setattr(goals, "render_scene", lambda scene, setting: speed.exact(scene, setting.occlusion) + 0.1)
     assert [figure.missed for figure in goals._errors(subject)] == [True] * 4
 
 
@@ -193,6 +193,6 @@ def test_bad_arguments_are_refused(
 
 
 def test_a_scene_in_focus_has_no_figures(tmp_path: Path, small: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Subject, "radius_px", 0.0)
+    monkeypatch.setattr(BenchScene, "radius_px", 0.0)
     with pytest.raises(ValueError, match="is all in focus"):
-        goals.subjects(DATA)
+        goals.bench_scenes(DATA)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdof.render.matting import split_mixed
+from torchdof.render.matting import matte
 
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
@@ -29,7 +29,7 @@ def random_scene() -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.8])
 def test_a_mixed_pixel_is_split_between_its_two_surfaces(share: float) -> None:
     image, coc = edge(share)
-    own, other, other_coc, found = (t[0, ..., 24, 31] for t in split_mixed(image, coc))
+    own, other, other_coc, found = (t[0, ..., 24, 31] for t in matte(image, coc))
     mine, theirs = (RED, BLUE) if share >= 0.5 else (BLUE, RED)
     assert float(found) == pytest.approx(1 - max(share, 1 - share), abs=0.03)
     assert torch.allclose(own, mine, atol=0.02) and torch.allclose(other, theirs, atol=0.02)
@@ -38,5 +38,5 @@ def test_a_mixed_pixel_is_split_between_its_two_surfaces(share: float) -> None:
 
 def test_no_light_is_lost_in_a_split() -> None:
     image, coc = random_scene()
-    own, other, _, share = split_mixed(image, coc)
+    own, other, _, share = matte(image, coc)
     assert torch.allclose((1 - share) * own + share * other, image, atol=1e-5)

@@ -97,18 +97,18 @@ def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tens
     light, place = (functional.pad(x, (half,) * 4, mode="replicate") for x in (image, place))
     height, width = (n + 2 * half for n in image.shape[-2:])
     size = [-(-(n + 2 * half) // 16) * 16 for n in image.shape[-2:]]  # of small factors, which is fast
-    out, room, covered = torch.zeros_like(image), torch.zeros_like(place), torch.zeros_like(image[:, :1])
+    out, at_or_behind, covered = torch.zeros_like(image), torch.zeros_like(place), torch.zeros_like(image[:, :1])
     least = 1e-6 if image.dtype == torch.float64 else 1e-3  # what is less is the noise of an FFT in float32
     for k in reversed(range(len(nodes))):  # far to near
-        share = (1.0 - (place - k).abs()).clamp_min(0.0)
-        room = room + share
-        stack = torch.cat([light * share, share, room], 1)
+        weight = (1.0 - (place - k).abs()).clamp_min(0.0)
+        at_or_behind = at_or_behind + weight
+        stack = torch.cat([light * weight, weight, at_or_behind], 1)
         spectrum = torch.fft.rfft2(stack, size) * torch.fft.rfft2(kernels[k], size)
         blurred = torch.fft.irfft2(spectrum, size)[..., 2 * half : height, 2 * half : width]
-        seen = blurred[:, -1:].clamp_min(least)
-        left = 1.0 - (blurred[:, -2:-1] / seen).clamp(0.0, 1.0)
-        out = blurred[:, :-2].clamp_min(0.0) / seen + left * out
-        covered = 1.0 - left + left * covered
+        visibility = blurred[:, -1:].clamp_min(least)
+        transmitted = 1.0 - (blurred[:, -2:-1] / visibility).clamp(0.0, 1.0)
+        out = blurred[:, :-2].clamp_min(0.0) / visibility + transmitted * out
+        covered = 1.0 - transmitted + transmitted * covered
     return out / covered.clamp_min(1e-6)
 
 
@@ -165,8 +165,8 @@ def compare_with_truth(truth: Path, out: Path, views: Sequence[int] | None, inne
         images = {name: render(scene) for name, render in compared.items()}
         known = torch.ones_like(scene.depth, dtype=torch.bool)
         for count, name in reference.items():
-            images[name], share = lens_views(scene.image, scene.depth, scene.camera, views=count)
-            known &= share == 1
+            images[name], known_share = lens_views(scene.image, scene.depth, scene.camera, views=count)
+            known &= known_share == 1
         margin = scene.margin_px * inner
         scores += [score(name, image, scene, margin, known) for name, image in images.items()]
         rows.append(_worst(scene, images))

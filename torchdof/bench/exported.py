@@ -48,19 +48,19 @@ def feed(session: onnxruntime.InferenceSession, size: tuple[int, int], scene: st
     facts = session.get_modelmeta().custom_metadata_map
     camera, reach = json.loads(facts["torchdof.camera"]), json.loads(facts["torchdof.options"])["max_coc_px"]
     height, width = size
-    share = np.zeros((1, 1, height, width), np.float32)  # of the largest radius
+    fraction = np.zeros((1, 1, height, width), np.float32)  # of the largest radius
     if scene == "blurred background":
-        share[..., width // 2 :] = np.linspace(0.0, 0.95, width - width // 2, dtype=np.float32)
+        fraction[..., width // 2 :] = np.linspace(0.0, 0.95, width - width // 2, dtype=np.float32)
     elif scene == "all blurred":
-        share[:] = np.linspace(0.6, 0.95, width, dtype=np.float32)
+        fraction[:] = np.linspace(0.6, 0.95, width, dtype=np.float32)
     values = {"image": np.random.default_rng(0).random((1, 3, height, width), dtype=np.float32)}
     if "coc_px" in {value.name for value in session.get_inputs()}:
-        return values | {"coc_px": reach * share}
+        return values | {"coc_px": reach * fraction}
     focus_m, focal_m = 2.0, camera["focal_length_mm"] / 1000
     image_m = focus_m * focal_m / (focus_m - focal_m) if camera["focus_breathing"] else focal_m
     pitch_m = camera["sensor_width_mm"] / 1000 / width
     aperture_m = 2 * reach * pitch_m * focus_m / image_m  # the coc of infinity is the largest radius
-    values["depth"] = (focus_m / (1.0 - share)).astype(np.float32)
+    values["depth"] = (focus_m / (1.0 - fraction)).astype(np.float32)
     values["focus_m"] = np.full(1, focus_m, np.float32)
     values["f_number"] = np.full(1, focal_m / aperture_m, np.float32)
     return values

@@ -9,14 +9,14 @@ from torch import Tensor
 from ..optics.camera import Camera
 from ..reference.scenes import posts, waves
 
-__all__ = ["LEAST_PX", "Subject", "shipped"]
+__all__ = ["LEAST_PX", "BenchScene", "shipped"]
 
 LEAST_PX = 16
-"""Smallest side of a subject."""
+"""Smallest side of a scene."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Subject:
+class BenchScene:
     """What is rendered.
 
     Args:
@@ -44,18 +44,18 @@ class Subject:
         """Largest radius of the circle of confusion."""
         return float(self.coc_px.abs().max())
 
-    def blurred(self, radius_px: float) -> "Subject":
+    def blurred(self, radius_px: float) -> "BenchScene":
         """As blurred as this, relative to the largest radius, which is ``radius_px``."""
         return dataclasses.replace(self, coc_px=self.coc_px * (radius_px / self.radius_px))
 
-    def resized(self, height: int, width: int) -> "Subject":
+    def resized(self, height: int, width: int) -> "BenchScene":
         """The same picture in a frame of another size, as blurred for its width."""
         how = "area" if height < self.image.shape[-2] else "bilinear"
         image = functional.interpolate(self.image, (height, width), mode=how)
         coc = functional.interpolate(self.coc_px, (height, width), mode="nearest")  # no radius that no surface has
         return dataclasses.replace(self, image=image, coc_px=coc * (width / self.image.shape[-1]))
 
-    def crop(self, side: int, widest: bool = False) -> "Subject":
+    def crop(self, side: int, widest: bool = False) -> "BenchScene":
         """A square at most ``side`` pixels wide: in the middle, or where the blur is widest."""
         height, width = self.image.shape[-2:]
         row, column = divmod(int(self.coc_px.abs().argmax()), width) if widest else (height // 2, width // 2)
@@ -65,7 +65,7 @@ class Subject:
         return dataclasses.replace(self, image=self.image[part], coc_px=self.coc_px[part])
 
 
-def shipped(height: int = 540, width: int = 960) -> Subject:
+def shipped(height: int = 540, width: int = 960) -> BenchScene:
     """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m, with a blur radius of up to a 60th of the width.
 
     Example:
@@ -78,4 +78,4 @@ def shipped(height: int = 540, width: int = 960) -> Subject:
     depth = torch.where(near, 1.0 / (1.0 + 0.1 * x / width), 1.0 / (0.1 + 0.9 * y / height)).float()[None, None]
     camera = Camera(50.0, 1.0, focus_m=1.0 / 0.6)  # the blur is as large far away as at the posts
     camera = camera.replace(f_number=float(camera.coc_px(depth, width).abs().max()) / (width / 60))
-    return Subject("slope with posts", light, camera.coc_px(depth, width), f"{camera!r}")
+    return BenchScene("slope with posts", light, camera.coc_px(depth, width), f"{camera!r}")

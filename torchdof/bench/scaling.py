@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.progress import track
 
-from .inputs import LEAST_PX, Subject
+from .inputs import LEAST_PX, BenchScene
 from .report import ReportTable
-from .speed import Setting, render_subject
+from .speed import Setting, render_scene
 from .timer import median_and_spread, times
 
-__all__ = ["Growth", "measure_growth", "scenes", "table_of"]
+__all__ = ["ScanCost", "measure_scans", "scenes", "table_of"]
 
 _TOLERANCE = 1 / 255
 _RADII_PX = (4.0, 8.0, 16.0, 32.0, 64.0)
@@ -22,7 +22,7 @@ _COLUMNS = ("scan", "frame", "radius px", "ms", "± ms", "Y", "ns a pixel", "wit
 
 
 @dataclasses.dataclass(frozen=True)
-class Growth:
+class ScanCost:
     """What one scene of a scan took, with and without occlusion; times in seconds, units in Y."""
 
     scan: str
@@ -38,7 +38,7 @@ class Growth:
     plain_units: float
 
 
-def scenes(subject: Subject) -> list[tuple[str, Subject]]:
+def scenes(scene: BenchScene) -> list[tuple[str, BenchScene]]:
     """The same scene with other largest radii, and in smaller frames with a blur as large relative to the width.
 
     Example:
@@ -46,21 +46,21 @@ def scenes(subject: Subject) -> list[tuple[str, Subject]]:
         >>> [(name, s.image.shape[-1], round(float(s.coc_px.abs().max()))) for name, s in scenes(shipped(64, 128))][4:]
         [('radius', 128, 64), ('size', 32, 1), ('size', 64, 1), ('size', 128, 2)]
     """
-    if not 0 < subject.radius_px < math.inf:
+    if not 0 < scene.radius_px < math.inf:
         return []
-    height, width = subject.image.shape[-2:]
-    sizes = [(max(LEAST_PX, round(height * share)), max(LEAST_PX, round(width * share))) for share in _SIZES]
+    height, width = scene.image.shape[-2:]
+    sizes = [(max(LEAST_PX, round(height * factor)), max(LEAST_PX, round(width * factor))) for factor in _SIZES]
     return [
-        *(("radius", subject.blurred(radius)) for radius in _RADII_PX),
-        *(("size", subject.resized(*size)) for size in sizes),
+        *(("radius", scene.blurred(radius)) for radius in _RADII_PX),
+        *(("size", scene.resized(*size)) for size in sizes),
     ]
 
 
-def measure_growth(subject: Subject, repeat: int, unit: float, console: Console | None = None) -> list[Growth]:
+def measure_scans(scene: BenchScene, repeat: int, unit: float, console: Console | None = None) -> list[ScanCost]:
     """Times of :func:`scenes` at a tolerance of 1/255.
 
     Args:
-        subject: What is rendered.
+        scene: What is rendered.
         repeat: Timed renderings each, after one more.
         unit: Unit Y in seconds.
         console: Where to show progress; None shows none.
@@ -69,20 +69,22 @@ def measure_growth(subject: Subject, repeat: int, unit: float, console: Console 
         A row for each; none if all is in focus.
     """
     rows, silent = [], console is None or not console.is_terminal
-    for scan, scene in track(scenes(subject), "scans", console=console, transient=True, disable=silent):
-        height, width = scene.image.shape[-2:]
-        both = []
+    for scan, scanned in track(scenes(scene), "scans", console=console, transient=True, disable=silent):
+        height, width = scanned.image.shape[-2:]
+        medians_and_spreads = []
         for occlusion in (True, False):
             setting = Setting("layered", occlusion, _TOLERANCE)
-            both.append(median_and_spread(times(functools.partial(render_subject, scene, setting), repeat)))
-        (median, spread), (plain, plain_spread) = both
-        radius, pixels = scene.radius_px, width * height
-        own = (median, spread, median / unit, 1e9 * median / pixels)
-        rows.append(Growth(scan, width, height, radius, *own, plain, plain_spread, plain / unit))
+            medians_and_spreads.append(
+                median_and_spread(times(functools.partial(render_scene, scanned, setting), repeat))
+            )
+        (median, spread), (without, without_spread) = medians_and_spreads
+        radius, pixels = scanned.radius_px, width * height
+        with_occlusion = (median, spread, median / unit, 1e9 * median / pixels)
+        rows.append(ScanCost(scan, width, height, radius, *with_occlusion, without, without_spread, without / unit))
     return rows
 
 
-def table_of(rows: Sequence[Growth]) -> ReportTable:
+def table_of(rows: Sequence[ScanCost]) -> ReportTable:
     """A line for each scene of the scans."""
     lines = [list(_COLUMNS)]
     for r in rows:

@@ -26,7 +26,7 @@ from ..reference import metrics
 from ..render.attention import weight_map
 from ..validation import whole
 from . import memory
-from .inputs import LEAST_PX, Subject
+from .inputs import LEAST_PX, BenchScene
 from .report import Report, ReportTable, machine
 from .timer import median_and_spread, timed, times
 
@@ -37,7 +37,7 @@ __all__ = [
     "measure_setting",
     "measure_all",
     "pareto",
-    "render_subject",
+    "render_scene",
     "renderer",
     "settings",
     "show",
@@ -109,25 +109,26 @@ class SettingCost:
     ready_s: float = 0.0
 
 
-def settings(subject: Subject, runtimes: Sequence[Runtime] = ()) -> list[Setting]:
-    """What is compared on a subject: from coarse to exact with and without occlusion, and the literal scatter.
+def settings(scene: BenchScene, runtimes: Sequence[Runtime] = ()) -> list[Setting]:
+    """What is compared on a scene: from coarse to exact with and without occlusion, and the literal scatter.
 
     That one holds k * k columns a pixel, so it gets a crop from the middle on which they stay within 256 MiB. Further
     runtimes render at 1/255.
     """
-    taps = (2 * math.ceil(subject.radius_px) + 3) ** 2
-    bytes_a_pixel = taps * subject.image.shape[1] * subject.image.element_size()
+    taps = (2 * math.ceil(scene.radius_px) + 3) ** 2
+    bytes_a_pixel = taps * scene.image.shape[1] * scene.image.element_size()
     side = min(_FOLD_PX, max(LEAST_PX, math.isqrt(_FOLD_BYTES // bytes_a_pixel)))
-    compared = [Setting("layered", seen, level / 255) for seen in (True, False) for level in (*_LEVELS, 0.0)]
-    height, width = subject.image.shape[-2:]
+    compared = [Setting("layered", occlusion, level / 255) for occlusion in (True, False) for level in (*_LEVELS, 0.0)]
+    height, width = scene.image.shape[-2:]
     compared.append(Setting("layered", True, 1 / 255, attention=(width / 2, height / 2, height / _LOOKED_AT)))
-    compared += [Setting("layered", seen, 1 / 255, runtime=runtime) for runtime in runtimes for seen in (True, False)]
-    return [*compared, *(Setting("fold", seen, 1 / 255, side) for seen in (True, False))]
+    for runtime in runtimes:
+        compared += [Setting("layered", occlusion, 1 / 255, runtime=runtime) for occlusion in (True, False)]
+    return [*compared, *(Setting("fold", occlusion, 1 / 255, side) for occlusion in (True, False))]
 
 
-def exact(subject: Subject, occlusion: bool) -> Tensor:
+def exact(scene: BenchScene, occlusion: bool) -> Tensor:
     """The rendering that errors are measured against: exact kernels, dense layers, full resolution."""
-    return render_subject(subject, Setting("layered", occlusion, 0.0))
+    return render_scene(scene, Setting("layered", occlusion, 0.0))
 
 
 def unit_work() -> Callable[[], Tensor]:
@@ -145,12 +146,12 @@ def unit_s(repeat: int = 5) -> float:
     return statistics.median(times(unit_work(), repeat))
 
 
-def render_subject(subject: Subject, setting: Setting) -> Tensor:
-    """A subject as a setting of PyTorch says: ``[1, C, H, W]``."""
+def render_scene(scene: BenchScene, setting: Setting) -> Tensor:
+    """A scene as a setting of PyTorch says: ``[1, C, H, W]``."""
     with torch.inference_mode():
         return blur_by_coc(
-            subject.image,
-            subject.coc_px,
+            scene.image,
+            scene.coc_px,
             tolerance=setting.tolerance,
             occlusion=setting.occlusion,
             method=setting.method,
@@ -158,20 +159,20 @@ def render_subject(subject: Subject, setting: Setting) -> Tensor:
         )
 
 
-def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
-    """What renders a subject: a function without arguments, once all is prepared.
+def renderer(scene: BenchScene, setting: Setting) -> Callable[[], Tensor]:
+    """What renders a scene: a function without arguments, once all is prepared.
 
     Raises:
         ModuleNotFoundError: If onnxruntime is asked for and missing.
         ValueError: If the exported file does not render as the module does.
     """
     if setting.runtime == "torch":
-        return lambda: render_subject(subject, setting)
-    reach = max(1.0, float(math.ceil(subject.radius_px)))
+        return lambda: render_scene(scene, setting)
+    reach = max(1.0, float(math.ceil(scene.radius_px)))
     options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
     if setting.runtime == "compiled":
         compiled = torch.compile(functools.partial(blur_by_coc, max_coc_px=reach, check=False, **options))
-        run = torch.no_grad()(lambda: compiled(subject.image, subject.coc_px))
+        run = torch.no_grad()(lambda: compiled(scene.image, scene.coc_px))
         run()  # compiles
         return run
     from torchdof.bench.exported import session
@@ -180,23 +181,23 @@ def renderer(subject: Subject, setting: Setting) -> Callable[[], Tensor]:
     dof = DepthOfField(Camera(), max_coc_px=reach, check=False, **options)
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/dof.onnx"
-        to_onnx(dof, path, inputs="coc_px", channels=subject.image.shape[1])
+        to_onnx(dof, path, inputs="coc_px", channels=scene.image.shape[1])
         runner = session(path, torch.get_num_threads())
-    feed = {"image": subject.image.numpy(), "coc_px": subject.coc_px.numpy()}
+    feed = {"image": scene.image.numpy(), "coc_px": scene.coc_px.numpy()}
     return lambda: torch.from_numpy(runner.run(None, feed)[0])
 
 
-def measure_setting(subject: Subject, setting: Setting, wanted: Tensor, repeat: int, unit: float) -> SettingCost:
+def measure_setting(scene: BenchScene, setting: Setting, wanted: Tensor, repeat: int, unit: float) -> SettingCost:
     """Renders once to see that it is right, then ``repeat`` times for the time.
 
     Args:
-        subject: What is rendered, already cropped.
+        scene: What is rendered, already cropped.
         setting: How.
         wanted: The exact rendering, ``[1, C, H, W]``.
         repeat: How often, at least 1.
         unit: Unit Y in seconds.
     """
-    work, ready = timed(lambda: renderer(subject, setting))
+    work, ready = timed(lambda: renderer(scene, setting))
     start = memory.reset_peak()
     out = work()
     peak_mb = memory.peak_mb() - start
@@ -213,12 +214,12 @@ def measure_setting(subject: Subject, setting: Setting, wanted: Tensor, repeat: 
 
 
 def measure_all(
-    subject: Subject, repeat: int = 5, console: Console | None = None, runtimes: Sequence[Runtime] = ()
+    scene: BenchScene, repeat: int = 5, console: Console | None = None, runtimes: Sequence[Runtime] = ()
 ) -> tuple[list[SettingCost], float]:
-    """Every setting on a subject.
+    """Every setting on a scene.
 
     Args:
-        subject: What is rendered.
+        scene: What is rendered.
         repeat: How often each.
         console: Where to show progress; None shows none.
         runtimes: Others to render with: ``compiled`` needs a C++ compiler, ``onnxruntime`` the extra ``export``;
@@ -234,8 +235,8 @@ def measure_all(
     unit, rows = unit_s(repeat), []
     references: dict[tuple[int | None, bool], Tensor] = {}
     silent = console is None or not console.is_terminal
-    for setting in track(settings(subject, runtimes), "settings", console=console, transient=True, disable=silent):
-        part = subject if setting.side is None else subject.crop(setting.side)
+    for setting in track(settings(scene, runtimes), "settings", console=console, transient=True, disable=silent):
+        part = scene if setting.side is None else scene.crop(setting.side)
         key = (setting.side, setting.occlusion)
         if key not in references:
             references[key] = exact(part, setting.occlusion)
@@ -266,37 +267,37 @@ def pareto(rows: Sequence[SettingCost]) -> list[SettingCost]:
 def write(
     folder: Path,
     rows: Sequence[SettingCost],
-    subject: Subject,
+    scene: BenchScene,
     unit: float,
     repeat: int,
-    growth: Sequence[ReportTable] = (),
+    scans: Sequence[ReportTable] = (),
 ) -> None:
     """Writes ``speed.csv``, ``speed.md`` and ``speed.png``: all of them or none.
 
     Args:
         folder: Where.
         rows: What was measured.
-        subject: On what.
+        scene: On what.
         unit: Unit Y in seconds.
         repeat: How often each.
-        growth: Further tables for ``speed.md``, of how cost grows.
+        scans: Further tables for ``speed.md``, of how cost grows.
 
     Raises:
         OSError: If a file cannot be written.
         ModuleNotFoundError: If matplotlib is missing.
     """
     broken = [row.setting for row in rows if not row.keeps]
-    names = "; ".join(f"{how.name}{'' if how.occlusion else ' without occlusion'}" for how in broken)
+    names = "; ".join(f"{setting.name}{'' if setting.occlusion else ' without occlusion'}" for setting in broken)
     tables = []
-    for seen in (True, False):
-        lines = [["setting", *_COLUMNS], *(cells for row, cells in _lines(rows) if row.setting.occlusion == seen)]
+    for occlusion in (True, False):
+        lines = [["setting", *_COLUMNS], *(cells for row, cells in _lines(rows) if row.setting.occlusion == occlusion)]
         starred = [[cell.replace("*", "\\*") for cell in line] for line in lines]
-        tables.append(ReportTable(f"{'With' if seen else 'Without'} occlusion", starred))
+        tables.append(ReportTable(f"{'With' if occlusion else 'Without'} occlusion", starred))
     report = Report(
         "speed",
         "Speed against error",
         [
-            f"{_title(subject)}. {subject.remark}.",
+            f"{_title(scene)}. {scene.remark}.",
             f"{machine()}.",
             f"Median and spread (interquartile range) of {repeat} renderings after one more. Y is the time of one "
             f"depthwise 17 x 17 convolution of 1 x 16 x 540 x 960, {1e3 * unit:.3g} ms in this run. MiB is the growth "
@@ -305,26 +306,26 @@ def write(
             f"Pareto front. {_remarks(rows)}",
             f"**The tolerance was not kept by: {names}.**" if broken else "Every tolerance was kept.",
             *tables,
-            *growth,
+            *scans,
         ],
         _csv(rows),
     )
-    report.write(folder, picture=lambda path: _plot(path, rows, subject))
+    report.write(folder, picture=lambda path: _plot(path, rows, scene))
 
 
-def show(rows: Sequence[SettingCost], subject: Subject, unit: float) -> None:
+def show(rows: Sequence[SettingCost], scene: BenchScene, unit: float) -> None:
     """Prints the table."""
     console = Console()
-    console.print(f"{_title(subject)}; {subject.remark}", markup=False, highlight=False)
+    console.print(f"{_title(scene)}; {scene.remark}", markup=False, highlight=False)
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("setting", no_wrap=True)
     for column in _COLUMNS:
         table.add_column(column.partition(" ")[0], justify="right", no_wrap=True)
-    for seen in (True, False):
+    for occlusion in (True, False):
         table.add_section()
-        table.add_row("with occlusion:" if seen else "without:", style="bold")
+        table.add_row("with occlusion:" if occlusion else "without:", style="bold")
         for row, cells in _lines(rows):
-            if row.setting.occlusion == seen:
+            if row.setting.occlusion == occlusion:
                 table.add_row(*cells, style=None if row.keeps else "red")
     console.print(table)
     console.print(f"ms: median and spread; 1 Y = {unit * 1e3:.3g} ms; RMS (of 255), dB and SSIM against exact.")
@@ -337,8 +338,15 @@ def _csv(rows: Iterable[SettingCost]) -> str:
     names = [field.name for field in dataclasses.fields(SettingCost) if field.name != "setting"]
     writer.writerow(["setting", "method", "runtime", "occlusion", "tolerance", "crop", *names])
     for row in rows:
-        how = row.setting
-        values = [how.name, how.method, how.runtime, how.occlusion, how.tolerance, how.side is not None]
+        setting = row.setting
+        values = [
+            setting.name,
+            setting.method,
+            setting.runtime,
+            setting.occlusion,
+            setting.tolerance,
+            setting.side is not None,
+        ]
         values += [getattr(row, name) for name in names]
         writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
     return text.getvalue()
@@ -368,13 +376,13 @@ def _remarks(rows: Sequence[SettingCost]) -> str:
     )
 
 
-def _title(subject: Subject) -> str:
-    height, width = subject.image.shape[-2:]
-    low, high = float(subject.coc_px.min()), float(subject.coc_px.max())
-    return f"{subject.name}, {width} x {height}, blur radius {low:.1f} to {high:.1f} px"
+def _title(scene: BenchScene) -> str:
+    height, width = scene.image.shape[-2:]
+    low, high = float(scene.coc_px.min()), float(scene.coc_px.max())
+    return f"{scene.name}, {width} x {height}, blur radius {low:.1f} to {high:.1f} px"
 
 
-def _plot(path: Path, rows: Sequence[SettingCost], subject: Subject) -> None:
+def _plot(path: Path, rows: Sequence[SettingCost], scene: BenchScene) -> None:
     # no pyplot: it would choose a screen and keep every figure alive
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -388,14 +396,14 @@ def _plot(path: Path, rows: Sequence[SettingCost], subject: Subject) -> None:
         chosen = [
             r for r in rows if r.setting.occlusion == occlusion and not r.setting.side and not r.setting.attention
         ]
-        seen = [row for row in chosen if row.rms_255 > 0]  # a logarithm has no zero
+        with_error = [row for row in chosen if row.rms_255 > 0]  # a logarithm has no zero
         front = [row for row in pareto(chosen) if row.rms_255 > 0]
         axes.plot([1e3 * r.median_s for r in front], [r.rms_255 for r in front], color=colour, lw=1)
-        for row in seen:
+        for row in with_error:
             point = (1e3 * row.median_s, row.rms_255)
             axes.plot(*point, "o", ms=6, color=colour, mfc=colour if row in front else "none")
-            other = row.setting.runtime != "torch"  # these lie side by side
-            place: dict[str, Any] = {"xytext": (0, -11), "ha": "center"} if other else {"xytext": (5, 4)}
+            beside = row.setting.runtime != "torch"  # these lie side by side
+            place: dict[str, Any] = {"xytext": (0, -11), "ha": "center"} if beside else {"xytext": (5, 4)}
             axes.annotate(row.setting.name, point, textcoords="offset points", fontsize=7, color=colour, **place)
         for row in (row for row in chosen if row.rms_255 == 0):
             axes.axvline(1e3 * row.median_s, color=colour, ls=":", lw=1)
@@ -408,7 +416,7 @@ def _plot(path: Path, rows: Sequence[SettingCost], subject: Subject) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(LogFormatter())
         axis.set_minor_formatter(LogFormatter())
-    axes.set_title(_title(subject), fontsize=9)
+    axes.set_title(_title(scene), fontsize=9)
     axes.grid(True, which="both", lw=0.3)
     axes.legend(fontsize=8, title="filled: Pareto front", title_fontsize=7)
     figure.savefig(path)

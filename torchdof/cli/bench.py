@@ -12,7 +12,7 @@ from rich.console import Console
 
 from ..bench import scaling, speed
 from ..bench.accuracy import compare_with_truth
-from ..bench.inputs import Subject, shipped
+from ..bench.inputs import BenchScene, shipped
 from ..bench.report import existing_folder
 from ..depth.holes import resolve_holes
 from ..depth.kinds import depth_from_values
@@ -140,24 +140,24 @@ def bench(
         raise FileNotFoundError(
             "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
         )
-    subject = shipped() if image is None else from_files(image, depth, how)
+    scene = shipped() if image is None else from_files(image, depth, how)
     console = Console(stderr=True)
     runtimes: list[speed.Runtime] = []
     if onnx:
         runtimes.append("onnxruntime")
     if compiled:
         runtimes.append("compiled")
-    rows, unit = speed.measure_all(subject, repeat, console, runtimes)
-    speed.show(rows, subject, unit)
-    grown = scaling.measure_growth(subject, repeat, unit, console) if scan else []
-    growth = [scaling.table_of(grown)] if grown else []
-    for table in growth:
+    rows, unit = speed.measure_all(scene, repeat, console, runtimes)
+    speed.show(rows, scene, unit)
+    scan_costs = scaling.measure_scans(scene, repeat, unit, console) if scan else []
+    scans = [scaling.table_of(scan_costs)] if scan_costs else []
+    for table in scans:
         table.show()
     if out is not None:
-        speed.write(out, rows, subject, unit, repeat, growth)
+        speed.write(out, rows, scene, unit, repeat, scans)
 
 
-def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:
+def from_files(image: Path, depth: Path | None, how: RenderSettings) -> BenchScene:
     """An image and its depth from files; alpha is left out.
 
     Args:
@@ -178,10 +178,10 @@ def from_files(image: Path, depth: Path | None, how: RenderSettings) -> Subject:
     values, _ = resolve_holes(values, str(depth or image), how.fill)
     light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
     if how.depth_kind == "coc":
-        return Subject(image.name, light, values, "blur as given")
+        return BenchScene(image.name, light, values, "blur as given")
     focus = "focus as stated"
     if how.focus is None:
         focus, how = "focus at the median depth", dataclasses.replace(how, focus=[(0, float(values.median()))])
     camera, remarks = how.camera(picture.metadata, light.shape[-1], 0)
     words = f"{camera!r}; {', '.join([focus, *remarks])}"
-    return Subject(image.name, light, camera.coc_px(values, light.shape[-1]), words)
+    return BenchScene(image.name, light, camera.coc_px(values, light.shape[-1]), words)

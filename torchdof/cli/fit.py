@@ -80,17 +80,17 @@ def fit(
         if plots is not None:
             _draw_table(table, plots, output.stem, console)
         return
-    sets = read_captures(str(captures), dots=None if dots == "manifest" else dots)
-    for i, one in enumerate(sets):
-        target = output if len(sets) == 1 else output.with_name(f"{output.stem}_{i:02d}.json")
-        if len(sets) > 1:
-            console.print(f"dot {i} at {one.notes['position_px']} px from the centre")
+    capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots)
+    for i, capture_set in enumerate(capture_sets):
+        target = output if len(capture_sets) == 1 else output.with_name(f"{output.stem}_{i:02d}.json")
+        if len(capture_sets) > 1:
+            console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
-        result, doubts = _fit_with_progress(one, family, accuracy_db, command, console)
-        _summary(one, result, doubts, console)
+        result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, console)
+        _summary(capture_set, result, messages, console)
         _write(result.table, target, console)
         if plots is not None:
-            _draw_fits(one, result, plots, target.stem, console)
+            _draw_fits(capture_set, result, plots, target.stem, console)
             _draw_table(result.table, plots, target.stem, console)
 
 
@@ -103,14 +103,14 @@ def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Cons
 
 
 def _fit_with_progress(
-    one: Captures, family: str, accuracy_db: float, command: str, console: Console
+    captures: Captures, family: str, accuracy_db: float, command: str, console: Console
 ) -> tuple[TableFit, list[str]]:
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with warnings.catch_warnings(record=True) as caught, Progress(*columns, console=console, transient=True) as bar:
         warnings.simplefilter("always", FitWarning)
         job = bar.add_task("fitting", total=None)
         result = fit_captures(
-            one,
+            captures,
             family,
             accuracy_db=accuracy_db,
             progress=lambda done, total, what: bar.update(job, completed=done, total=total, description=what),
@@ -120,14 +120,15 @@ def _fit_with_progress(
     return result, list(dict.fromkeys(str(w.message) for w in caught))
 
 
-def _summary(one: Captures, result: TableFit, doubts: list[str], console: Console) -> None:
+def _summary(captures: Captures, result: TableFit, messages: list[str], console: Console) -> None:
     shown = Table(
-        title=f"{one.name or 'captures'}: {result.table.family}, focus {one.focus_m:g} m", title_justify="left"
+        title=f"{captures.name or 'captures'}: {result.table.family}, focus {captures.focus_m:g} m",
+        title_justify="left",
     )
     names = [n for n in result.fits[0].params if n != "values"]
     for column in ("distance m", "coc px", *names, "residual %", "x noise", "magnification"):
         shown.add_column(column, justify="right")
-    for pair, fitted, coc in zip(one, result.fits, result.coc_px, strict=True):
+    for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True):
         values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
         ratio = fitted.residual_over_noise
         shown.add_row(
@@ -141,8 +142,8 @@ def _summary(one: Captures, result: TableFit, doubts: list[str], console: Consol
         + ("from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"),
         highlight=False,
     )
-    for doubt in doubts:
-        console.print(f"warning: {doubt}", style="yellow", markup=False, highlight=False)
+    for message in messages:
+        console.print(f"warning: {message}", style="yellow", markup=False, highlight=False)
 
 
 def _lens_summary(table: BlurTable, console: Console) -> None:
@@ -164,10 +165,10 @@ def _write(table: BlurTable, target: Path, console: Console) -> None:
     console.print(f"{target}: {table!r}", markup=False, highlight=False)
 
 
-def _draw_fits(one: Captures, result: TableFit, folder: Path, stem: str, console: Console) -> None:
+def _draw_fits(captures: Captures, result: TableFit, folder: Path, stem: str, console: Console) -> None:
     from torchdof.fit.plots import picture_of_fit
 
-    for pair, fitted in zip(one, result.fits, strict=True):
+    for pair, fitted in zip(captures, result.fits, strict=True):
         target = folder / f"{stem}_{pair.distance_m * 1000:.0f}mm.png"
         picture_of_fit(fitted).savefig(target)
         console.print(str(target), markup=False, highlight=False)

@@ -15,7 +15,6 @@ from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
 from ..optics.blur_table import BlurTable
-from ..optics.camera import Camera
 from ..options import Options
 from ..validation import image_and_map
 from .settings import RenderSettings
@@ -64,7 +63,10 @@ def render_frame(
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
-        parts.append(_describe(camera))
+        parts.append(
+            f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
+            f"{camera.sensor_width_mm:.4g} mm"
+        )
     parts.append(f"blur radius up to {float(coc_px.abs().max()):.1f} px")
     pixels = picture.pixels.to(settings.device)
     if settings.show_focus:
@@ -72,7 +74,10 @@ def render_frame(
         parts.append("focus shown: near orange, sharp green, far blue")
         picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
     else:
-        table = _with_alpha(settings.table) if picture.has_alpha else settings.table
+        table = settings.table
+        if picture.has_alpha and table.channels > 1:  # alpha is blurred as green is
+            params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
+            table = BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
         options = Options(table, settings.tolerance, settings.occlusion, method=settings.method).arguments()
         with torch.no_grad():
             if camera is None:
@@ -114,8 +119,8 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
     colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
     grey = colour.mean(dim=1, keepdim=True)
     tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
-    which = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
-    tint = tints[which[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
+    zone = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
+    tint = tints[zone[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
     tinted = 0.35 * colour + 0.65 * grey * tint / tint.mean(dim=1, keepdim=True)
     return torch.cat([tinted, alpha], dim=1)
 
@@ -155,16 +160,3 @@ def _depth(
         fov_x_deg=fov_x_deg,
     )
     return resolve_holes(result, name, settings.fill)
-
-
-def _with_alpha(table: BlurTable) -> BlurTable:
-    """A table that blurs colours differently blurs alpha like green."""
-    if table.channels == 1:
-        return table
-    params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
-    return BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
-
-
-def _describe(camera: Camera) -> str:
-    lens = f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm"
-    return f"{lens} on {camera.sensor_width_mm:.4g} mm"

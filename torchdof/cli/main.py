@@ -36,8 +36,8 @@ class _Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command itself, for which its module is imported."""
-        name, _, rest = super().resolve_command(ctx, args)
-        return name, _imported(str(name)), rest
+        name, _, remaining = super().resolve_command(ctx, args)
+        return name, _imported(str(name)), remaining
 
     def invoke(self, ctx: Any) -> Any:
         with told_in_one_sentence():

@@ -122,11 +122,11 @@ class RenderSettings:
             return Camera.from_fov(self.fov_x_deg, radius_m, focus_m), remarks
         lens: dict[str, float] = {}
         for name, assumed in _ASSUMED.items():
-            said = getattr(self, name)
-            lens[name] = facts.get(name, assumed) if said is None else said
-            if said is None:
-                plain = name.rsplit("_", 1)[0].replace("_", " ") if name != "f_number" else "f-number"
-                remarks.append(f"{plain} {'from the file' if name in facts else 'assumed'}")
+            stated = getattr(self, name)
+            lens[name] = facts.get(name, assumed) if stated is None else stated
+            if stated is None:
+                words = name.rsplit("_", 1)[0].replace("_", " ") if name != "f_number" else "f-number"
+                remarks.append(f"{words} {'from the file' if name in facts else 'assumed'}")
         return Camera(lens["focal_length_mm"], lens["f_number"], focus_m, lens["sensor_width_mm"]), remarks
 
 

@@ -83,10 +83,10 @@ def resolve_holes(depth: Tensor, name: str, fill: Literal["nearest", "far"] | fl
 
 def _first_along(depth: Tensor, dim: int, back: bool) -> Tensor:
     """The last value that is not NaN at or before each place along a dimension; NaN where there is none."""
-    seen = depth.flip(dim) if back else depth
-    place = torch.arange(seen.shape[dim]).reshape([-1 if d == seen.ndim + dim else 1 for d in range(seen.ndim)])
-    last = torch.where(seen.isnan(), -1, place).cummax(dim=dim).values
-    values = torch.where(last >= 0, seen.gather(dim, last.clamp(min=0)), torch.nan)
+    line = depth.flip(dim) if back else depth
+    place = torch.arange(line.shape[dim]).reshape([-1 if d == line.ndim + dim else 1 for d in range(line.ndim)])
+    last = torch.where(line.isnan(), -1, place).cummax(dim=dim).values
+    values = torch.where(last >= 0, line.gather(dim, last.clamp(min=0)), torch.nan)
     return values.flip(dim) if back else values
 
 
@@ -106,10 +106,10 @@ def _nearest(depth: Tensor) -> Tensor:
         for dy in (-step, 0, step):
             for dx in (-step, 0, step):
                 inside = (y + dy >= 0) & (y + dy < height) & (x + dx >= 0) & (x + dx < width)
-                other = seed[(y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)]
-                other = torch.where(inside, other, -1)
-                distance = _squared_distance(other, y, x, width)
-                best = torch.where(distance < best_distance, other, best)
+                neighbour = seed[(y + dy).clamp(0, height - 1), (x + dx).clamp(0, width - 1)]
+                neighbour = torch.where(inside, neighbour, -1)
+                distance = _squared_distance(neighbour, y, x, width)
+                best = torch.where(distance < best_distance, neighbour, best)
                 best_distance = torch.minimum(best_distance, distance)
         seed[y, x] = best
     return depth.flatten()[seed]

@@ -37,7 +37,7 @@ class Part:
         names: Names of the channels.
         values: ``[H, W, C]``.
         samples: What each channel was stored as: "8", "16", "half" or "float".
-        one: The number that stands for 1.0: 255, 65535 or 1.
+        white: The number that stands for 1.0: 255, 65535 or 1.
         straight_alpha: Whether colour is not multiplied by alpha yet.
         metadata: Name -> (OpenImageIO type, value).
         window: x, y, full x, full y, full width, full height.
@@ -47,7 +47,7 @@ class Part:
     names: tuple[str, ...]
     values: np.ndarray
     samples: tuple[PixelType, ...]
-    one: float = 1.0
+    white: float = 1.0
     straight_alpha: bool = False
     metadata: dict[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None
@@ -120,7 +120,7 @@ def _read_every_part(path: Path) -> list[Part]:
                     names=names,
                     values=values.reshape(spec.height, spec.width, len(names)),
                     samples=tuple(_SAMPLES.get(f, "16" if integers else "float") for f in formats),
-                    one=float(np.iinfo(values.dtype).max) if integers and not is_exr else 1.0,
+                    white=float(np.iinfo(values.dtype).max) if integers and not is_exr else 1.0,
                     straight_alpha=bool(spec.get_int_attribute("oiio:UnassociatedAlpha")),
                     metadata=kept_metadata(spec.extra_attribs),
                     window=(spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height),

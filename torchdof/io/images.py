@@ -102,21 +102,21 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    stored = parts[part]
-    array = stored.values[..., indices].astype(np.float32)
+    source = parts[part]
+    array = source.values[..., indices].astype(np.float32)
     if not np.isfinite(array).all():
         bad = int((~np.isfinite(array)).any(axis=-1).sum())
         raise ValueError(f"{path}: {bad} pixels are not finite (NaN or inf); repair them before blurring spreads them")
-    sample: PixelType = "half" if all(stored.samples[k] == "half" for k in indices) else stored.samples[indices[0]]
+    sample: PixelType = "half" if all(source.samples[k] == "half" for k in indices) else source.samples[indices[0]]
     transfer = transfer or default_transfer(sample)
     pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]  # [H, W, C] -> [1, C, H, W]
-    pixels = decode(pixels / stored.one, transfer, names[-1] == "A", stored.straight_alpha)
+    pixels = decode(pixels / source.white, transfer, names[-1] == "A", source.straight_alpha)
     depth = None
-    same_size = [p for p in parts if p.values.shape[:2] == stored.values.shape[:2]]
-    where = depth_channel([(p.label, p.names) for p in same_size])
-    if where is not None:
-        depth = torch.from_numpy(same_size[where[0]].values[..., where[1]].astype(np.float32))[None, None]
-    return Picture(pixels, names, depth, stored.metadata, sample, transfer, stored.window)
+    same_size = [p for p in parts if p.values.shape[:2] == source.values.shape[:2]]
+    depth_place = depth_channel([(p.label, p.names) for p in same_size])
+    if depth_place is not None:
+        depth = torch.from_numpy(same_size[depth_place[0]].values[..., depth_place[1]].astype(np.float32))[None, None]
+    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window)
 
 
 def write_image(
@@ -220,18 +220,18 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
     if path.suffix.lower() in (".npy", ".npz"):
         return torch.from_numpy(read_array(path, channel).astype(np.float32))[None, None]
     parts = read_parts(path)
-    every = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
-    listing = ", ".join(name for _, name, _ in every)
+    planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
+    listing = ", ".join(name for _, name, _ in planes)
     if channel is not None:
-        chosen = [plane for label, name, plane in every if channel in (name, f"{label}.{name}")]
+        chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
         if not chosen:
             raise ValueError(f"{path}: no channel {channel!r}; it has {listing}")
         return torch.from_numpy(chosen[0].astype(np.float32))[None, None]
-    where = depth_channel([(p.label, p.names) for p in parts])
-    if where is not None:
-        plane = parts[where[0]].values[..., where[1]]
-    elif all(np.array_equal(values, every[0][2]) for _, name, values in every if name != "A"):
-        plane = every[0][2]
+    depth_place = depth_channel([(p.label, p.names) for p in parts])
+    if depth_place is not None:
+        plane = parts[depth_place[0]].values[..., depth_place[1]]
+    elif all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
+        plane = planes[0][2]
     else:
         raise ValueError(f"{path}: which of the channels {listing} is depth? name it (--depth-channel)")
     return torch.from_numpy(plane.astype(np.float32))[None, None]
@@ -249,7 +249,7 @@ def _is_whole(path: Path) -> bool:
 
 
 def _reserve(path: Path, size: int) -> None:
-    """Asks for the room beforehand, because libjpeg ends the process when the disk is full."""
+    """Reserves the bytes on the disk, because libjpeg ends the process when that is full."""
     if hasattr(os, "posix_fallocate"):
         with path.open("wb") as file:
             os.posix_fallocate(file.fileno(), 0, size)

@@ -75,9 +75,9 @@ def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int) -> dict[st
             facts["sensor_width_mm"] = width_mm
     per_unit = number("Exif:FocalPlaneXResolution")
     if per_unit is not None:
-        taken = number("Exif:PixelXDimension") or width
+        original_width = number("Exif:PixelXDimension") or width
         unit = _MM_PER_UNIT.get(number("Exif:FocalPlaneResolutionUnit") or 2, 25.4)
-        by_plane = taken / per_unit * unit
+        by_plane = original_width / per_unit * unit
         if 0 < by_plane < math.inf and abs(by_plane / facts.get("sensor_width_mm", by_plane) - 1.0) < 0.25:
             facts["sensor_width_mm"] = by_plane
     return facts

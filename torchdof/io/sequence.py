@@ -129,7 +129,7 @@ def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
         return keys[0][1]
     for (before, near), (after, far) in zip(keys, keys[1:], strict=False):
         if frame <= after:
-            share = (frame - before) / (after - before)
-            dioptres = (1.0 - share) / near + share / far
+            fraction = (frame - before) / (after - before)
+            dioptres = (1.0 - fraction) / near + fraction / far
             return far if frame == after else 1.0 / dioptres if dioptres > 0 else math.inf
     return keys[-1][1]

@@ -192,16 +192,16 @@ class BlurTable:
         kernels = psf.pixel_kernels(self.family, params, size, window).transpose(0, 1)
         if self.family == "disc" and self.reach_px(0.5, width) <= 0.5 + 1e-9:
             return kernels
-        share = (2 * coc_px.to(torch.float64).abs() - 1).clamp(0.0, 1.0)[:, None, None, None]
+        fade = (2 * coc_px.to(torch.float64).abs() - 1).clamp(0.0, 1.0)[:, None, None, None]
         centre = torch.zeros_like(kernels)
         centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
-        return torch.lerp(centre, kernels, share)
+        return torch.lerp(centre, kernels, fade)
 
     def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
         number("coc_px", coc_px, unit="pixels")
-        both = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
-        return psf.support(self.family, self.params(both, width))
+        signed = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
+        return psf.support(self.family, self.params(signed, width))
 
     def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
         """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
@@ -264,14 +264,14 @@ class BlurTable:
 
     def to_dict(self) -> dict[str, Any]:
         """The table as JSON-like data, the inverse of :meth:`from_dict`."""
-        shared = self.channels == 1
+        one_for_all = self.channels == 1
         fields = {
             "name": self.name,
             "family": self.family,
             "unit": self.unit,
             "sensor_width_mm": self.sensor_width_mm,
             "coc": self.coc.tolist(),
-            "params": {k: (v[0] if shared else v).tolist() for k, v in self._params.items()},
+            "params": {k: (v[0] if one_for_all else v).tolist() for k, v in self._params.items()},
             "strength": None if self.strength is None else self.strength.tolist(),
             "residual": None if self.residual is None else self.residual.tolist(),
             "provenance": self.provenance,
@@ -338,28 +338,28 @@ class BlurTable:
         if not bool((self.coc * sign > 0).any()):
             return None
         order = torch.argsort(self.coc[chosen].abs())
-        where = self.coc[chosen].abs()[order]
+        distances = self.coc[chosen].abs()[order]
         nodes = {k: v[:, chosen][:, order] for k, v in self._params.items()}
-        if where[0] > 0:
-            where = torch.cat([where.new_zeros(1), where])
+        if distances[0] > 0:
+            distances = torch.cat([distances.new_zeros(1), distances])
             for name, value in nodes.items():
                 first = torch.zeros_like(value[:, :1]) if name in psf.LENGTHS else value[:, :1]
                 nodes[name] = torch.cat([first, value], 1)
-        return where, nodes
+        return distances, nodes
 
     def _side_params(self, sign: int, distance: Tensor) -> dict[str, Tensor]:
         side = self._sides[sign]
         if side is None:
             raise AssertionError("a table has nodes on at least one side")
-        where, nodes = side[0].to(distance.device), {k: v.to(distance.device) for k, v in side[1].items()}
-        upper = torch.searchsorted(where, distance.detach().contiguous()).clamp(1, len(where) - 1)
+        distances, nodes = side[0].to(distance.device), {k: v.to(distance.device) for k, v in side[1].items()}
+        upper = torch.searchsorted(distances, distance.detach().contiguous()).clamp(1, len(distances) - 1)
         lower = upper - 1
-        part = ((distance - where[lower]) / (where[upper] - where[lower])).clamp(max=1.0)
-        beyond = (distance / where[-1]).clamp_min(1.0)
+        fraction = ((distance - distances[lower]) / (distances[upper] - distances[lower])).clamp(max=1.0)
+        beyond = (distance / distances[-1]).clamp_min(1.0)
         mixed = {}
         for name, value in nodes.items():
-            share = part.unsqueeze(-1) if name == "values" else part
-            mixed[name] = torch.lerp(value[:, lower], value[:, upper], share)
+            weight = fraction.unsqueeze(-1) if name == "values" else fraction
+            mixed[name] = torch.lerp(value[:, lower], value[:, upper], weight)
             if name in psf.LENGTHS:
                 mixed[name] = mixed[name] * beyond
         return mixed

@@ -90,7 +90,10 @@ class Camera:
         _check_number("aperture_radius_m", aperture_radius_m)
         if not is_traced() and _largest(fov_x_deg) >= 180.0:
             raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}")
-        half = torch.tan(torch.deg2rad(fov_x_deg) / 2) if isinstance(fov_x_deg, Tensor) else _tan_half_deg(fov_x_deg)
+        if isinstance(fov_x_deg, Tensor):
+            half: Number = torch.tan(torch.deg2rad(fov_x_deg) / 2)
+        else:
+            half = math.tan(math.radians(fov_x_deg) / 2)
         if not isinstance(half, Tensor) and half < 1e-300:
             raise ValueError(f"fov_x_deg must be in (0, 180) degrees, got {_show(fov_x_deg)}, which is none")
         focal_length_mm = 18.0 / half
@@ -234,10 +237,6 @@ class Camera:
         return f"Camera({', '.join(numbers)})"
 
 
-def _tan_half_deg(degrees: float) -> float:
-    return math.tan(math.radians(degrees) / 2)
-
-
 def _largest(value: Number) -> float:
     return float(value.detach().max()) if isinstance(value, Tensor) else float(value)
 
@@ -252,7 +251,7 @@ def _show(value: Number) -> str:
 def _check_number(name: str, value: Number) -> None:
     if isinstance(value, Tensor):
         if value.ndim > 1 or not value.is_floating_point() or value.layout != torch.strided or not value.numel():
-            raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {_describe(value)}")
+            raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")
         if is_traced():
             return
         if value.device.type == "meta":
@@ -267,10 +266,6 @@ def _check_number(name: str, value: Number) -> None:
     # compared, not asked for: in compiled code a number that differs between two cameras is a variable
     if not good or (name != "focus_m" and (_largest(value) if isinstance(value, Tensor) else value) == math.inf):
         raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {_show(value)}")
-
-
-def _describe(value: Tensor) -> str:
-    return f"{value.dtype} tensor of shape {list(value.shape)}"
 
 
 def _column(value: Number, like: Tensor) -> Tensor:

@@ -160,14 +160,14 @@ def pixel_kernels(
     Raises:
         ValueError: If the family, a parameter or the size is not as described.
     """
-    given = _checked(family, params)
+    checked = _checked(family, params)
     if window is None:
-        whole = part = width_of(family, given, size) // 2
+        whole = part = width_of(family, checked, size) // 2
     else:
-        whole = half_width(support(family, given)) if size is None else width_of(family, given, size) // 2
-        part = min(whole, width_of(family, given, window) // 2)
+        whole = half_width(support(family, checked)) if size is None else width_of(family, checked, size) // 2
+        part = min(whole, width_of(family, checked, window) // 2)
     half = whole if whole <= _ALWAYS_WHOLE else part
-    lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in given.items()}
+    lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in checked.items()}
     if family == "gaussian":
         quadrant = _gaussian_quadrant(lengths["sigma"], half)
     elif family == "disc":
@@ -198,23 +198,23 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
     Raises:
         ValueError: If the family or a parameter is not as described.
     """
-    given = {k: v if k == "values" else v.unsqueeze(-1) for k, v in _checked(family, params).items()}
+    checked = {k: v if k == "values" else v.unsqueeze(-1) for k, v in _checked(family, params).items()}
     r = real_tensor("r", r, "[n]").to(torch.float64)
     if family == "gaussian":
-        return torch.exp(-0.5 * (r / given["sigma"]) ** 2)
+        return torch.exp(-0.5 * (r / checked["sigma"]) ** 2)
     if family == "ring":
-        return torch.exp(-0.5 * ((r - given["r_c"]) / given["sigma"]) ** 2)
+        return torch.exp(-0.5 * ((r - checked["r_c"]) / checked["sigma"]) ** 2)
     if family == "disc":
-        return (r <= given["radius"]).to(torch.float64)
+        return (r <= checked["radius"]).to(torch.float64)
     if family == "softm":
-        edge = 0.5 * torch.erfc((r - given["radius"]) / (math.sqrt(2) * given["sigma"].clamp_min(1e-12)))
-        return edge * _tilt(r, given)
-    values, radius = given["values"], given["radius"]
-    where = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
-    low = where.floor().long().clamp(max=values.shape[-1] - 2)
+        edge = 0.5 * torch.erfc((r - checked["radius"]) / (math.sqrt(2) * checked["sigma"].clamp_min(1e-12)))
+        return edge * _tilt(r, checked)
+    values, radius = checked["values"], checked["radius"]
+    place = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
+    low = place.floor().long().clamp(max=values.shape[-1] - 2)
     batch = torch.broadcast_shapes(values.shape[:-1], low.shape[:-1])
     values, low = values.expand(*batch, -1), low.expand(*batch, -1)
-    mixed = torch.lerp(values.gather(-1, low), values.gather(-1, low + 1), where - low)
+    mixed = torch.lerp(values.gather(-1, low), values.gather(-1, low + 1), place - low)
     return torch.where(r <= radius, mixed, 0.0)
 
 
@@ -252,28 +252,28 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
         got = ", ".join(map(str, params)) if isinstance(params, Mapping) else show(params)
         raise ValueError(f"{family} takes the parameters {', '.join(FAMILIES[family])}, got {got}")
     device = next((p.device for p in params.values() if isinstance(p, Tensor)), torch.device("cpu"))
-    given = {k: _parameter(k, v, device) for k, v in params.items()}
-    for name, value in given.items():
+    checked = {k: _parameter(k, v, device) for k, v in params.items()}
+    for name, value in checked.items():
         low = -1.0 if name == "b" else 0.0
         if not bool((torch.isfinite(value.detach()) & (value.detach() >= low)).all()):
             raise ValueError(f"{name} of {family} must be finite and >= {low:g}, got {value.detach().flatten()[:4]}")
-    if family == "radial" and (given["values"].ndim < 1 or given["values"].shape[-1] < 2):
-        raise ValueError(f"values must be [..., P] with P >= 2, got {list(given['values'].shape)}")
-    shapes = {k: tuple(v.shape[:-1] if k == "values" else v.shape) for k, v in given.items()}
+    if family == "radial" and (checked["values"].ndim < 1 or checked["values"].shape[-1] < 2):
+        raise ValueError(f"values must be [..., P] with P >= 2, got {list(checked['values'].shape)}")
+    shapes = {k: tuple(v.shape[:-1] if k == "values" else v.shape) for k, v in checked.items()}
     try:
         torch.broadcast_shapes(*shapes.values())
     except RuntimeError:
-        told = ", ".join(f"{k} {list(v)}" for k, v in shapes.items())
-        raise ValueError(f"parameters of {family} must broadcast against each other, got {told}") from None
-    return given
+        listed = ", ".join(f"{k} {list(v)}" for k, v in shapes.items())
+        raise ValueError(f"parameters of {family} must broadcast against each other, got {listed}") from None
+    return checked
 
 
 def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
     if isinstance(value, Tensor):
-        given = real_tensor(name, value.double() if value.dtype in _INTEGERS else value, "[...]")
-        if not given.numel():
+        tensor = real_tensor(name, value.double() if value.dtype in _INTEGERS else value, "[...]")
+        if not tensor.numel():
             raise ValueError(f"{name} must hold at least one number, got {show(value)}")
-        return given.to(device, torch.float64)
+        return tensor.to(device, torch.float64)
     if name == "values":
         raise ValueError(f"values must be a tensor [..., P], got {show(value)}")
     plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
@@ -282,18 +282,18 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
     return torch.tensor(value, dtype=torch.float64, device=device)
 
 
-def _reach(family: str, given: Mapping[str, Tensor]) -> Tensor:
+def _reach(family: str, params: Mapping[str, Tensor]) -> Tensor:
     if family == "gaussian":
-        return 5.0 * given["sigma"]
+        return 5.0 * params["sigma"]
     if family == "ring":
-        return given["r_c"] + 5.0 * given["sigma"]
+        return params["r_c"] + 5.0 * params["sigma"]
     if family == "softm":
-        return given["radius"] + 4.5 * given["sigma"]
-    return given["radius"]
+        return params["radius"] + 4.5 * params["sigma"]
+    return params["radius"]
 
 
-def _tilt(r: Tensor, given: Mapping[str, Tensor]) -> Tensor:
-    return (1.0 + given["b"] * (r / given["radius"]) ** given["m"]).clamp_min(0.0)
+def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
+    return (1.0 + params["b"] * (r / params["radius"]) ** params["m"]).clamp_min(0.0)
 
 
 def _gaussian_quadrant(sigma: Tensor, half: int) -> Tensor:
@@ -400,8 +400,8 @@ def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor
     low_y, low_x = (v.flatten()[:, None] for v in torch.meshgrid(low[top:bottom], low, indexing="ij"))
     high_y, high_x = (v.flatten()[:, None] for v in torch.meshgrid(high[top:bottom], high, indexing="ij"))
     nearest, farthest = torch.hypot(low_y, low_x), torch.hypot(high_y, high_x)
-    share = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64)
-    r = nearest + (farthest - nearest) * share
+    fractions = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64)
+    r = nearest + (farthest - nearest) * fractions
     covered = (
         _corner_area(high_x, high_y, r)
         - _corner_area(low_x, high_y, r)

@@ -114,7 +114,7 @@ def _radii(table: BlurTable, channel: int, nodes: Tensor, width: int) -> Tensor:
 def _nearest(points: Tensor, views: Tensor) -> list[list[int]]:
     """For each view the points that are nearer to it than to any other."""
     owner = torch.cat([torch.cdist(part, views).argmin(1) for part in points.split(4096)])
-    mine: list[list[int]] = [[] for _ in range(len(views))]
+    owned: list[list[int]] = [[] for _ in range(len(views))]
     for point, view in enumerate(owner.tolist()):
-        mine[view].append(point)
-    return mine
+        owned[view].append(point)
+    return owned

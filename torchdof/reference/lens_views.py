@@ -20,7 +20,7 @@ from torch import Tensor
 from .. import validation
 from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
-from ..render.matting import split_mixed
+from ..render.matting import matte
 from .lens_samples import LensSamples
 
 __all__ = ["LensViews", "lens_views", "lens_views_by_coc"]
@@ -80,8 +80,8 @@ def lens_views(
             ``r^2`` of them.
         surfaces: Further surfaces, such as what is hidden: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
             and depth like ``depth``.
-        mixed_edges: Split pixels that hold two surfaces (:func:`torchdof.render.matting.split_mixed`); None: where no
-            surfaces are given, for beside those the split's guess does more harm than good.
+        mixed_edges: Whether pixels that hold two surfaces are told apart (:func:`torchdof.render.matting.matte`); None:
+            where no surfaces are given, for beside those the matte's guess does more harm than good.
 
     Returns:
         Image and the known share, in the image's dtype; pixels that no view knows are those of ``image``.
@@ -142,10 +142,10 @@ def lens_views_by_coc(
 
     images, shares = [], []
     for item in range(batch):
-        seen = (image[item : item + 1].float(), coc_px.expand(batch, -1, -1, -1)[item : item + 1].float())
-        stack = [(*seen, torch.ones_like(seen[1]))]
+        shown = (image[item : item + 1].float(), coc_px.expand(batch, -1, -1, -1)[item : item + 1].float())
+        stack = [(*shown, torch.ones_like(shown[1]))]
         if mixed_edges or (mixed_edges is None and not surfaces):
-            stack = _split(*seen)
+            stack = _matted(*shown)
         for rgba, coc in surfaces:
             cover = rgba[item : item + 1, -1:].float().clamp(0.0, 1.0)
             colour = rgba[item : item + 1, :-1].float() / cover.clamp_min(1e-6)
@@ -155,20 +155,20 @@ def lens_views_by_coc(
         for c, group in enumerate(groups):
             lens = LensSamples(table, c, views, [coc for _, coc, _ in stack], width)
             parts.append(_average([(light[:, group], coc, cover) for light, coc, cover in stack], lens, height, width))
-        known = torch.stack([share for _, share in parts]).amin(0)
+        known = torch.stack([known_share for _, known_share in parts]).amin(0)
         average = torch.cat([light for light, _ in parts], 1)
-        images.append(torch.where(known > 0, average, seen[0]))
+        images.append(torch.where(known > 0, average, shown[0]))
         shares.append(known)
     return LensViews(torch.cat(images).to(image.dtype), torch.cat(shares).to(image.dtype))
 
 
-def _split(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
+def _matted(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Light, coc and cover of the surface in front, and of the one behind it where a pixel holds two."""
-    own, other, other_coc, share = split_mixed(image, coc)
-    mixed = share > 1e-3
+    own, other, other_coc, other_weight = matte(image, coc)
+    mixed = other_weight > 1e-3
     in_front, behind = mixed & (other_coc < coc), mixed & (other_coc >= coc)
     front = torch.where(in_front, other, torch.where(behind, own, image))
-    cover = torch.where(in_front, share, torch.where(behind, 1.0 - share, 1.0))
+    cover = torch.where(in_front, other_weight, torch.where(behind, 1.0 - other_weight, 1.0))
     return [
         (front, torch.where(in_front, other_coc, coc), cover),
         (torch.where(in_front, own, other), torch.where(in_front, coc, other_coc), mixed.to(image.dtype)),
@@ -232,8 +232,8 @@ def _sides(values: Tensor, coc: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """Differences to the neighbour before and to the one after, 0 where that one lies on another surface."""
     step = torch.diff(values, dim=dim)
     step = torch.where(torch.diff(coc, dim=dim).abs() < _SAME_SURFACE_PX, step, 0.0)
-    none = torch.zeros_like(step.narrow(dim, 0, 1))
-    return torch.cat([none, step], dim), torch.cat([step, none], dim)
+    edge = torch.zeros_like(step.narrow(dim, 0, 1))
+    return torch.cat([edge, step], dim), torch.cat([step, edge], dim)
 
 
 def _coc_slope(coc: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ def box_around(weight: Tensor, reach_px: float) -> tuple[slice, slice] | None:
         return None
     box = []
     for dim in (1, 0):
-        at = seen.any(dim).nonzero()[:, 0]
-        first, last = int(at[0]) - math.ceil(reach_px), int(at[-1]) + 1 + math.ceil(reach_px)
+        lines = seen.any(dim).nonzero()[:, 0]
+        first, last = int(lines[0]) - math.ceil(reach_px), int(lines[-1]) + 1 + math.ceil(reach_px)
         box.append(slice(max(0, first // _ALIGN * _ALIGN), min(-(-last // _ALIGN) * _ALIGN, seen.shape[1 - dim])))
     return box[0], box[1]

@@ -70,13 +70,12 @@ def accumulate(
     """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
 
     Not normalised, the plain sum is dark at the frame's border and uneven at depth edges. ``highlights`` is light that
-    was extracted from the layers and splat ray by ray; else arguments are those of :func:`over`.
+    was extracted from the layers and splatted ray by ray; else arguments are those of :func:`over`.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
     """
-    summed = _composite_layers(frame, blurs, scatter, torch.add)
-    summed = summed[..., : frame.size[0], : frame.size[1]]
+    summed = _composite_layers(frame, blurs, scatter, torch.add)[..., : frame.size[0], : frame.size[1]]
     if highlights is not None:
         light, weight = summed.tensor_split((frame.colours,), 1)
         summed = torch.cat([light + highlights, weight], 1)

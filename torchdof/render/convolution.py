@@ -34,8 +34,7 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     half, channels = kernels.shape[-1] // 2, light.shape[1]
     if halo > half:
         spare = halo - half
-        light = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare]
-        halo = half
+        light, halo = light[..., spare : light.shape[-2] - spare, spare : light.shape[-1] - spare], half
     if half == 0:
         return light * kernels[:, 0, 0, None, None]
     if (2 * half + 1) ** 2 > DIRECT_TAPS and not is_traced():

@@ -45,15 +45,15 @@ class _Level:
         the foreground's own colour.
         """
         row, column = (row + 0.5) / self.step - 0.5, (column + 0.5) / self.step - 0.5
-        seen = total = torch.zeros_like(coc_px)
+        summed = total = torch.zeros_like(coc_px)
         corners, down, right = pixels.corners(item, row, column, self.height, self.width)
-        shares = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
-        for corner, share in zip(corners, shares, strict=True):
+        corner_weights = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
+        for corner, corner_weight in zip(corners, corner_weights, strict=True):
             sample = self.flat.index_select(1, corner)
-            weight = share * sample[-1] * (sample[-2] > coc_px + _BEHIND_PX)
-            seen, total = seen + sample[:-1] * weight, total + weight
+            weight = corner_weight * sample[-1] * (sample[-2] > coc_px + _BEHIND_PX)
+            summed, total = summed + sample[:-1] * weight, total + weight
         total = torch.where(total > 1e-4, total, 0.0)
-        return seen / total.clamp_min(1e-4), total
+        return summed / total.clamp_min(1e-4), total
 
 
 def behind_size(size: int, levels: int) -> int:
@@ -66,7 +66,7 @@ def fill_hidden(
     coc_px: Tensor,
     other_light: Tensor,
     other_coc_px: Tensor,
-    share: Tensor,
+    other_weight: Tensor,
     valid: Tensor | None,
     threshold: Tensor,
     levels: int,
@@ -81,11 +81,11 @@ def fill_hidden(
     the levels show, the farthest.
 
     Args:
-        light: Each pixel's own, as :func:`torchdof.render.matting.split_mixed` gives it, ``[B, C, H, W]``.
+        light: Each pixel's own, as :func:`torchdof.render.matting.matte` gives it, ``[B, C, H, W]``.
         coc_px: Its signed coc ``[B, 1, H, W]``.
         other_light: Of mixed pixels' second surface, from there as well, as the next two.
         other_coc_px: ``[B, 1, H, W]``.
-        share: ``[B, 1, H, W]``, 0 where a pixel is not mixed.
+        other_weight: ``[B, 1, H, W]``, 0 where a pixel is not mixed.
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
         threshold: Largest light that is no highlight's, ``[B, 1, H, W]``; a highlight is nowhere else but in its place.
         levels: Levels of the pyramid, from 2; the widest look is ``2 ** levels`` pixels.
@@ -98,12 +98,12 @@ def fill_hidden(
     ends = (0, _continued(width, 2**levels) - width, 0, _continued(height, 2**levels) - height)
 
     # the farther surface of each pixel, dimmed to no highlight
-    is_mixed = (share > 0.05) & (other_coc_px > coc_px)
+    is_mixed = (other_weight > 0.05) & (other_coc_px > coc_px)
     far_coc, far_light = torch.where(is_mixed, other_coc_px, coc_px), torch.where(is_mixed, other_light, light)
     brightest = far_light.amax(1, keepdim=True)
     is_bright = brightest > threshold
     far_light = far_light * torch.where(is_bright, threshold / torch.where(is_bright, brightest, 1.0), 1.0)
-    far_weight = torch.where(is_mixed, share, 1.0 - share)
+    far_weight = torch.where(is_mixed, other_weight, 1.0 - other_weight)
     if valid is not None:
         far_coc, far_weight = torch.where(valid > 0, far_coc, -NEVER_PX), far_weight * valid
     level = (*(functional.pad(t, ends, mode="replicate") for t in (far_light, far_coc, far_weight)),)
@@ -111,34 +111,34 @@ def fill_hidden(
     for _ in range(levels):
         level = _farthest(*level)
         pyramid.append(level)
-    looks = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
+    searched = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
 
     # what coarse levels show behind cells is one level of such cells; and the farthest of all is behind both surfaces
     may_hide = _may_hide(functional.pad(coc_px, ends, mode="replicate"), [far_coc for _, far_coc, _ in pyramid])
-    hides = may_hide[..., :height, :width] & (coc_px.abs() > 0.5) & (share < HIDDEN_WEIGHT)
+    hides = may_hide[..., :height, :width] & (coc_px.abs() > 0.5) & (other_weight < HIDDEN_WEIGHT)
     nearest = -functional.max_pool2d(functional.pad(-coc_px, ends, value=-NEVER_PX), BEHIND_STEP)
     cells = pixels.indices(functional.max_pool2d(functional.pad(hides.to(coc_px.dtype), ends), BEHIND_STEP) > 0)
     item, row, column = pixels.places(cells, nearest.shape[-2], nearest.shape[-1])
     centre = (BEHIND_STEP - 1) / 2
     cell_places = (item, row * BEHIND_STEP + centre, column * BEHIND_STEP + centre, pixels.pick(nearest, cells)[0])
-    total, seen = _look(looks, *cell_places, farthest=True)
+    total, seen = _search(searched, *cell_places, farthest=True)
     shown = pixels.indices(total > 0)
-    behind = pixels.put(looks[_FINE_LEVELS - 1].light, cells[shown], seen[:-1].index_select(1, shown))
+    behind = pixels.put(searched[_FINE_LEVELS - 1].light, cells[shown], seen[:-1].index_select(1, shown))
     if levels > _FINE_LEVELS:
-        total, seen = _look(looks[_FINE_LEVELS:], *cell_places)
+        total, seen = _search(searched[_FINE_LEVELS:], *cell_places)
         values = nearest.new_zeros(nearest.shape[0], len(seen) + 1, *nearest.shape[-2:])
         values = pixels.put(values, cells, torch.cat([seen, total[None]]))
-        looks = [*looks[:_FINE_LEVELS], _Level(values, BEHIND_STEP, None, looks[_FINE_LEVELS].least_px)]
+        searched = [*searched[:_FINE_LEVELS], _Level(values, BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)]
 
     # each pixel behind which these levels show something gets it as its second sample
     hiding = pixels.indices(hides)
-    total, seen = _look(looks, *pixels.places(hiding, height, width), pixels.pick(coc_px, hiding)[0])
+    total, seen = _search(searched, *pixels.places(hiding, height, width), pixels.pick(coc_px, hiding)[0])
     shown = pixels.indices(total > 0)
     hiding, seen = hiding[shown], seen.index_select(1, shown)
     return (
         pixels.put(other_light, hiding, seen[:-1]),
         pixels.put(other_coc_px, hiding, seen[-1]),
-        pixels.put(share, hiding, torch.full_like(seen[-1], HIDDEN_WEIGHT)),
+        pixels.put(other_weight, hiding, torch.full_like(seen[-1], HIDDEN_WEIGHT)),
         behind,
     )
 
@@ -171,7 +171,7 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
     return functional.interpolate(may_hide.to(near.dtype), scale_factor=float(2**coarsest), mode="nearest") > 0
 
 
-def _look(
+def _search(
     levels: list[_Level], item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
     """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[C + 1, P]``.

@@ -1,11 +1,11 @@
-"""Highlights: light far brighter than what is around it, traced ray by ray to the crisp discs that a lens makes of it.
+"""Highlights: light far brighter than what is around it, splatted by rays to the crisp discs that a lens makes of it.
 
 Layers know how much of the lens a blurred foreground covers, not which part. For other light that is enough; in the
 disc of a highlight everybody sees it, for a post in front of a lamp draws a crisp line through its disc. A ray from a
 pixel at ``p`` with coc ``c`` through the point ``u`` of the lens lands at ``p + c u``, and it passes a nearer surface
 with coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sharp image itself tells which rays pass.
 
-Highlights are few. What exceeds the threshold of what is around it is extracted from the layers, and splat again as
+Highlights are few. What exceeds the threshold of what is around it is extracted from the layers, and splatted as
 rays: where something nearer could stand in the way, where its layer is too coarse for a crisp edge, and at the frame's
 border, where layers make up for the light that is not seen with the light that is. Without occlusion nothing stands in
 the way, and the rays' light is divided by the same sum of weights as the layers'.
@@ -24,7 +24,7 @@ from . import pixels
 from .plan import kernels_for
 from .surfaces import Surface
 
-__all__ = ["FACTOR", "Rays", "extract", "splat", "threshold"]
+__all__ = ["FACTOR", "Highlights", "extract", "splat", "threshold"]
 
 FACTOR = 8.0
 """Light above so many times what is around it is a highlight's."""
@@ -33,10 +33,10 @@ _CELL = 32  # pixels over which the threshold is decided
 _COARSE_CELL = 8  # pixels in which nearer surfaces are looked for
 _NEARER_PX = 1.5  # difference in coc from which on a surface is another one, in front
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
-_TAPS = 2**21  # rays splat together
+_TAPS = 2**21  # rays splatted together
 
 
-class Rays(NamedTuple):
+class Highlights(NamedTuple):
     """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.render.pixels`), and their coc."""
 
     pixels: Tensor
@@ -64,17 +64,19 @@ def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
     return level[..., :height, :width]
 
 
-def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px: float) -> tuple[Surface, Rays | None]:
-    """Take out of a surface of an image the light above a limit that needs to be traced.
+def extract(
+    surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px: float
+) -> tuple[Surface, Highlights | None]:
+    """Take the light above a limit out of a surface of an image, where it needs to be splatted ray by ray.
 
     Args:
         surface: Of an image.
         limit: As :func:`threshold` gives it, ``[B, 1, H, W]``.
         nearest_px: Coc of what each pixel shows, ``[B, 1, H, W]``; None if nothing hides anything.
-        crisp_px: Blurs from this radius on lose their edge in coarse layers, so they are traced in any case.
+        crisp_px: Blurs from this radius on lose their edge in coarse layers, so they are splatted in any case.
 
     Returns:
-        The surface with what is left of its light, and the rays if there are any.
+        The surface with what is left of its light, and the highlights if there are any.
     """
     light, coc_px, weight = surface
     brightest = light.amax(1, keepdim=True)
@@ -83,7 +85,7 @@ def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px
     coc = pixels.pick(coc_px.detach(), bright)[0]
     needed = coc.abs() >= crisp_px
     if nearest_px is not None and len(bright):
-        needed |= _need_tracing(bright, coc, nearest_px)
+        needed |= _need_splats(bright, coc, nearest_px)
     bright = bright[needed & (coc.abs() > 1.0)]
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
     order = torch.argsort(peak.detach(), descending=True)
@@ -97,11 +99,11 @@ def extract(surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px
     # from nothing at a radius of 1 px to all of it at 2
     excess = pixels.pick(light, bright) * ((1.0 - most / peak) * (coc.abs() - 1.0).clamp(max=1.0))
     left = pixels.put(light, bright, pixels.pick(light, bright) - excess)
-    rays = Rays(bright, excess if weight is None else excess * pixels.pick(weight, bright), coc)
-    return surface._replace(light=left), rays
+    highlights = Highlights(bright, excess if weight is None else excess * pixels.pick(weight, bright), coc)
+    return surface._replace(light=left), highlights
 
 
-def _need_tracing(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
+def _need_splats(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     """Whether a ray of a pixel could meet a nearer surface, or land where layers would scale it; none too few.
 
     They do so beside the border and beside what is nearer. Wider and wider windows are looked at, in cells: a surface
@@ -125,7 +127,7 @@ def _need_tracing(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     return needed
 
 
-def splat(rays: Sequence[Rays], coc_px: Tensor, table: BlurTable, occlusion: bool = True) -> Tensor:
+def splat(rays: Sequence[Highlights], coc_px: Tensor, table: BlurTable, occlusion: bool = True) -> Tensor:
     """Scatter highlights to ``[B, C, H, W]``, each ray to where it lands unless a nearer surface is in its way.
 
     What is in the way is told by the coc that each pixel shows, ``[B, 1, H, W]``; without occlusion all rays pass.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from . import pixels
 
-__all__ = ["NEVER_PX", "split_mixed"]
+__all__ = ["NEVER_PX", "matte"]
 
 NEVER_PX = 1e9
 """A coc that no pixel has."""
@@ -22,19 +22,19 @@ NEVER_PX = 1e9
 _EDGE_PX = 1.0  # difference in coc of neighbours from which on they may be two surfaces
 _REACH = 2  # pixels around a mixed pixel that tell what its two surfaces look like
 _UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
-_TRUST = 4.0  # how much local contrast discredits a split
-_DOUBT = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
-_LEAST_SHARE = 0.1  # a smaller share is more likely texture than a second surface
+_TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
+_TEXTURE = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
+_LEAST_WEIGHT = 0.1  # a smaller weight is more likely texture than a second surface
 
 
-def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Split pixels at depth edges between the surface they are attributed to and the one across the edge.
+def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Matting of pixels at depth edges: the surface they are attributed to, and the one across the edge.
 
-    With F and B the light of the two surfaces near the pixel, the share ``a`` of F in a pixel is the least-squares
+    With F and B the light of the two surfaces near the pixel, the weight ``a`` of F in a pixel is the least-squares
     solution of ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on
-    that surface) and drawn towards no split at all where the contrast of the two is small against the texture of each,
-    or where the texture of the pixel's own surface explains it and moves little light. The light of the two parts sums
-    to the pixel's.
+    that surface) and drawn towards one surface alone where the contrast of the two is small against their texture, or
+    where the texture of the pixel's own surface explains it and moves little light. The light of the two parts sums to
+    the pixel's.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -42,8 +42,8 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
 
     Returns:
-        ``(own, other, other_coc_px, share)``: light of the pixel's own surface and of the other ``[B, C, H, W]``, the
-        other's coc and the share of the pixel that it covers, in [0, 1/2], ``[B, 1, H, W]``; 0 away from edges.
+        ``(own, other, other_coc_px, other_weight)``: light of the pixel's own surface and the other ``[B, C, H, W]``,
+        the other's coc and the part of the pixel that it covers, in [0, 1/2], ``[B, 1, H, W]``; 0 away from edges.
     """
     # pixels beside another surface
     known = None if valid is None else valid > 0
@@ -87,30 +87,30 @@ def split_mixed(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> t
     fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
     misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
     trust = strength / (strength + 4e-4 + _TRUST * (back_variance + front_variance + misfit))
-    raw = torch.where(is_near, 1.0 - fitted, fitted)  # share of the other surface
-    # what lies behind is seen sharp where it is nearer to focus, and so is every error of its split
+    fitted_weight = torch.where(is_near, 1.0 - fitted, fitted)  # weight of the other surface
+    # what lies behind is seen sharp where it is nearer to focus, and so is every error of its matte
     own_variance = torch.where(is_near, front_variance, back_variance)
-    doubt = (_DOUBT * own_variance / strength.clamp_min(1e-12)).clamp_min(1e-12).sqrt()
-    sure = raw - torch.where(far.abs() < near.abs(), doubt, 0.0)
-    sure = sure * (2.0 * sure / _LEAST_SHARE - 1.0).clamp(0.0, 1.0)
-    # the light of a highlight counts even where its share is small
-    moved = raw * (strength / (colour**2).sum(0).clamp_min(1e-18)).clamp_min(1e-12).sqrt()
-    sure = torch.lerp(sure, raw, (4.0 * moved - 1.0).clamp(0.0, 1.0))
+    texture_weight = (_TEXTURE * own_variance / strength.clamp_min(1e-12)).clamp_min(1e-12).sqrt()
+    trusted = fitted_weight - torch.where(far.abs() < near.abs(), texture_weight, 0.0)
+    trusted = trusted * (2.0 * trusted / _LEAST_WEIGHT - 1.0).clamp(0.0, 1.0)
+    # the light of a highlight counts even where its weight is small
+    moved = fitted_weight * (strength / (colour**2).sum(0).clamp_min(1e-18)).clamp_min(1e-12).sqrt()
+    trusted = torch.lerp(trusted, fitted_weight, (4.0 * moved - 1.0).clamp(0.0, 1.0))
     # the pixel's depth must be that of one of the two: in between, a steep surface goes on
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     certainty = trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
-    share = sure.clamp(0.0, 0.5) * certainty * edge
+    other_weight = trusted.clamp(0.0, 0.5) * certainty * edge
 
     # what the mean colours do not explain goes to both; the own part takes what the other leaves: no light is lost
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
-    rest = colour - (1.0 - share) * own_mean - share * other_mean
-    other = (other_mean + rest * share / (share**2 + (1.0 - share) ** 2)).clamp_min(0.0)
-    own = (colour - share * other) / (1.0 - share)
+    unexplained = colour - (1.0 - other_weight) * own_mean - other_weight * other_mean
+    other = (other_mean + unexplained * other_weight / (other_weight**2 + (1.0 - other_weight) ** 2)).clamp_min(0.0)
+    own = (colour - other_weight * other) / (1.0 - other_weight)
     return (
         pixels.put(light, edge_pixels, own),
         pixels.put(torch.zeros_like(light), edge_pixels, other),
         pixels.put(coc_px, edge_pixels, torch.where(is_near, far, near)),
-        pixels.put(torch.zeros_like(coc_px), edge_pixels, share),
+        pixels.put(torch.zeros_like(coc_px), edge_pixels, other_weight),
     )
 
 

@@ -15,7 +15,7 @@ from ..validation import is_traced
 from . import compiled, composite, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
-from .matting import split_mixed
+from .matting import matte
 from .plan import Blur, Plan
 from .scatter import fold
 from .surfaces import Frame, Surface, framed, surfaces_of_image
@@ -179,17 +179,17 @@ def _render_item(
 def _before_background(surface: Surface, behind: Tensor, behind_coc: Tensor, options: Options) -> list[Surface]:
     """Surfaces of an image in front of a known background, near to far."""
     light, coc, weight = surface
-    own, other, other_coc, share = split_mixed(light, coc, weight)
+    own, other, other_coc, other_weight = matte(light, coc, weight)
     # what shows past a nearer surface of a mixed pixel is the background's to tell
-    own_weight, share = 1.0 - share, torch.where(other_coc < coc, share, 0.0)
+    own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:
-        own_weight, share = own_weight * weight, share * weight
+        own_weight, other_weight = own_weight * weight, other_weight * weight
     apart = (behind_coc - coc - _SAME_PX).clamp(0.0, 1.0)  # else the image itself shows it
-    behind_weight = apart + (1.0 - apart) * share
+    behind_weight = apart + (1.0 - apart) * other_weight
     if not options.check:
         valid = torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
         behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
-    shown = [Surface(other, other_coc, share), Surface(own, coc, own_weight)]
+    shown = [Surface(other, other_coc, other_weight), Surface(own, coc, own_weight)]
     return [*shown, Surface(behind, torch.maximum(behind_coc, coc), behind_weight)]
 
 

@@ -53,8 +53,8 @@ class Plan:
     Args:
         nodes: Places of the layers on the blur axis (see :mod:`torchdof.render.layer_weights`), strictly increasing.
         tolerance: What the plan was made for.
-        rays: Highlights are traced (:mod:`torchdof.render.highlights`) where layers would not do; False leaves them in
-            their layers, as plans for every scene do.
+        rays: Highlights are splatted (:mod:`torchdof.render.highlights`) where layers would not do; False leaves them
+            in their layers, as plans for every scene do.
         pixels: Share of the scene's pixels that each layer carries, where it was asked for.
     """
 

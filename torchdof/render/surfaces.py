@@ -12,7 +12,7 @@ from ..validation import is_traced
 from .disocclusion import BEHIND_STEP, behind_size, fill_hidden
 from .downsampling import upsampled
 from .layer_weights import blur_axis, weight_at_or_behind
-from .matting import split_mixed
+from .matting import matte
 from .plan import Blur
 
 __all__ = ["Frame", "Placed", "Surface", "framed", "surfaces_of_image"]
@@ -21,7 +21,7 @@ __all__ = ["Frame", "Placed", "Surface", "framed", "surfaces_of_image"]
 class Surface(NamedTuple):
     """What a surface contributes to each pixel: light ``[B, C, H, W]``, signed coc and weight ``[B, 1, H, W]``.
 
-    The weight is the share of the pixel that it covers; None is 1.
+    The weight is the part of the pixel that it covers; None is 1.
     """
 
     light: Tensor
@@ -50,7 +50,7 @@ class Frame:
         area: Height and width, continued to whole blocks of the coarsest layer.
         size: Height and width of the image.
         stacked: The surfaces of a pixel, near to far, each cover it by their weight, whatever the others do. False:
-            their weights are shares of the pixel.
+            their weights sum to at most 1.
     """
 
     surfaces: Sequence[Placed]
@@ -121,7 +121,7 @@ def _stacked(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tupl
     A pixel counts for layer k as far as what is at or behind it is known, but for what that has in front.
     """
     visible = torch.ones_like(surfaces[0].x)
-    left = unknown = visible
+    arriving = unknown = visible
     stopped = []
     for _, x, weight in surfaces:
         behind = weight_at_or_behind(x, nodes, k)
@@ -129,8 +129,8 @@ def _stacked(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tupl
         cover = torch.ones_like(x) if weight is None else weight
         passes = torch.where(behind > 0, 1.0 - cover * (1.0 - behind), 1.0)  # what layers in front leave
         stops = cover * own / passes.clamp_min(1e-6)  # of what arrives at the surface in this layer
-        stopped.append(left * stops)
-        left, visible = left * (1.0 - stops), visible * passes
+        stopped.append(arriving * stops)
+        arriving, visible = arriving * (1.0 - stops), visible * passes
         unknown = torch.where(behind > 0, unknown * (1.0 - cover), unknown)
     light = torch.stack([s.light * (visible * part) for s, part in zip(surfaces, stopped, strict=True)]).sum(0)
     return light, visible * torch.stack(stopped).sum(0), visible * (1.0 - unknown)
@@ -183,20 +183,20 @@ def surfaces_of_image(
     Arguments and what is behind are those of :func:`torchdof.render.disocclusion.fill_hidden`.
     """
     compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
-    maps = (_operator if compiling else _split_and_fill)(light, coc_px, valid, threshold, levels)
+    maps = (_operator if compiling else _matte_and_fill)(light, coc_px, valid, threshold, levels)
     own, own_weight, other, other_coc, other_weight, behind = maps
     return [Surface(own, coc_px, own_weight), Surface(other, other_coc, other_weight)], behind
 
 
-def _split_and_fill(
+def _matte_and_fill(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
 ) -> tuple[Tensor, ...]:
-    own, other, other_coc, share = split_mixed(light, coc_px, valid)
-    own_weight = 1.0 - share
-    other, other_coc, share, behind = fill_hidden(own, coc_px, other, other_coc, share, valid, threshold, levels)
+    own, other, other_coc, weight = matte(light, coc_px, valid)
+    own_weight = 1.0 - weight
+    other, other_coc, weight, behind = fill_hidden(own, coc_px, other, other_coc, weight, valid, threshold, levels)
     if valid is not None:
-        own_weight, share = own_weight * valid, share * valid
-    return own, own_weight, other, other_coc, share, behind
+        own_weight, weight = own_weight * valid, weight * valid
+    return own, own_weight, other, other_coc, weight, behind
 
 
 # How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
@@ -204,7 +204,7 @@ def _split_and_fill(
 def _operator(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    maps = (t.contiguous() for t in _split_and_fill(light, coc_px, valid, threshold, levels))
+    maps = (t.contiguous() for t in _matte_and_fill(light, coc_px, valid, threshold, levels))
     own, own_weight, other, other_coc, other_weight, behind = maps
     return own, own_weight, other, other_coc, other_weight, behind
 
@@ -225,7 +225,7 @@ def _backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
     light, coc_px, valid, threshold = context.saved_tensors
     with torch.enable_grad():
         light, coc_px = light.detach().requires_grad_(), coc_px.detach().requires_grad_()
-        outputs = _split_and_fill(light, coc_px, valid, threshold, context.levels)
+        outputs = _matte_and_fill(light, coc_px, valid, threshold, context.levels)
         wanted = [(o, g) for o, g in zip(outputs, gradients, strict=True) if o.requires_grad]
         back = torch.autograd.grad([o for o, _ in wanted], [light, coc_px], [g for _, g in wanted], allow_unused=True)
     return (*back, None, None, None)

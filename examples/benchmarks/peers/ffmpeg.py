@@ -26,8 +26,8 @@ _MAX_R = 32
 def available() -> str | None:
     """None, or what to install."""
     if shutil.which("ffmpeg"):
-        listed = subprocess.run(["ffmpeg", "-hide_banner", "-filters"], capture_output=True, text=True).stdout
-        if " varblur " in listed and " bench " in listed:
+        filters = subprocess.run(["ffmpeg", "-hide_banner", "-filters"], capture_output=True, text=True).stdout
+        if " varblur " in filters and " bench " in filters:
             return None
     return "Debian and Ubuntu: apt install ffmpeg (5.0 or later)"
 

@@ -38,5 +38,5 @@ def _disc(radius: float) -> Tensor:
     half = int(radius + 0.5)
     place = (torch.arange((2 * half + 1) * _FINE) + 0.5) / _FINE - half - 0.5
     inside = (place[:, None] ** 2 + place**2 <= radius**2).float()
-    share = torch.nn.functional.avg_pool2d(inside[None], _FINE)
-    return share / share.sum()
+    coverage = torch.nn.functional.avg_pool2d(inside[None], _FINE)
+    return coverage / coverage.sum()

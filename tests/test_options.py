@@ -1,0 +1,22 @@
+"""The options of a rendering are those of the dataclass, wherever they are written."""
+
+import dataclasses
+import inspect
+
+import pytest
+
+from torchdof import DepthOfField, blur_by_coc, depth_of_field
+from torchdof.options import OptionArguments, Options
+
+OPTIONS = {field.name: field.default for field in dataclasses.fields(Options)}
+
+
+def test_type_checkers_know_every_option() -> None:
+    assert ["table", *OptionArguments.__annotations__] == list(OPTIONS)
+
+
+@pytest.mark.parametrize("function", [DepthOfField, depth_of_field, blur_by_coc])
+def test_signature_and_help_tell_every_option_with_its_default(function: object) -> None:
+    parameters = inspect.signature(function).parameters  # type: ignore[arg-type]
+    assert {name: parameters[name].default for name in OPTIONS} == {**OPTIONS, "table": None}
+    assert all(f"{name}: " in (function.__doc__ or "") for name in OPTIONS)
