@@ -2,8 +2,8 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
-from typing import TypeVar
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, TypeVar
 
 from torch import Tensor
 
@@ -11,6 +11,7 @@ __all__ = ["KernelCache"]
 
 _ENTRY_BYTES = 512  # of a key and what belongs to it
 
+_Key = TypeVar("_Key", bound=Hashable)
 Kept = TypeVar("Kept", Tensor, tuple[Tensor, ...], float)
 
 
@@ -36,20 +37,29 @@ class KernelCache:
 
         Two threads that miss at once both make it, and one result is kept.
         """
+        return self.get_all([key], lambda _: [make()])[0]
+
+    def get_all(self, keys: Sequence[_Key], make: Callable[[list[_Key]], Sequence[Kept]]) -> list[Kept]:
+        """The same for several keys, no two of them alike; ``make`` makes what is missing of them together."""
+        results: dict[_Key, Any] = {}
         with self._lock:
-            if key in self._entries:
-                self._entries.move_to_end(key)
-                return self._entries[key][0]  # type: ignore[return-value]
-        made = make()
-        size = _ENTRY_BYTES + _bytes(made)
+            for key in keys:
+                if key in self._entries:
+                    self._entries.move_to_end(key)
+                    results[key] = self._entries[key][0]
+        missing = [key for key in keys if key not in results]
+        if missing:
+            results.update(zip(missing, make(missing), strict=True))
         with self._lock:
-            if key not in self._entries and size <= self.limit_bytes:
-                self._entries[key] = (made, size)
-                self.bytes += size
-                while self.bytes > self.limit_bytes:
-                    _, (_, freed) = self._entries.popitem(last=False)
-                    self.bytes -= freed
-        return made
+            for key in missing:
+                size = _ENTRY_BYTES + _bytes(results[key])
+                if key not in self._entries and size <= self.limit_bytes:
+                    self._entries[key] = (results[key], size)
+                    self.bytes += size
+                    while self.bytes > self.limit_bytes:
+                        _, (_, freed) = self._entries.popitem(last=False)
+                        self.bytes -= freed
+        return [results[key] for key in keys]
 
 
 def _bytes(made: Tensor | tuple[Tensor, ...] | float) -> int:

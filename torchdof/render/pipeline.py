@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..options import NAMED, Options
 from ..validation import is_traced
-from . import composite, highlights
+from . import compiled, composite, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
 from .matting import split_mixed
@@ -118,7 +118,7 @@ def _render_item(
     behind_coc: Tensor | None = None,
     cover: Tensor | None = None,
 ) -> Tensor:
-    """The picture ``[B, C, H, W]`` of float maps with a plan: the one entry to this engine.
+    """The picture ``[B, C, H, W]`` of float maps with a plan: the one entry to both engines.
 
     Args:
         plan: Layers.
@@ -129,6 +129,10 @@ def _render_item(
         behind_coc: Its coc.
         cover: How much of each pixel each layer of a stack covers, ``[B, N, 1, H, W]``.
     """
+    if plan.nodes != (0.0,):
+        picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover)
+        if picture is not None:
+            return picture
     low, high = plan.coc_px[0], plan.coc_px[-1]  # beyond, blurs are alike, and differences of huge ones would cancel
     if cover is not None:
         coc = coc.clamp(low, high)

@@ -14,10 +14,12 @@ from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import from_blur_axis, weight_at_or_behind
 
-__all__ = ["Blur", "Plan", "kernels_for"]
+__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
+
+KERNELS_PER_PX = 32
+"""Of radius, for highlights."""
 
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
-_KERNELS_PER_PX = 32  # of radius, for highlights
 _kernels = KernelCache(256 * 2**20)
 
 
@@ -173,7 +175,7 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> T
     if torch.is_grad_enabled() and coc_px.requires_grad:
         kernels = table.kernels(coc_px, width)
     else:
-        steps = (coc_px.double() * _KERNELS_PER_PX).round() / _KERNELS_PER_PX
+        steps = (coc_px.double() * KERNELS_PER_PX).round() / KERNELS_PER_PX
         radii, which = torch.unique(steps, return_inverse=True)
         kernels = table.kernels(radii.cpu(), width).to(coc_px.device)[which]
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))

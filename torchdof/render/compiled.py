@@ -1,0 +1,108 @@
+"""Hands pictures to the compiled engine (:mod:`torchdof.native`), where that can make them."""
+
+import functools
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from .. import native
+from ..optics.blur_table import BlurTable
+from ..optics.kernel_cache import KernelCache
+from ..options import Options
+from ..validation import is_traced
+from .plan import KERNELS_PER_PX, Blur, Plan, kernels_for
+
+__all__ = ["picture"]
+
+_AT_ONCE = 64  # kernels of highlights computed together
+_kernels = KernelCache(128 * 2**20)
+
+
+def picture(
+    plan: Plan,
+    options: Options,
+    light: Tensor,
+    coc: Tensor,
+    behind_light: Tensor | None = None,
+    behind_coc: Tensor | None = None,
+    cover: Tensor | None = None,
+) -> Tensor | None:
+    """The picture ``[B, C, H, W]`` that the plain engine would make, item by item; None where that one serves.
+
+    The compiled engine serves eager inference on the CPU in float32, with layers. Arguments are those of the plain
+    engine's entry, ``torchdof.render.pipeline._render_item``.
+    """
+    given = [t for t in (light, coc, behind_light, behind_coc, cover) if t is not None]
+    if options.method != "layered" or is_traced() or not native.chosen() or not all(map(_is_plain, given)):
+        return None
+    height, width = int(light.shape[-2]), int(light.shape[-1])
+    blurs = plan.blurs(options.table, (height, width), torch.float32, torch.device("cpu"), coarse=True)
+    if max(blur.half for blur in blurs) > native.HALF_LARGEST:
+        return None
+    render = functools.partial(_render, plan, options, blurs)
+    if cover is not None:
+        low, high = plan.coc_px[0], plan.coc_px[-1]
+        coc = coc.clamp(low, high)
+        # what no layer covers is seen through all of them
+        nothing, farthest = torch.zeros_like(light[0, 0]), torch.full_like(coc[0, 0, 0], high)
+        items = []
+        for layers in zip(light, coc[:, :, 0], cover[:, :, 0], strict=True):
+            items.append(render([*zip(*layers, strict=True), (nothing, farthest, None)], "stack"))
+    elif behind_light is not None and behind_coc is not None:
+        shown, hidden = zip(light, coc[:, 0], strict=True), zip(behind_light, behind_coc[:, 0], strict=True)
+        items = [render([(*a, None), (*b, None)], "background") for a, b in zip(shown, hidden, strict=True)]
+    else:
+        items = [render([(*item, None)], "image") for item in zip(light, coc[:, 0], strict=True)]
+    return items[0][None] if len(items) == 1 else torch.stack(items)
+
+
+def _is_plain(values: Tensor) -> bool:
+    """Whether numbers alone are asked for, in memory that the compiled engine can read: no gradients, no device."""
+    if values.device.type != "cpu" or values.dtype != torch.float32:
+        return False
+    followed = torch.is_grad_enabled() and values.requires_grad
+    return not followed and forward_ad.unpack_dual(values).tangent is None
+
+
+def _render(
+    plan: Plan,
+    options: Options,
+    blurs: Sequence[Blur],
+    surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]],
+    kind: native.Kind,
+) -> Tensor:
+    """One item ``[C, H, W]``."""
+    height, width = surfaces[0][0].shape[-2:]
+    return native.render(
+        surfaces,
+        kind,
+        nodes=plan.nodes,
+        layers=[(blur.kernel, blur.scale) for blur in blurs],
+        psfs=functools.partial(_psfs, options.table, int(width), int(max(height, width))),
+        occlusion=options.occlusion,
+        extend=options.border == "extend",
+        normalize=options.normalize,
+        masked=kind != "stack" and not options.check,
+        highlights=plan.rays,
+        crisp_px=plan.crisp_px,
+    )
+
+
+def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:
+    """Kernels ``[1 or C, k, k]`` of highlights whose coc is so many steps, each as small as it can be."""
+    lens = table.fingerprint()
+
+    def made(keys: Sequence[tuple[str, int, int, int]]) -> list[Tensor]:
+        trimmed = []
+        for start in range(0, len(keys), _AT_ONCE):
+            coc_px = torch.tensor([step for _, step, _, _ in keys[start : start + _AT_ONCE]]) / KERNELS_PER_PX
+            for kernel in kernels_for(table, coc_px, width, longest).float():
+                half = kernel.shape[-1] // 2
+                rows = kernel.sum((0, 2)).nonzero()[:, 0]  # kernels are not negative
+                rim = min(int(rows[0]), 2 * half - int(rows[-1])) if len(rows) else half
+                trimmed.append(kernel[:, rim : 2 * half + 1 - rim, rim : 2 * half + 1 - rim].clone())
+        return trimmed
+
+    return _kernels.get_all([(lens, step, width, longest) for step in steps], made)
