@@ -1,6 +1,6 @@
 # make demo       render a real photograph focused near, middle and far; pictures go to out/
 # make test       run the tests, two at a time
-# make sweep      run the hard tests at full length: whole frames instead of strips, twenty times as many examples
+# make sweep      run the hard tests at full length: whole frames instead of strips, up to twenty times as many examples
 # make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
 # All need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
