@@ -106,6 +106,7 @@ def read_peers(folder: Path) -> list[Peer]:
 
 
 def _read_peer(path: Path) -> Peer:
+    """The peer that one Python file defines; one whose imports are missing is listed as not installed."""
     spec = importlib.util.spec_from_file_location(f"torchdof_peer_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path}: cannot be read as Python")

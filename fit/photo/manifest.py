@@ -235,6 +235,7 @@ def _text(fields: Mapping[str, Any], name: str, where: str, needed: bool = False
 
 
 def _check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
+    """Refuse distances that are not positive and increasing, or that equal the focus."""
     for what, value in [("focus_m", focus), *(("distance_m", d) for d in distances)]:
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e100:
             raise DistanceError(f"{what} must be a positive number of metres, got {show(value)}", file=where)

@@ -213,6 +213,7 @@ def render(
 def _render_sequence(
     image: Path, depth: Path | None, out: Path, settings: RenderSettings, frames: str | None, resume: bool
 ) -> None:
+    """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
     source, target = FramePattern(image), FramePattern(out)
     depths = FramePattern(depth) if depth is not None and FramePattern.matches(depth) else None
     numbers = source.frames()
