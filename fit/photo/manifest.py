@@ -8,11 +8,12 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from torchdof.io.images import read_image
+from torchdof.io.transfer import Transfer
 from torchdof.validation import show
 
 from ..problems import DistanceError, FitError, ManifestError, NonFiniteError
@@ -20,8 +21,6 @@ from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
 
 __all__ = ["Capture", "Captures", "read_captures", "read_pair"]
-
-Transfer = Literal["linear", "srgb"]
 
 MANIFEST = "capture.toml"
 

@@ -18,6 +18,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from ..depth.holes import Fill
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
 from .frame import render_frame
@@ -263,7 +264,7 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def _fill(text: str) -> Literal["nearest", "far"] | float:
+def _fill(text: str) -> Fill:
     if text == "nearest" or text == "far":
         return "nearest" if text == "nearest" else "far"
     try:
