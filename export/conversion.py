@@ -88,6 +88,7 @@ def to_onnx(
 
 
 def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
+    """The module as an ONNX graph, as torch.onnx gives it: not yet slimmed."""
     program = trace(portable, channels)
     frame = {0: "B", 2: "H", 3: "W"}
     names = INPUTS[portable.inputs]

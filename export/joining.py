@@ -123,6 +123,7 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
+    """Encoding, estimator, decoding and module as one graph; the names of each part get a prefix of their own."""
     names = ("encode/", "estimator/", "decode/", "dof/")
     encode, estimator, decode, dof = (_prefixed(part, name) for part, name in zip(parts, names, strict=True))
     estimator_input, estimator_output = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"

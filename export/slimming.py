@@ -112,6 +112,7 @@ class _Casts(onnx_ir.passes.InPlacePass):
 
 
 def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.DataType, number: int) -> onnx_ir.Value:
+    """A constant in another type, as an initializer of the graph."""
     if value.const_value is None:
         raise ValueError(f"{value.name} is no constant")
     tensor = onnx_ir.tensor(value.const_value.numpy().astype(kind.numpy()), name=f"cast_{number}")

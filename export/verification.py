@@ -140,6 +140,7 @@ def local_range(image: Tensor, reach: int) -> Tensor:
 
 
 def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Case) -> CaseComparison:
+    """One case in eager PyTorch and in onnxruntime: errors and times."""
     start = time.perf_counter()
     with torch.no_grad():
         expected = portable(*case.tensors)
@@ -178,6 +179,7 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
 
 
 def _check_origin(facts: dict, dof: DepthOfField) -> None:
+    """Refuse a file that was made from another table, other options or another camera than the module's."""
     if facts["table"]["sha256"] != table_hash(dof.options.table):
         raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.options.table!r}")
     options: dict[str, Any] = {**dof.options.arguments()}

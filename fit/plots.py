@@ -146,6 +146,7 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
+    """A figure of a size in inches, and its axes side by side."""
     # no pyplot: it would choose a screen and keep every figure alive
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

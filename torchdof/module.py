@@ -285,6 +285,7 @@ def _blur(
     background_coc_px: Tensor | None,
     attention: Attention | None,
 ) -> Tensor:
+    """Check the arguments of a rendering, then render, with autocast switched off."""
     channels = options.table.channels
     validation.image_and_coc(image, coc_px, channels, values=options.check)
     _check_plan(plan)

@@ -245,6 +245,7 @@ def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
 
 
 def _image(image: Tensor) -> None:
+    """Refuse what is no image ``[B, C, H, W]`` of floating-point light."""
     if not isinstance(image, Tensor):
         raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {type(image).__name__}")
     if not image.is_floating_point():
@@ -257,6 +258,7 @@ def _image(image: Tensor) -> None:
 
 
 def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
+    """Refuse what is no map of one number for each pixel of an image, on its device."""
     batch, _, height, width = image.shape
     expected = f"{name} must be [{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit}"
     if not isinstance(value, Tensor) or not value.is_floating_point():

@@ -204,7 +204,7 @@ def _frames(scene: BenchScene, repeat: int) -> Iterator[Figure]:
 
 def _beside_gegl(scene: BenchScene, repeat: int) -> Iterator[Figure]:
     """A frame with occlusion beside GEGL's lens-blur, where that is installed."""
-    spec = importlib.util.spec_from_file_location("gegl", Path(__file__).parent / "peers" / "gegl.py")
+    spec = importlib.util.spec_from_file_location("gegl", Path(__file__).parent / "tools" / "gegl.py")
     if spec is None or spec.loader is None:
         return
     gegl = importlib.util.module_from_spec(spec)

@@ -2,7 +2,7 @@
 
     python examples/benchmarks/peers.py SCENES --out results
 
-A peer is a Python file in a folder (``peers`` beside this file)::
+A peer is a Python file in a folder (``tools`` beside this file)::
 
     NAME = "my blur"                                 # may be left out, like NOTE and version()
     NOTE = "float32. Time: the whole call."
@@ -42,7 +42,7 @@ __all__ = ["Peer", "CaseTiming", "check", "compare", "measure_case", "ours", "re
 
 _LEVELS = (8.0, 4.0, 1.0)  # of 255
 _STRIP_PX = 65
-_PEERS = Path(__file__).parent / "peers"
+_PEERS = Path(__file__).parent / "tools"
 _DOT = 8.0
 
 
@@ -100,12 +100,13 @@ def read_peers(folder: Path) -> list[Peer]:
     files = sorted(path for path in folder.glob("*.py") if not path.name.startswith("_"))
     if not files:
         raise FileNotFoundError(
-            f"{folder}: there are no peers here; a peer is a Python file, see examples/benchmarks/peers/README.md"
+            f"{folder}: there are no peers here; a peer is a Python file, see examples/benchmarks/tools/README.md"
         )
     return [_read_peer(path) for path in files]
 
 
 def _read_peer(path: Path) -> Peer:
+    """The peer that one Python file defines; one whose imports are missing is listed as not installed."""
     spec = importlib.util.spec_from_file_location(f"torchdof_peer_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ValueError(f"{path}: cannot be read as Python")

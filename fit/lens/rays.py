@@ -81,6 +81,7 @@ def trace_rays(
 
 
 def _trace_chunk(lens: Lens, index: Array, vertices: Array, position: Array, direction: Array, clip: bool) -> Rays:
+    """Rays ``[3, R]`` through all surfaces: where each meets the sphere, whether it passes, how it is refracted."""
     (x, y, z), (u, v, w) = position.copy(), direction.copy()
     alive = np.ones(x.shape, dtype=bool)
     for i, radius in enumerate(lens.radius):

@@ -209,6 +209,7 @@ def _object_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -
 
 
 def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
+    """Distance behind the last vertex, in mm, at which an object on the axis is in focus."""
     first = lens.paraxial()
     distance = object_mm + first.front_principal
     if distance <= first.focal_length:

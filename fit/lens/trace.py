@@ -166,6 +166,7 @@ def trace_table(
 def _check(
     lens: Any, family: Any, nodes: Any, points: Any, focus: Any, reference: Any, wavelengths: Any, rays: Any, name: Any
 ) -> None:
+    """Refuse arguments of :func:`trace_table` that make no sense, by name."""
     if not isinstance(lens, Lens):
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
     for what, value, known in (

@@ -144,6 +144,7 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stackl
 
 
 def _outside(pair: Forward, solution: Solution) -> float:
+    """Share of the blur's light that falls outside the window."""
     kernel = pair.kernels(solution.family, {k: np.asarray(v)[None] for k, v in solution.params.items()})
     source = pair.moved_source(solution.moves)
     inside = float(pair.convolve(source, kernel, whole=True)[0].sum())
@@ -176,6 +177,7 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None, stacklevel
 
 
 def _check_parameters(pair: Forward, solution: Solution, file: str | None, stacklevel: int) -> None:
+    """Warn about parameters that ended on a bound, and about a blur whose size the pictures do not determine."""
     low, high = pair.bounds(solution.names)
     for name, least, most in zip(solution.names, low, high, strict=True):
         value = solution.params.get(name, solution.moves.get(name, 0.0))

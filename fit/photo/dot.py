@@ -128,6 +128,7 @@ def _level(values: Array, noise: float) -> float:
 
 
 def _measure(above: Array, x: float, y: float, background: float, noise: float, peak: float) -> Dot:
+    """Centre, reach, radius and light of a dot around (x, y), by moments; three rounds, each within the reach found."""
     height, width = above.shape
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     reach = 0.0
@@ -142,6 +143,7 @@ def _measure(above: Array, x: float, y: float, background: float, noise: float, 
 
 
 def _reach(above: Array, distance: Array, noise: float, peak: float) -> float:
+    """Radius in px from which on the mean level over rings is not above the noise."""
     mean, count = radial_mean(above, distance)
     # light so faint that neither the noise nor a moment would feel it
     dark = np.abs(mean) < np.maximum(2.5 * noise / np.sqrt(np.maximum(count, 1)), 5e-4 * peak)

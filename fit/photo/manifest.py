@@ -8,11 +8,12 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from torchdof.io.images import read_image
+from torchdof.io.transfer import Transfer
 from torchdof.validation import show
 
 from ..problems import DistanceError, FitError, ManifestError, NonFiniteError
@@ -20,8 +21,6 @@ from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
 
 __all__ = ["Capture", "Captures", "read_captures", "read_pair"]
-
-Transfer = Literal["linear", "srgb"]
 
 MANIFEST = "capture.toml"
 
@@ -235,6 +234,7 @@ def _text(fields: Mapping[str, Any], name: str, where: str, needed: bool = False
 
 
 def _check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
+    """Refuse distances that are not positive and increasing, or that equal the focus."""
     for what, value in [("focus_m", focus), *(("distance_m", d) for d in distances)]:
         if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e100:
             raise DistanceError(f"{what} must be a positive number of metres, got {show(value)}", file=where)

@@ -156,6 +156,7 @@ def _check_options(
     start: Any,
     prior: Any,
 ) -> None:
+    """Refuse options of :func:`fit_pair` that make no sense, by name."""
     if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
         raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
     texts = isinstance(model, str) and isinstance(source, str)

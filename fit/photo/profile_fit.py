@@ -135,6 +135,7 @@ def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
 
 
 def _checked(r: ArrayLike, strength: ArrayLike, family: str) -> tuple[Array, Array]:
+    """Radii and strengths `[n]` as float64, or a refusal that says what is wrong with them."""
     if not isinstance(family, str) or family not in FAMILIES:
         raise FitError(f"family must be one of {', '.join(FAMILIES)}, got {show(family)}")
     try:
@@ -165,6 +166,7 @@ def _checked(r: ArrayLike, strength: ArrayLike, family: str) -> tuple[Array, Arr
 
 
 def _checked_groups(groups: ArrayLike, count: int) -> Array:
+    """The number of the group of each sample `[n]`, or a refusal."""
     try:
         array = np.asarray(groups)
         if array.shape != (count,) or array.dtype.kind not in "iuf":
@@ -175,6 +177,7 @@ def _checked_groups(groups: ArrayLike, count: int) -> Array:
 
 
 def _refuse_flat(x: Array, y: Array, noise: float) -> None:
+    """Refuse samples that a parabola over r explains no better than a constant does."""
     level = y - y.mean()
     bent = np.stack([np.ones_like(x), x, x * x], axis=1)
     residual = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
@@ -190,6 +193,7 @@ def _refuse_flat(x: Array, y: Array, noise: float) -> None:
 
 
 def _fit_smooth(x: Array, y: Array, family: str, clusters: Array | None) -> tuple[Array, Array, tuple[str, ...], Array]:
+    """Parameters, covariance, names and fitted curve of a family with a smooth profile."""
     names = _ORDER[family]
 
     def model(_: Array, *p: float) -> Array:
@@ -206,6 +210,7 @@ def _fit_smooth(x: Array, y: Array, family: str, clusters: Array | None) -> tupl
 
 
 def _jacobian(model: object, x: Array, params: Array) -> Array:
+    """Derivatives of a model by its parameters `[n, p]`, by central differences."""
     columns = []
     for i, value in enumerate(params):
         step = 1e-5 * max(abs(float(value)), 1e-2)
@@ -257,6 +262,7 @@ def _fit_disc(x: Array, y: Array) -> tuple[Array, Array, tuple[str, ...], Array]
 
 
 def _fit_radial(x: Array, y: Array, knots: int | None) -> tuple[Array, Array, tuple[str, ...], Array]:
+    """Values, covariance, names and fitted curve of a free non-negative profile, linear between its knots."""
     from scipy.optimize import nnls
 
     count = knots if knots is not None else int(np.clip(np.unique(x).size // 3, 4, 32))
@@ -283,6 +289,7 @@ def hat_functions(x: Array, count: int) -> Array:
 
 
 def _warn_if_undetermined(fit: BlurFit, unit: float) -> None:
+    """Warn about lengths with a large standard error, and about those that ended on their bound."""
     loose: Sequence[str] = [n for n in ("r_c", "sigma", "radius") if n in fit.params]
     for name in loose:
         value, error = float(fit.params[name]), float(fit.stderr[name])

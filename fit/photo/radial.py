@@ -123,6 +123,7 @@ def _covariance(
     free: Mask,
     smooth: Array,
 ) -> Array:
+    """Covariance of the profile's values `[knots, knots]`; 0 where a value is held at 0."""
     tall = (columns - columns.mean(axis=1, keepdims=True))[free].T
     plain = pair.covariance(tall, residual, kernel, gain, moves)
     bread, normal = inverse(tall.T @ tall + smooth[np.ix_(free, free)]), tall.T @ tall

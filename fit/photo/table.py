@@ -167,6 +167,7 @@ def _choose(
     progress: Callable[[int, int, str], None] | None,
     total: int,
 ) -> tuple[str, str]:
+    """The cheapest family that is accurate enough at every distance, and why."""
     worst = 0
     why = ""
     for i, pair in enumerate(pairs):
@@ -180,6 +181,7 @@ def _choose(
 
 
 def _check_exposure(pair: Capture, fit: BlurFit) -> None:
+    """Warn where a fitted gain contradicts the stated exposures."""
     if pair.exposure is None or not fit.gain > 0:
         return
     off = fit.gain / pair.exposure
@@ -225,6 +227,7 @@ def _table(
     command: str,
     why: str,
 ) -> BlurTable:
+    """The blur table of the fits, in mm of the sensor where its width is known, with its provenance."""
     sensor = captures.sensor_width_mm
     unit = captures.width_px if sensor is None else captures.width_px / sensor
     provenance = {

@@ -1,18 +1,21 @@
 """`torchdof fit` as a user runs it."""
 
+from pathlib import Path
+from types import ModuleType
+
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from torchdof import BlurTable
 from torchdof.cli.main import app
 
 
-def kernel(distance):
+def kernel(distance: float) -> tuple[str, dict[str, float]]:
     return "disc", {"radius": 10.0 * abs(1 / 0.5 - 1 / distance)}
 
 
 @pytest.fixture(scope="module")
-def folder(simulator, tmp_path_factory):
+def folder(simulator: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
     fields = 'focal_length_mm = 50.0\nf_number = 4.0\nsensor_width_mm = 36.0\nname = "my lens"'
     return simulator.write_captures(
@@ -20,11 +23,11 @@ def folder(simulator, tmp_path_factory):
     )
 
 
-def run(*arguments):
+def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["fit", *map(str, arguments)])
 
 
-def test_a_folder_becomes_a_table_with_pictures(folder, tmp_path):
+def test_a_folder_becomes_a_table_with_pictures(folder: Path, tmp_path: Path) -> None:
     result = run(folder, "-o", tmp_path / "mine.json", "--plots", tmp_path / "pictures")
     assert result.exit_code == 0, result.output
     table = BlurTable.load(tmp_path / "mine.json")
@@ -36,7 +39,7 @@ def test_a_folder_becomes_a_table_with_pictures(folder, tmp_path):
     ]  # fmt: skip
 
 
-def test_a_lens_becomes_a_table(tmp_path):
+def test_a_lens_becomes_a_table(tmp_path: Path) -> None:
     result = run("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
     assert result.exit_code == 0, result.output
     assert BlurTable.load(tmp_path / "lens.json").unit == "mm"
@@ -53,13 +56,15 @@ def test_a_lens_becomes_a_table(tmp_path):
         (("nowhere", "-o", "table.txt"), "name it table.json"),
     ],
 )
-def test_wrong_input_is_one_sentence_and_exit_code_2(arguments, message, tmp_path, monkeypatch):
+def test_wrong_input_is_one_sentence_and_exit_code_2(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     result = run(*arguments)
     assert result.exit_code == 2
     assert message in result.output.replace("\n", " ") and "Traceback" not in result.output
 
 
-def test_help_teaches():
+def test_help_teaches() -> None:
     result = run("--help")
     assert result.exit_code == 0 and "capture.toml" in result.output and "--lens" in result.output

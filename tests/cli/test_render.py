@@ -184,7 +184,7 @@ def test_options_of_the_blur_are_those_of_the_function(
 def test_method_reaches_the_function(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     methods = []
 
-    def spy(*arguments: Any, method: str, **options: Any) -> torch.Tensor:
+    def spy(*arguments: Any, method: Any, **options: Any) -> torch.Tensor:
         methods.append(method)
         return torchdof.depth_of_field(*arguments, method=method, **options)
 

@@ -17,7 +17,7 @@ from torchdof.reference import metrics
 from torchdof.reference.scenes import Scene
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = ROOT / "examples" / "benchmarks" / "peers"
+SHIPPED = ROOT / "examples" / "benchmarks" / "tools"
 DATA = ROOT / "tests" / "data" / "scenes"
 
 TOY = """

@@ -9,8 +9,12 @@ from torchdof.optics.kernel_cache import KernelCache
 def test_what_was_made_is_kept_and_the_longest_unused_goes_first() -> None:
     cache, made = KernelCache(25_000), []
 
-    def kernel(name: str, count: int = 1000) -> Tensor:
-        return cache.get(name, lambda: (made.append(name), torch.zeros(count, dtype=torch.float64))[1])
+    def kernel(name: str) -> Tensor:
+        def make() -> Tensor:
+            made.append(name)
+            return torch.zeros(1000, dtype=torch.float64)
+
+        return cache.get(name, make)
 
     for name in ("a", "b", "a", "c", "a", "d", "a", "c", "b"):  # 8 kB each: two fit, "a" is used all the time
         kernel(name)

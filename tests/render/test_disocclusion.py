@@ -14,10 +14,10 @@ from torchdof.render.surfaces import Surface, framed, surfaces_of_image
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
 
-def edge(share: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Tensor, Tensor]:
+def edge(weight: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Tensor, Tensor]:
     """Red in front of blue; column 31 is red by a share but has the depth of red if that is at least a half."""
     red = (torch.arange(64) < 31).float()
-    red[31] = share
+    red[31] = weight
     image = (red * RED[:, None] + (1 - red) * BLUE[:, None])[None, :, None].expand(1, 3, 48, 64)
     coc = torch.where(red >= 0.5, near_px, far_px).expand(1, 1, 48, 64)
     return image, coc
@@ -31,8 +31,9 @@ def surfaces(image: Tensor, coc: Tensor, levels: int) -> tuple[Surface, Surface,
 
 def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> None:
     image, coc = edge(1.0, near_px=-12.0)
-    (own, _, _), (other, other_coc, share), behind = surfaces(image, coc, levels=5)
-    reached = (share[0, 0, 24] > 0).nonzero()[:, 0]
+    (own, _, _), (other, other_coc, weight), behind = surfaces(image, coc, levels=5)
+    assert weight is not None
+    reached = (weight[0, 0, 24] > 0).nonzero()[:, 0]
     assert 12 <= 32 - int(reached.min()) <= 32 and int(reached.max()) == 31  # nothing is behind the wall
     assert torch.equal(own, image)
     assert torch.allclose(other[0, :, 24, 20:31], BLUE[:, None].expand(3, 11), atol=1e-5)
@@ -44,8 +45,8 @@ def test_a_highlight_beside_what_is_hidden_is_not_hidden_there_too() -> None:
     image, coc = edge(1.0, near_px=-12.0)
     image = image.clone()
     image[..., 20:28, 32:36] = 500.0
-    _, (other, _, share), behind = surfaces(image, coc, levels=5)
-    assert float(share[0, 0, 24, 26]) > 0
+    _, (other, _, weight), behind = surfaces(image, coc, levels=5)
+    assert weight is not None and float(weight[0, 0, 24, 26]) > 0
     most = float(threshold(image).max())
     assert most < 10.0, "the scene tests nothing"
     assert float(other[0, :, 24, :32].max()) <= most
@@ -58,8 +59,8 @@ def test_behind_two_blurred_surfaces_lies_the_farthest_around() -> None:
     image, coc = image.clone(), coc.clone()
     image[..., 24:40], coc[..., 24:40] = green[:, None, None], -12.0  # red in front of green, and a blue wall
     image[..., 40:], coc[..., 40:] = BLUE[:, None, None], 0.0
-    _, (_, _, share), behind = surfaces(image, coc, levels=6)
-    assert float(share[0, 0, 24, 20]) > 0
+    _, (_, _, weight), behind = surfaces(image, coc, levels=6)
+    assert weight is not None and float(weight[0, 0, 24, 20]) > 0
     assert torch.allclose(behind[0, :, 24 // 4, 20 // 4], BLUE, atol=0.02), "the wall, not the surface in between"
 
 

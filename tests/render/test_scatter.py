@@ -171,7 +171,7 @@ def test_fold_is_differentiable_in_the_weights_across_strips(monkeypatch: pytest
     light = torch.rand(1, 2, 3, 4, dtype=torch.float64, requires_grad=True)
     kernels = torch.rand(2, 1, 3, 3, dtype=torch.float64, requires_grad=True)
     weights = torch.rand(1, 2, 3, 4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda *given: fold(*given[:2], weights=given[2]), (light, kernels, weights))
+    assert torch.autograd.gradcheck(lambda a, k, w: fold(a, k, weights=w), (light, kernels, weights))
 
 
 @BOTH

@@ -333,6 +333,7 @@ def show(rows: Sequence[SettingCost], scene: BenchScene, unit: float) -> None:
 
 
 def _csv(rows: Iterable[SettingCost]) -> str:
+    """The measurements as CSV text, a line a setting."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = [field.name for field in dataclasses.fields(SettingCost) if field.name != "setting"]
@@ -363,6 +364,7 @@ def _lines(rows: Sequence[SettingCost]) -> list[tuple[SettingCost, list[str]]]:
 
 
 def _remarks(rows: Sequence[SettingCost]) -> str:
+    """What a reader of the table must know of its rows: what is a crop, what was compiled, where a tolerance holds."""
     sizes = {f"{row.width} x {row.height}" for row in rows if row.setting.side is not None}
     crop = f" fold holds k * k columns a pixel: on the {' and '.join(sizes)} pixels in the middle." if sizes else ""
     ready = [
@@ -383,6 +385,7 @@ def _title(scene: BenchScene) -> str:
 
 
 def _plot(path: Path, rows: Sequence[SettingCost], scene: BenchScene) -> None:
+    """Draws RMS error over median time, both logarithmic, a line with and one without occlusion, to a PNG file."""
     # no pyplot: it would choose a screen and keep every figure alive
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -105,6 +105,7 @@ def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Cons
 def _fit_with_progress(
     captures: Captures, family: str, accuracy_db: float, command: str, console: Console
 ) -> tuple[TableFit, list[str]]:
+    """Fits one set of captures behind a progress bar; returns the fit and the warnings, each once."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with warnings.catch_warnings(record=True) as caught, Progress(*columns, console=console, transient=True) as bar:
         warnings.simplefilter("always", FitWarning)
@@ -121,6 +122,7 @@ def _fit_with_progress(
 
 
 def _summary(captures: Captures, result: TableFit, messages: list[str], console: Console) -> None:
+    """Prints a table of the fits at all distances, why the family was chosen, and the warnings."""
     shown = Table(
         title=f"{captures.name or 'captures'}: {result.table.family}, focus {captures.focus_m:g} m",
         title_justify="left",
@@ -147,6 +149,7 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
 
 
 def _lens_summary(table: BlurTable, console: Console) -> None:
+    """Prints what was traced and how well the kernels fit the spots."""
     facts, places = table.provenance, table.coc.tolist()
     console.print(
         f"{facts['lens']}: {facts['focal_length_mm']:g} mm, f/{facts['f_number']:g}, focus {facts['focus_m']} m; "
@@ -175,6 +178,7 @@ def _draw_fits(captures: Captures, result: TableFit, folder: Path, stem: str, co
 
 
 def _draw_table(table: BlurTable, folder: Path, stem: str, console: Console) -> None:
+    """Draws a table over depth, and the blur texture of its largest circle of confusion, to PNG files."""
     from torchdof.fit.plots import picture_of_table, picture_of_texture
 
     target = folder / f"{stem}_table.png"

@@ -77,6 +77,7 @@ def _summary(source: Path, name: str) -> str:
 
 
 def _imported(name: str) -> Any:
+    """The command of a name, imported; where a package is missing, one that says what to install."""
     single = typer.Typer(add_completion=False, rich_markup_mode="markdown")
     try:
         function = getattr(importlib.import_module(_MODULES[name]), name)

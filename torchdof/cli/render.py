@@ -18,6 +18,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from ..depth.holes import Fill
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
 from .frame import render_frame
@@ -213,6 +214,7 @@ def render(
 def _render_sequence(
     image: Path, depth: Path | None, out: Path, settings: RenderSettings, frames: str | None, resume: bool
 ) -> None:
+    """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
     source, target = FramePattern(image), FramePattern(out)
     depths = FramePattern(depth) if depth is not None and FramePattern.matches(depth) else None
     numbers = source.frames()
@@ -262,7 +264,7 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def _fill(text: str) -> Literal["nearest", "far"] | float:
+def _fill(text: str) -> Fill:
     if text == "nearest" or text == "far":
         return "nearest" if text == "nearest" else "far"
     try:

@@ -3,10 +3,11 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
+from ..depth.holes import Fill
 from ..depth.kinds import DepthKind
 from ..io.decode import PixelType
 from ..io.metadata import camera_facts
@@ -14,6 +15,7 @@ from ..io.sequence import focus_at_frame
 from ..io.transfer import Transfer
 from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
+from ..options import Method
 from ..validation import number, show
 
 __all__ = ["RenderSettings", "load_table", "pick_device"]
@@ -66,11 +68,11 @@ class RenderSettings:
     depth_offset: float = 0.0
     depth_unknown: float | None = None
     depth_channel: str | None = None
-    fill: Literal["nearest", "far"] | float | None = None
+    fill: Fill | None = None
     table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
     tolerance: float = 1 / 255
     occlusion: bool = True
-    method: Literal["layered", "fold"] = "layered"
+    method: Method = "layered"
     device: torch.device = torch.device("cpu")
     transfer: Transfer | None = None
     out_transfer: Transfer | None = None

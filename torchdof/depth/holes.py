@@ -9,10 +9,13 @@ from torch import Tensor
 from ..validation import show
 from .kinds import number_map
 
-__all__ = ["fill_holes", "resolve_holes"]
+__all__ = ["Fill", "fill_holes", "resolve_holes"]
+
+Fill = Literal["nearest", "far"] | float
+"""What a hole is filled with, as :func:`fill_holes` describes it."""
 
 
-def fill_holes(depth: Tensor, fill: Literal["nearest", "far"] | float) -> Tensor:
+def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
     """Gives every pixel without depth (NaN) one.
 
     Args:
@@ -53,7 +56,7 @@ def fill_holes(depth: Tensor, fill: Literal["nearest", "far"] | float) -> Tensor
     return fill_holes(filled, "nearest")  # what has no depth in its row or column
 
 
-def resolve_holes(depth: Tensor, name: str, fill: Literal["nearest", "far"] | float | None) -> tuple[Tensor, int]:
+def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, int]:
     """Counts the pixels without depth (NaN), and refuses or fills them.
 
     Args:

@@ -1,12 +1,11 @@
 """A depth map from a file to metres without holes."""
 
 import os
-from typing import Literal
 
 from torch import Tensor
 
 from ..io.images import read_values
-from .holes import resolve_holes
+from .holes import Fill, resolve_holes
 from .kinds import DepthKind, depth_from_values
 
 __all__ = ["read_depth"]
@@ -20,7 +19,7 @@ def read_depth(
     offset: float = 0.0,
     unknown: float | None = None,
     fov_x_deg: float | None = None,
-    fill: Literal["nearest", "far"] | float | None = None,
+    fill: Fill | None = None,
     channel: str | None = None,
 ) -> Tensor:
     """Reads a depth map: :func:`torchdof.io.images.read_values`, :func:`depth_from_values`, :func:`fill_holes`.

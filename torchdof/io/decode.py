@@ -90,6 +90,7 @@ def read_parts(path: Path) -> list[Part]:
 
 
 def _read_every_part(path: Path) -> list[Part]:
+    """The parts of a file that OpenImageIO reads; other than EXR files have one."""
     import OpenImageIO as oiio
 
     config = oiio.ImageSpec()

@@ -298,6 +298,7 @@ class BlurTable:
         return float(width) if self.sensor_width_mm is None else width / self.sensor_width_mm
 
     def _check_params(self, params: Mapping[str, Any]) -> dict[str, Tensor]:
+        """Parameters by name as ``[channels, N]`` (``values``: ``[channels, N, P]``), or a refusal by name."""
         names = psf.FAMILIES[self.family]
         if not isinstance(params, Mapping) or set(params) != set(names):
             got = ", ".join(map(str, params)) if isinstance(params, Mapping) else type(params).__name__
@@ -348,6 +349,7 @@ class BlurTable:
         return distances, nodes
 
     def _side_params(self, sign: int, distance: Tensor) -> dict[str, Tensor]:
+        """Parameters at unsigned coc ``[...]``, in the table's unit, on one side of focus: ``[channels, ...]``."""
         side = self._sides[sign]
         if side is None:
             raise AssertionError("a table has nodes on at least one side")
@@ -366,6 +368,7 @@ class BlurTable:
 
 
 def _numbers(name: str, value: Any) -> Tensor:
+    """Finite numbers as a float64 tensor on the CPU, or a refusal by name."""
     try:
         numbers = torch.as_tensor(value)
         if numbers.dtype == torch.bool or numbers.is_complex() or numbers.layout != torch.strided:

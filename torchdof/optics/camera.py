@@ -249,6 +249,7 @@ def _show(value: Number) -> str:
 
 
 def _check_number(name: str, value: Number) -> None:
+    """Refuse a number of the camera that is not positive, or neither a float nor a tensor ``[B]``."""
     if isinstance(value, Tensor):
         if value.ndim > 1 or not value.is_floating_point() or value.layout != torch.strided or not value.numel():
             raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")

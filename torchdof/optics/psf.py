@@ -246,6 +246,7 @@ def half_width(reach: float) -> int:
 
 
 def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
+    """Parameters of a family as float64 tensors on one device, or a refusal by name."""
     if not isinstance(family, str) or family not in FAMILIES:
         raise ValueError(f"family must be one of {', '.join(FAMILIES)}, got {show(family)}")
     if not isinstance(params, Mapping) or set(params) != set(FAMILIES[family]):
@@ -269,6 +270,7 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
 
 
 def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
+    """One parameter as a float64 tensor, or a refusal by name."""
     if isinstance(value, Tensor):
         tensor = real_tensor(name, value.double() if value.dtype in _INTEGERS else value, "[...]")
         if not tensor.numel():
@@ -283,6 +285,7 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
 
 
 def _reach(family: str, params: Mapping[str, Tensor]) -> Tensor:
+    """Radius beyond which a profile holds next to no light, in the unit of its lengths: ``[...]``."""
     if family == "gaussian":
         return 5.0 * params["sigma"]
     if family == "ring":
@@ -297,6 +300,7 @@ def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
 
 
 def _gaussian_quadrant(sigma: Tensor, half: int) -> Tensor:
+    """Integral of a Gaussian over each pixel right of and below its centre: ``[..., half + 1, half + 1]``."""
     edges = torch.arange(half + 2, dtype=torch.float64, device=sigma.device) - 0.5
     cumulative = torch.erf(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
     tail = torch.erfc(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
@@ -306,6 +310,7 @@ def _gaussian_quadrant(sigma: Tensor, half: int) -> Tensor:
 
 
 def _disc_quadrant(radius: Tensor, half: int) -> Tensor:
+    """Area of a disc in each pixel right of and below its centre, ``[..., half + 1, half + 1]``, each axis included."""
     radius = radius[..., None, None]
     index = torch.arange(half + 1, dtype=torch.float64, device=radius.device)
     edge = torch.cat([index.new_zeros(1), index + 0.5])
@@ -325,6 +330,7 @@ def _twice(index: Tensor) -> Tensor:
 
 
 def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, whole: int) -> Tensor:
+    """Integral of any profile over each pixel right of and below its centre, cut by circles into thin slices."""
     # finer slices where a pixel is a larger part of the kernel
     slices = 64 if whole <= 4 else 32 if whole <= 12 else 16 if whole <= 64 else 8
     rows = max(1, _AT_ONCE // ((half + 1) * slices))

@@ -76,6 +76,8 @@ class LensSamples:
 
 
 class _Points(NamedTuple):
+    """Points of the lens, and the shift of each at the tabulated circles of confusion."""
+
     places: Tensor  # [n, 2] on the unit disc
     directions: Tensor  # [n, 2] unit vectors
     radii: Tensor  # [n, nodes] signed shift in pixels at each tabulated coc

@@ -133,6 +133,7 @@ def flip_map(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def _alike(image: Tensor, truth: Tensor, finite: bool = False) -> None:
+    """Refuse two images that cannot be compared: other shapes or devices, or values that are not finite where asked."""
     for name, value in (("image", image), ("truth", truth)):
         real_tensor(name, value, "[B, C, H, W]")
         if value.ndim != 4 or not value.numel():

@@ -84,6 +84,7 @@ def read_scenes(folder: str | os.PathLike[str]) -> Iterator[Scene]:
 
 
 def _read_scene(meta: Path) -> Iterator[Scene]:
+    """Every setting of the scene that one ``meta.json`` describes."""
     from ..io.images import read_image, read_values
 
     try:
