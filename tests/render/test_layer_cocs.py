@@ -10,20 +10,25 @@ from torchdof.render.plan import Plan
 WIDE = 2.7 / 255  # a tolerance for which layers lie 2 px apart where these planes are
 
 
+def coc_at(x: torch.Tensor) -> torch.Tensor:
+    """Coc of places on the blur axis."""
+    return x + 0.5 * x.sign()
+
+
 def test_planes_are_found_where_they_lie_and_slopes_are_none() -> None:
     x = torch.linspace(-10, 10, 256).repeat(1, 1, 256, 1)  # a slope: no place holds more than others
-    assert layer_cocs.plane_nodes(x, WIDE) == []
+    assert layer_cocs.plane_nodes(coc_at(x), WIDE) == []
     x[..., 20:60] = 3.3
     x[..., 100:180] = -7.77
-    assert layer_cocs.plane_nodes(x, WIDE) == pytest.approx([-7.77, 3.3])  # the larger one first
+    assert layer_cocs.plane_nodes(coc_at(x), WIDE) == pytest.approx([-7.77, 3.3])  # the larger one first
 
 
 def test_a_plane_that_is_no_flatter_than_what_is_around_it_is_none() -> None:
     x = torch.full((1, 1, 64, 64), 5.0)
     x[..., ::2, :] += torch.linspace(-0.9, 0.9, 64)  # half of the pixels, spread over the spacing
-    assert layer_cocs.plane_nodes(x, WIDE) == pytest.approx([5.0])
-    assert layer_cocs.plane_nodes(x[..., 1:, :][..., ::2, :], WIDE) == pytest.approx([5.0])
-    assert layer_cocs.plane_nodes(x[..., ::2, :], WIDE) == []
+    assert layer_cocs.plane_nodes(coc_at(x), WIDE) == pytest.approx([5.0])
+    assert layer_cocs.plane_nodes(coc_at(x[..., 1:, :][..., ::2, :]), WIDE) == pytest.approx([5.0])
+    assert layer_cocs.plane_nodes(coc_at(x[..., ::2, :]), WIDE) == []
 
 
 def test_a_plane_at_a_layer_is_exact() -> None:
@@ -55,9 +60,9 @@ def test_places_at_the_border_are_those_of_many_pixels() -> None:
     x = torch.zeros(1, 1, 100, 100)
     x[..., -1, :] = 6.0  # a quarter of the border
     x[..., 0, :10] = -9.0  # too few
-    assert layer_cocs.border_nodes(x) == pytest.approx([0.0, 6.0])
+    assert layer_cocs.border_nodes(coc_at(x)) == pytest.approx([0.0, 6.0])
     x[..., -1, :] = torch.linspace(-40, 40, 100)
-    assert layer_cocs.border_nodes(x) == pytest.approx([0.0])
+    assert layer_cocs.border_nodes(coc_at(x)) == pytest.approx([0.0])
 
 
 @pytest.mark.parametrize("x", [-300.0, -20.5, -3.3, 0.0, 7.0, 20.0, 1e4])

@@ -22,12 +22,10 @@ _SPACING_POWER = 0.8  # of the tolerance
 _LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consists of two layers
 
 
-def on_axis(coc_px: Tensor) -> Tensor:
-    """Places of pixels on the blur axis, finite, shaped as ``coc_px``."""
-    coc = coc_px.detach()
-    # a kernel far larger than the frame is the same everywhere in it
-    reach = 4.0 * max(coc.shape[-2:]) + 4.0
-    return blur_axis(torch.where(torch.isnan(coc), 0.0, coc).clamp(-reach, reach))
+def on_axis(coc_px: Tensor, longest: int) -> Tensor:
+    """Places on the blur axis, finite, of some pixels of a frame whose longer side has so many."""
+    reach = 4.0 * longest + 4.0  # a kernel far larger than the frame is the same everywhere in it
+    return blur_axis(torch.where(torch.isnan(coc_px), 0.0, coc_px).clamp(-reach, reach))
 
 
 def finest(x: float) -> float:
@@ -53,29 +51,33 @@ def spaced_nodes(low: float, high: float, tolerance: float) -> tuple[float, ...]
     return tuple(sorted(nodes))
 
 
-def ends(x: Tensor) -> tuple[float, float]:
-    """Nearest and farthest place."""
-    low, high = torch.stack(torch.aminmax(x)).tolist()
+def ends(coc_px: Tensor) -> tuple[float, float]:
+    """Nearest and farthest place of the pixels ``[B, 1, H, W]``."""
+    both = torch.stack(torch.aminmax(coc_px))
+    if bool(both.isnan().any()):
+        both = torch.stack(torch.aminmax(torch.where(coc_px.isnan(), 0.0, coc_px)))
+    low, high = on_axis(both, max(coc_px.shape[-2:])).tolist()
     return low, high
 
 
-def plane_nodes(x: Tensor, tolerance: float) -> list[float]:
+def plane_nodes(coc_px: Tensor, tolerance: float) -> list[float]:
     """Places at which many pixels lie and few around them: planes that face the camera, and distant backgrounds.
 
     Few may lie as far around as the next layer would be at this tolerance.
     """
-    step = max(1, math.isqrt(x.numel() // _SAMPLES))
-    return _crowded(x[..., ::step, ::step].flatten(), width=0.2, least_share=0.01, tolerance=tolerance)
+    step = max(1, math.isqrt(coc_px.numel() // _SAMPLES))
+    x = on_axis(coc_px[..., ::step, ::step], max(coc_px.shape[-2:]))
+    return _crowded(x.flatten(), width=0.2, least_share=0.01, tolerance=tolerance)
 
 
-def border_nodes(x: Tensor) -> list[float]:
+def border_nodes(coc_px: Tensor) -> list[float]:
     """Places at which much of the frame's border lies.
 
     Surfaces go on beyond the frame as they are at its border. Light from there is not known; what stands for it is
     light of the same layer, which therefore must not reach far into the frame.
     """
-    border = torch.cat([x[..., 0, :], x[..., -1, :], x[..., 0], x[..., -1]], -1).flatten()
-    return _crowded(border, width=1.0, least_share=0.03)
+    border = torch.cat([coc_px[..., 0, :], coc_px[..., -1, :], coc_px[..., 0], coc_px[..., -1]], -1)
+    return _crowded(on_axis(border, max(coc_px.shape[-2:])).flatten(), width=1.0, least_share=0.03)
 
 
 def _crowded(x: Tensor, width: float, least_share: float, tolerance: float | None = None) -> list[float]:

@@ -159,7 +159,7 @@ def _render_item(
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc.clamp(low, high), options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc, (low, high), options)
     elif options.occlusion and limit is not None:
         widest = max(2.0, *(abs(c) for c in plan.coc_px))
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
@@ -176,9 +176,13 @@ def _render_item(
     return out if valid is None else torch.where(valid, out, image)
 
 
-def _before_background(surface: Surface, behind: Tensor, behind_coc: Tensor, options: Options) -> list[Surface]:
-    """Surfaces of an image in front of a known background, near to far."""
+def _before_background(
+    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: tuple[float, float], options: Options
+) -> list[Surface]:
+    """Surfaces of an image in front of a known background, near to far, with coc within the layers' reach."""
     light, coc, weight = surface
+    valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
+    behind_coc = behind_coc.clamp(*reach)
     own, other, other_coc, other_weight = matte(light, coc, weight)
     # what shows past a nearer surface of a mixed pixel is the background's to tell
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
@@ -186,8 +190,7 @@ def _before_background(surface: Surface, behind: Tensor, behind_coc: Tensor, opt
         own_weight, other_weight = own_weight * weight, other_weight * weight
     apart = (behind_coc - coc - _SAME_PX).clamp(0.0, 1.0)  # else the image itself shows it
     behind_weight = apart + (1.0 - apart) * other_weight
-    if not options.check:
-        valid = torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
+    if valid is not None:
         behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
     shown = [Surface(other, other_coc, other_weight), Surface(own, coc, own_weight)]
     return [*shown, Surface(behind, torch.maximum(behind_coc, coc), behind_weight)]

@@ -69,8 +69,8 @@ class Plan:
 
         A scene ``[B, 1, H, W]`` of one plane gets one layer, and its kernel is exact. NaN is left out.
         """
-        x = layer_cocs.on_axis(coc_px)
-        low, high = layer_cocs.ends(x)
+        coc_px = coc_px.detach()
+        low, high = layer_cocs.ends(coc_px)
         if high <= low:
             return cls((low,), tolerance)
         nodes = [low, high]
@@ -79,9 +79,9 @@ class Plan:
             if low < node < high and min(abs(node - other) for other in nodes) > gap:
                 nodes.append(node)
 
-        for plane in layer_cocs.plane_nodes(x, tolerance):
+        for plane in layer_cocs.plane_nodes(coc_px, tolerance):
             add(plane, 0.2 * layer_cocs.finest(plane))
-        for border in layer_cocs.border_nodes(x):
+        for border in layer_cocs.border_nodes(coc_px):
             finest = layer_cocs.finest(border)
             if layer_cocs.spacing(border, tolerance) > 2.5 * finest:
                 for node in (border, border - finest, border + finest):
@@ -93,7 +93,7 @@ class Plan:
     @classmethod
     def still(cls, coc_px: Tensor, tolerance: float) -> "Plan":
         """Layers that reach as far as this scene does but do not move with it: for gradients."""
-        return cls(layer_cocs.spaced_nodes(*layer_cocs.ends(layer_cocs.on_axis(coc_px)), tolerance), tolerance)
+        return cls(layer_cocs.spaced_nodes(*layer_cocs.ends(coc_px.detach()), tolerance), tolerance)
 
     @classmethod
     def all(cls, max_coc_px: float, tolerance: float) -> "Plan":
@@ -105,7 +105,7 @@ class Plan:
 
     def of_pixels(self, coc_px: Tensor) -> "Plan":
         """The same plan, told which share of a scene's pixels each layer carries: ``[B, 1, H, W]``."""
-        x = layer_cocs.on_axis(coc_px).clamp(self.nodes[0], self.nodes[-1])
+        x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
         behind = [float(weight_at_or_behind(x, self.nodes, k).double().mean()) for k in range(len(self.nodes) + 1)]
         pixels = tuple(behind[k] - behind[k + 1] for k in range(len(self.nodes)))
         return dataclasses.replace(self, pixels=pixels)
