@@ -1,5 +1,6 @@
 # make demo       render a real photograph focused near, middle and far; pictures go to out/
-# make test       run the tests
+# make test       run the tests, two at a time
+# make sweep      run the hard tests at full length: whole frames instead of strips, up to twenty times as many examples
 # make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
 # All need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
@@ -14,13 +15,16 @@ INSTALLED := $(VENV)/.installed
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
-.PHONY: demo test install check wheel sanitize clean
+.PHONY: demo test sweep install check wheel sanitize clean
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+sweep: $(INSTALLED)
+	HYPOTHESIS_PROFILE=many $(BIN)/python -m pytest -n 2 --dist worksteal -m "hard or sweep"
 
 install: $(INSTALLED)
 

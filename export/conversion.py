@@ -65,7 +65,7 @@ def to_onnx(
 
     Example:
         >>> import tempfile, torchdof
-        >>> dof = torchdof.DepthOfField(torchdof.Camera(), max_coc_px=2.0)
+        >>> dof = torchdof.DepthOfField(torchdof.Camera(), max_coc_px=2.0, occlusion=False)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     len(to_onnx(dof, f"{folder}/dof.onnx").cases) > 5
         True

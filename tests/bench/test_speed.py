@@ -246,11 +246,13 @@ def test_bad_arguments_are_refused_in_a_sentence(
     assert result.output.count("\n") == 1
 
 
-def test_an_exported_file_has_its_row() -> None:
+def test_an_exported_file_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     subject = shipped(64, 96)
     found = [s for s in speed.settings(subject, ["onnxruntime"]) if s.runtime == "onnxruntime"]
     assert [(s.name, s.occlusion) for s in found] == [("onnx 1/255", True), ("onnx 1/255", False)]
     wanted = speed.exact(subject, occlusion=False)
+    exported = speed.renderer(subject, found[1])
+    monkeypatch.setattr(speed, "renderer", lambda *_: exported)
     here = speed.measure_setting(subject, found[1], wanted, 1, 1.0)
     assert here.keeps and 0 < here.rms_255 < 1
     assert not speed.measure_setting(subject, found[1], wanted + 0.1, 1, 1.0).keeps

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import FileLock
 from torch import Tensor
 
 from torchdof import Camera, DepthOfField
@@ -24,15 +25,17 @@ class Exported:
     """One exported module, layers up to 6 pixels, and the eager module of the same layers.
 
     Args:
-        folder: Where the file is written.
+        path: The file, which is written by whoever needs it first.
         camera: Of the cases.
     """
 
-    def __init__(self, folder: Path, camera: Camera) -> None:
+    def __init__(self, path: Path, camera: Camera) -> None:
         self.camera = camera
         dof = DepthOfField(camera, tolerance=8 / 255, max_coc_px=6.0, check=False)
-        to_onnx(dof, folder / "dof.onnx")
-        self.session, self.portable = session(folder / "dof.onnx"), Portable(dof)
+        with FileLock(path.with_suffix(".lock")):
+            if not path.exists():
+                to_onnx(dof, path)
+        self.session, self.portable = session(path), Portable(dof)
 
     def run(self, image: Tensor, depth: Tensor, focus_m: float, f_number: float) -> tuple[Tensor, Tensor]:
         """The picture of the file, and that of the module in float64: ``[B, 3, H, W]`` each."""

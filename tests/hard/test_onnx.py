@@ -26,8 +26,8 @@ pytestmark = pytest.mark.hard
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return exported_module.Exported(tmp_path_factory.mktemp("hard_onnx"), cases.CAMERA)
+def exported(shared_folder: Path) -> Any:
+    return exported_module.Exported(shared_folder / "hard.onnx", cases.CAMERA)
 
 
 @pytest.mark.parametrize("case", cases.CASES, ids=lambda case: f"{case.group}: {case.name}")

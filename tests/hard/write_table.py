@@ -69,7 +69,7 @@ def main() -> None:
     out = parser.parse_args().out
     cases, exported = beside("cases"), beside("exported")
     with tempfile.TemporaryDirectory() as folder:
-        file = exported.Exported(Path(folder), cases.CAMERA)
+        file = exported.Exported(Path(folder) / "dof.onnx", cases.CAMERA)
     rows = table(cases, lambda case: exported.worst_error(file, cases, case))
     head = HEAD.format(
         half=2**-11,

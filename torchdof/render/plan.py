@@ -128,8 +128,9 @@ class Plan:
     def crisp_px(self) -> float:
         """Radius from which on light is blurred at a coarser resolution, all or in part; that softens highlights."""
         coarse = [abs(coc) for coc in self.coc_px if self._scale(coc) > 1]
-        finer = [abs(coc) for coc in self.coc_px if abs(coc) < min(coarse, default=0.0)]
-        return math.inf if not coarse else max(finer, default=0.0)
+        if not coarse:
+            return math.inf
+        return max([0.0, *(abs(coc) for coc in self.coc_px if abs(coc) < min(coarse))])
 
     def blurs(
         self, table: BlurTable, size: tuple[int, int], dtype: torch.dtype, device: torch.device, coarse: bool

@@ -25,7 +25,7 @@ SIZE, SIGMA = 61, 2.0
 
 
 def _simulator() -> ModuleType:
-    path = Path(__file__).parents[1] / "fit" / "simulator.py"
+    path = Path(__file__).parents[1] / "simulator.py"
     spec = importlib.util.spec_from_file_location("hard_capture_simulator", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
