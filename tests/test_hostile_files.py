@@ -151,4 +151,4 @@ def test_a_state_is_loaded_as_weights_only(tmp_path: Path) -> None:
     torch.save(dof.state_dict(), tmp_path / "dof.pt")
     other = DepthOfField(Camera())
     other.load_state_dict(torch.load(tmp_path / "dof.pt", weights_only=True))
-    assert other.camera.focus_m == 1.5 and other.table.to_dict() == dof.table.to_dict()
+    assert other.camera.focus_m == 1.5 and other.options.table.to_dict() == dof.options.table.to_dict()
