@@ -27,7 +27,7 @@ HALF_LARGEST = 64
 
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
-_NO_MEMORY, _CANCELLED = 1, 2
+_NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 
@@ -131,6 +131,7 @@ def render(
 
     Raises:
         MemoryError: If there is too little.
+        OverflowError: If the first surface's light is beyond 1e30, whose sums could overflow; scale it down.
     """
     lights = [light.float().contiguous() for light, _, _ in surfaces]
     cocs = [coc.float().contiguous() for _, coc, _ in surfaces]
@@ -225,6 +226,8 @@ def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32) -> None:
 def _check(status: int) -> None:
     if status == _NO_MEMORY:
         raise MemoryError("there is too little memory to render this image")
+    if status == _TOO_BRIGHT:
+        raise OverflowError("light beyond 1e30 is too bright for sums in float32")
     if status == _CANCELLED:
         raise KeyboardInterrupt
 

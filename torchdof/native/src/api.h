@@ -11,7 +11,12 @@
 #define TORCHDOF_API extern "C" __attribute__((visibility("default")))
 #endif
 
-enum { TORCHDOF_OK = 0, TORCHDOF_NO_MEMORY = 1, TORCHDOF_CANCELLED = 2 };
+enum {
+  TORCHDOF_OK = 0,
+  TORCHDOF_NO_MEMORY = 1,
+  TORCHDOF_CANCELLED = 2,
+  TORCHDOF_TOO_BRIGHT = 3,  // sums of the image's light could overflow: scale it down; other surfaces are not looked at
+};
 
 // What the given surfaces are.
 enum {

@@ -40,6 +40,8 @@ int32_t guarded(const Body &body) {
     return TORCHDOF_OK;
   } catch (const Cancelled &) {
     return TORCHDOF_CANCELLED;
+  } catch (const TooBright &) {
+    return TORCHDOF_TOO_BRIGHT;
   } catch (const std::bad_alloc &) {
     return TORCHDOF_NO_MEMORY;
   } catch (const std::length_error &) {

@@ -116,6 +116,9 @@ void Job::take_scene() {
     });
   };
   find_ends();
+  constexpr float BRIGHTEST = 1.2676506e30f;  // 2 to the 100th
+  for (size_t i = 0; i < surfaces.blocks.size(); i++)
+    if (block_peak[i] > BRIGHTEST) throw TooBright();
   if (std::count(beyond.begin(), beyond.end(), 1)) {
     const float *given = surfaces.coc;
     Buffer<float> within(area);

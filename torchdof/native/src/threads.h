@@ -5,6 +5,7 @@
 namespace torchdof {
 
 struct Cancelled {};
+struct TooBright {};
 
 // Calls body(index, worker) for every index below count, on the calling thread and up to threads - 1 others. Workers
 // are numbered from 0, so that each can have memory of its own. Which worker takes which index is left to chance;
