@@ -74,7 +74,7 @@ def test_an_item_of_a_batch_equals_the_item_alone_with_one_plan_for_all(way: dic
 @pytest.mark.parametrize("size", [(64, 64), (150, 200), (65, 129)])
 @pytest.mark.parametrize("reach", [3.0, 14.0, 40.0])
 def test_tiles_leave_no_seam(occlusion: bool, size: tuple[int, int], reach: float) -> None:
-    # while gradients are recorded the frame is rendered whole, otherwise in tiles
+    # while gradients are recorded the plain engine renders the frame whole, otherwise the compiled one renders tiles
     image, coc = scene(*size, reach)
     plan = Plan.of_scene(coc, 1 / 255)
     tiled = blur_by_coc(image, coc, plan=plan, occlusion=occlusion)

@@ -350,6 +350,7 @@ def test_a_forked_child_renders_after_its_parent_has() -> None:
 
 INTERRUPTED = """
 import os, signal, sys, threading, time, torch
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background is told to ignore it
 os.environ["TORCHDOF_ENGINE"] = "native"
 import torchdof
 from torchdof.render.plan import Plan

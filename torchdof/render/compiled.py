@@ -75,7 +75,10 @@ def _render(
 ) -> Tensor:
     """One item ``[C, H, W]``."""
     height, width = surfaces[0][0].shape[-2:]
-    return native.render(
+    gain = 2.0**-60 if any(_is_huge(light) for light, _, _ in surfaces) else 1.0
+    if gain != 1.0:
+        surfaces = [(light * gain, coc, weight) for light, coc, weight in surfaces]
+    out = native.render(
         surfaces,
         kind,
         nodes=plan.nodes,
@@ -88,6 +91,15 @@ def _render(
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
     )
+    return out if gain == 1.0 else out / gain
+
+
+def _is_huge(light: Tensor) -> bool:
+    """Whether sums of this light could overflow."""
+    ends = torch.stack(torch.aminmax(light))
+    if not torch.isfinite(ends).all():
+        ends = light[torch.isfinite(light)]
+    return ends.numel() > 0 and float(ends.abs().max()) > 2.0**100
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:
