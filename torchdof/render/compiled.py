@@ -75,12 +75,9 @@ def _render(
 ) -> Tensor:
     """One item ``[C, H, W]``."""
     height, width = surfaces[0][0].shape[-2:]
-    gain = 2.0**-60 if any(_is_huge(light) for light, _, _ in surfaces) else 1.0
-    if gain != 1.0:
-        surfaces = [(light * gain, coc, weight) for light, coc, weight in surfaces]
-    out = native.render(
-        surfaces,
-        kind,
+    render = functools.partial(
+        native.render,
+        kind=kind,
         nodes=plan.nodes,
         layers=[(blur.kernel, blur.scale) for blur in blurs],
         psfs=functools.partial(_psfs, options.table, int(width), int(max(height, width))),
@@ -91,7 +88,12 @@ def _render(
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
     )
-    return out if gain == 1.0 else out / gain
+    try:
+        if not any(_is_huge(light) for light, _, _ in (surfaces if kind == "stack" else surfaces[1:])):
+            return render(surfaces)
+    except OverflowError:  # the image is
+        pass
+    return render([(light * 2.0**-60, coc, weight) for light, coc, weight in surfaces]) / 2.0**-60
 
 
 def _is_huge(light: Tensor) -> bool:
