@@ -72,12 +72,26 @@ void Job::find_threshold() {
   parallel(threshold_rows, [&](int row, int) {
     float brightest[COUNT];
     for (int column = 0; column < threshold_columns; column++) {
-      for (int i = 0; i < COUNT; i++) {
-        const int y = 2 * std::min(row * HALF + i / HALF, rows - 1), x = 2 * std::min(column * HALF + i % HALF, columns - 1);
-        const size_t at = (size_t)y * width + x;
-        float most = light[at];
-        for (int c = 1; c < channels; c++) most = std::max(most, light[c * area + at]);
-        brightest[i] = valid && !(valid[at] > 0) ? INFINITY : most;
+      const bool inside = (row + 1) * THRESHOLD_CELL <= height && (column + 1) * THRESHOLD_CELL <= width;
+      for (int i = 0; i < HALF; i++) {
+        const size_t line = (size_t)2 * std::min(row * HALF + i, rows - 1) * width;
+        float peaks[THRESHOLD_CELL];
+        if (inside) {  // all pixels of the row, for they lie side by side
+          const float *from = light + line + column * THRESHOLD_CELL;
+          memcpy(peaks, from, sizeof peaks);
+          for (int c = 1; c < channels; c++)
+            for (int x = 0; x < THRESHOLD_CELL; x++) peaks[x] = std::max(peaks[x], from[c * area + x]);
+          if (valid)
+            for (int x = 0; x < THRESHOLD_CELL; x++) peaks[x] = valid[line + column * THRESHOLD_CELL + x] > 0 ? peaks[x] : INFINITY;
+        } else {
+          for (int j = 0; j < HALF; j++) {
+            const size_t at = line + 2 * std::min(column * HALF + j, columns - 1);
+            peaks[2 * j] = light[at];
+            for (int c = 1; c < channels; c++) peaks[2 * j] = std::max(peaks[2 * j], light[c * area + at]);
+            if (valid && !(valid[at] > 0)) peaks[2 * j] = INFINITY;
+          }
+        }
+        for (int j = 0; j < HALF; j++) brightest[i * HALF + j] = peaks[2 * j];
       }
       std::nth_element(brightest, brightest + COUNT / 5 - 1, brightest + COUNT, std::greater<float>());
       const float largest = 3.4028234663852886e38f;
