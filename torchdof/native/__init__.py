@@ -123,7 +123,7 @@ def render(
         extend: Light goes on beyond the frame.
         normalize: As in :class:`torchdof.DepthOfField`.
         masked: Values may be NaN or infinite; such pixels pass through.
-        highlights: Highlights are traced where layers would not do.
+        highlights: Highlights are splatted ray by ray where layers would not do.
         crisp_px: Blur from which on layers soften highlights.
 
     Returns:
