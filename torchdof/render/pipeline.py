@@ -120,14 +120,8 @@ def _render_item(
 ) -> Tensor:
     """The picture ``[B, C, H, W]`` of float maps with a plan: the one entry to both engines.
 
-    Args:
-        plan: Layers.
-        options: Options.
-        light: An image ``[B, C, H, W]``; with ``cover`` a stack ``[B, N, C, H, W]``, near to far.
-        coc: Its signed coc ``[B, 1, H, W]``; of a stack ``[B, N, 1, H, W]``.
-        behind_light: What is seen where the nearer surfaces of the image are taken away, if it is known.
-        behind_coc: Its coc.
-        cover: How much of each pixel each layer of a stack covers, ``[B, N, 1, H, W]``.
+    An image ``[B, C, H, W]`` and its coc ``[B, 1, H, W]``, with what is seen where its nearer surfaces are taken away,
+    if that is known; or, with how much each covers ``[B, N, 1, H, W]``, a stack of layers ``[B, N, ...]``, near to far.
     """
     if plan.nodes != (0.0,):
         picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover)

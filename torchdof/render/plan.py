@@ -16,21 +16,14 @@ from .layer_weights import from_blur_axis, weight_at_or_behind
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
-KERNELS_PER_PX = 32
-"""Of radius, for highlights."""
-
+KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
 _kernels = KernelCache(256 * 2**20)
 
 
 @dataclasses.dataclass(frozen=True)
 class Blur:
-    """How one layer is scattered.
-
-    Args:
-        kernel: ``[1 or C, k, k]``, in pixels of the layer's resolution.
-        scale: The layer is convolved at every ``scale``-th pixel.
-    """
+    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels."""
 
     kernel: Tensor
     scale: int
