@@ -6,8 +6,6 @@
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 
-static float coc_at(double node) { return (float)(node == 0 ? 0 : node > 0 ? node + 0.5 : node - 0.5); }
-
 Job::Job(const torchdof_scene &scene)
     : scene(scene), height(scene.height), width(scene.width), channels(scene.channels), colours(scene.kernel_colours) {
   const float *values = scene.kernels;
@@ -17,11 +15,10 @@ Job::Job(const torchdof_scene &scene)
     l.half = scene.halves[k];
     l.node = scene.nodes[k];
     l.first = k == 0;
-    l.last = k == scene.layers - 1;
     l.before = (float)(l.first ? l.node : scene.nodes[k - 1]);
     l.per_before = l.first ? 0.0f : (float)(1.0 / (l.node - scene.nodes[k - 1]));
     l.at = (float)l.node;
-    l.per_after = l.last ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
+    l.per_after = k == scene.layers - 1 ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
     const int side = 2 * l.half + 1;
     for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half));
     layers.push_back(std::move(l));
@@ -143,10 +140,9 @@ void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
   const bool several = layers.size() > 1, background = scene.kind == TORCHDOF_BACKGROUND;
+  const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
   bool bright = scene.occlusion;
   if (several && !scene.occlusion && scene.highlights) {  // coarse layers soften what is brighter than a display shows
-    float reach = 0;
-    for (const Layer &l : layers) reach = std::max(reach, std::fabs(coc_at(l.node)));
     if (scene.crisp_px < reach)
       for (size_t i = 0; i < surfaces.blocks.size(); i++) bright |= block_peak[i] > 1.0f;
   }
@@ -159,9 +155,7 @@ void Job::begin() {
   } else if (limited && scene.occlusion) {
     surfaces.count = 2;
     split_mixed();
-    float reach = 2.0f;
-    for (const Layer &l : layers) reach = std::max(reach, std::fabs(coc_at(l.node)));
-    levels = std::min((int)std::ceil(std::log2((double)reach)) + 1, 7);
+    levels = std::min((int)std::ceil(std::log2(std::max(2.0, (double)reach))) + 1, 7);
     fill_hidden();
   }
   if (limited && scene.highlights) extract_highlights();

@@ -111,7 +111,7 @@ class Surfaces {
 };
 
 struct Ray {
-  int surface, row, column;
+  int row, column;
   int radius;  // index of its kernel
   float coc;
 };
@@ -128,9 +128,12 @@ struct Layer {
   int scale = 1, half = 0;
   double node = 0;
   float before = 0, per_before = 0, at = 0, per_after = 0;  // ramps to the layer and beyond it
-  bool first = false, last = false;
+  bool first = false;
   std::vector<Kernel> kernels;  // one, or one a colour
 };
+
+// Signed coc of a place on the blur axis.
+inline float coc_at(double node) { return (float)(node == 0 ? 0 : node > 0 ? node + 0.5 : node - 0.5); }
 
 struct Job {
   explicit Job(const torchdof_scene &scene);

@@ -218,7 +218,7 @@ void Job::extract_highlights() {
         weight = (i ? b.weight : b.seen)[within];
       }
       const int radius = (int)std::nearbyint((double)p.coc * STEPS_PER_PX);
-      rays.push_back({i, p.row, p.column, radius, p.coc});
+      rays.push_back({p.row, p.column, radius, p.coc});
       for (int c = 0; c < channels; c++) {
         const float excess = light[c * step] * share;
         light[c * step] -= excess;

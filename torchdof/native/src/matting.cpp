@@ -285,8 +285,7 @@ void Job::put_before_background() {
   for (int i = 0; i < 3; i++) copies.emplace_back(area * (channels + 2));
   float *planes[3];
   for (int i = 0; i < 3; i++) planes[i] = copies[copies.size() - 3 + i].data();
-  const float low = (float)(layers.front().node + (layers.front().node > 0 ? 0.5 : layers.front().node < 0 ? -0.5 : 0));
-  const float high = (float)(layers.back().node + (layers.back().node > 0 ? 0.5 : layers.back().node < 0 ? -0.5 : 0));
+  const float low = coc_at(layers.front().node), high = coc_at(layers.back().node);
   const float *behind_light = scene.light[1], *behind_coc = scene.coc[1];
   parallel(height, [&](int y, int) {
     std::vector<const float *> own(channels), other(channels);
