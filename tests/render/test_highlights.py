@@ -11,6 +11,7 @@ from torch import Tensor
 from torchdof import BlurTable, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.render import highlights
+from torchdof.render.disocclusion import HIDDEN_WEIGHT
 from torchdof.render.surfaces import Surface
 
 LAMP = 3000.0
@@ -70,12 +71,18 @@ def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) 
     coc = stretch * torch.tensor([9.0, 4.5, -1.5, 1.1], dtype=torch.float64).repeat(10)
     coc_px = stretch * coc_px
     step = torch.arange(-half, half + 1)
-    hiding = highlights._Hiding(coc_px)
+    covers = torch.rand(coc_px.shape, dtype=torch.float64, generator=made)  # of the own surface and of a second one
+    other_px = stretch * 3.0 + torch.zeros_like(coc_px)
+    others = torch.where(covers < 0.3, 0.9 - covers, HIDDEN_WEIGHT)  # what is hidden covers nothing
+    nothing = torch.zeros_like(coc_px)
+    hiding = highlights._Hiding([Surface(nothing, coc_px, covers), Surface(nothing, other_px, others)])
     hidden = hiding.hidden(torch.zeros_like(source), row, column, coc, step, 9.0 * stretch)
 
     wanted = torch.zeros_like(hidden)
     for k in range(int(20 * stretch)):
-        layer = (1.0 - (coc_px - hiding.low - k).abs()).clamp_min(0.0).expand(len(source), -1, -1, -1)
+        parts = ((coc_px, covers), (other_px, others - HIDDEN_WEIGHT))
+        layer = sum(part * (1.0 - (place - hiding.low - k).abs()).clamp_min(0.0) for place, part in parts)
+        layer = layer.expand(len(source), -1, -1, -1)
         scale = (1.0 - (hiding.low + k) / coc)[:, None]
         y, x = row[:, None] + step * scale, column[:, None] + step * scale
         y, x = (y * 2 / (height - 1) - 1)[:, :, None], (x * 2 / (width - 1) - 1)[:, None, :]

@@ -4,7 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchdof.render.matting import matte
+from torchdof import blur_by_coc
+from torchdof.render.highlights import threshold
+from torchdof.render.matting import emitters_behind, matte
 
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
@@ -40,3 +42,56 @@ def test_no_light_is_lost_in_a_split() -> None:
     image, coc = random_scene()
     own, other, _, share = matte(image, coc)
     assert torch.allclose((1 - share) * own + share * other, image, atol=1e-5)
+
+
+def strands_before_a_lamp() -> tuple[Tensor, Tensor, Tensor]:
+    """Dark strands of a pixel, every third column, in focus before a lamp; depth finds two thirds of each."""
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
+    is_strand = columns % 3 == 0
+    lamp = ((rows - 30) ** 2 + (columns - 40) ** 2 <= 16) * 50.0
+    light = torch.where(is_strand, 0.05 + 0.4 * lamp, 0.2 + lamp).expand(1, 3, -1, -1)
+    coc = torch.where(is_strand & (rows % 3 > 0), 0.0, 12.0).expand(1, 1, -1, -1)
+    return light, coc, is_strand & (lamp > 0) & (rows % 3 > 0)
+
+
+def test_a_lamp_seen_through_strands_is_given_back_to_its_surface() -> None:
+    light, coc, shone_through = strands_before_a_lamp()
+    own, other, other_coc, weight = emitters_behind(light, coc, threshold(light), None, matte(light, coc))
+    inner = shone_through
+    assert int(inner.sum()) > 5
+    assert torch.allclose(weight[0, 0][inner], torch.tensor(0.4), atol=0.05)
+    assert torch.allclose(other_coc[0, 0][inner], torch.tensor(12.0), atol=0.1)
+    assert float(own[..., inner].max()) < 1.0 and float(other[..., inner].min()) > 45.0
+    torch.testing.assert_close((1 - weight) * own + weight * other, light, rtol=1e-5, atol=1e-5)
+    sharp = blur_by_coc(light, coc)[0, 0]
+    assert float(sharp.max()) < 8.0, "no pixel of the lamp, 20 or more, stays in focus"
+
+
+def test_a_lamp_on_a_near_surface_stays_there() -> None:
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
+    is_post = (columns >= 30) & (columns < 42)
+    lamp = (rows >= 30) & (rows < 32) & (columns >= 40) & (columns < 42)
+    light = torch.where(lamp, 50.0, torch.where(is_post, 0.05, 0.2)).expand(1, 3, -1, -1).clone()
+    light[..., 30:32, 42] = 20.0  # the rim of the lamp, in pixels whose centre shows the wall
+    coc = torch.where(is_post, 0.0, 12.0).expand(1, 1, -1, -1)
+    found = matte(light, coc)
+    for before, after in zip(found, emitters_behind(light, coc, threshold(light), None, found), strict=True):
+        torch.testing.assert_close(before, after, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("times", [1e-6, 1e-3, 1e6, 1e25])
+def test_exposure_decides_nothing(times: float, dtype: torch.dtype) -> None:
+    image, coc = (t.to(dtype) for t in random_scene())
+    image[..., 100:104, 20:24] = 300.0
+    torch.testing.assert_close(blur_by_coc(image * times, coc) / times, blur_by_coc(image, coc), rtol=1e-4, atol=1e-5)
+
+
+def test_split_light_is_no_brighter_and_no_darker_than_the_image() -> None:
+    made = torch.Generator().manual_seed(3)
+    for _ in range(20):
+        image = 0.2 + 0.6 * torch.rand(1, 3, 40, 40, generator=made)
+        coc = 20.0 * torch.rand(1, 1, 40, 40, generator=made).round(decimals=0)
+        for light in matte(image, coc)[:2]:
+            light = light[(light != 0).all(1, keepdim=True).expand_as(light)]  # 0 where there is no second surface
+            assert float(light.min()) >= 0.2 - 1e-5 and float(light.max()) <= 0.8 + 1e-5

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ..optics.blur_table import BlurTable
 from . import pixels
+from .disocclusion import HIDDEN_WEIGHT
 from .plan import kernels_for
 from .surfaces import Surface
 
@@ -127,13 +128,13 @@ def _need_splats(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
     return needed
 
 
-def splat(rays: Sequence[Highlights], coc_px: Tensor, table: BlurTable, occlusion: bool = True) -> Tensor:
-    """Scatter highlights to ``[B, C, H, W]``, each ray to where it lands unless a nearer surface is in its way.
+def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable, occlusion: bool = True) -> Tensor:
+    """Scatter highlights to ``[B, C, H, W]``, each ray to where it lands but for what nearer surfaces take of it.
 
-    What is in the way is told by the coc that each pixel shows, ``[B, 1, H, W]``; without occlusion all rays pass.
-    Differentiable in the light and coc of the rays.
+    These are the surfaces that an image shows, each pixel's own first; without occlusion all rays pass. Differentiable
+    in the light and coc of the rays and in what is in their way.
     """
-    batch, _, height, width = coc_px.shape
+    batch, _, height, width = shown[0].coc_px.shape
     longest = max(height, width)
     source, light, coc = (torch.cat(parts, -1) for parts in zip(*rays, strict=True))
     order = torch.argsort(coc.detach().abs())
@@ -148,7 +149,7 @@ def splat(rays: Sequence[Highlights], coc_px: Tensor, table: BlurTable, occlusio
     across = width + 2 * margin
     area = (height + 2 * margin) * across
     splats = light.new_zeros(len(light), batch * area)
-    hiding = _Hiding(coc_px) if occlusion else None
+    hiding = _Hiding(shown) if occlusion else None
     start = 0
     while start < len(radii):  # sources of increasing blur, as many as make a bounded number of taps
         stop = min(len(radii), start + max(1, _TAPS // (2 * half_of(radii[start]) + 1) ** 2))
@@ -170,19 +171,24 @@ def splat(rays: Sequence[Highlights], coc_px: Tensor, table: BlurTable, occlusio
 
 
 class _Hiding:
-    """What may stand in the way of rays: what an image shows, in bins of 1 px of its coc ``[B, 1, H, W]``."""
+    """What may stand in the way of rays: surfaces that an image shows, in bins of 1 px of their coc."""
 
-    def __init__(self, coc_px: Tensor) -> None:
+    def __init__(self, surfaces: Sequence[Surface]) -> None:
+        coc_px = surfaces[0].coc_px
         self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
         self.low = float(coc_px.detach().min())
-        self.place = (coc_px[:, 0] - self.low).flatten()  # in bins
-        counts = torch.bincount(self.place.detach().floor().long()).tolist()
+        # place in bins, and the part of a pixel that is covered; what is hidden covers nothing
+        covers = [torch.ones_like(s.coc_px) if s.weight is None else s.weight for s in surfaces]
+        covers = [covers[0], *((c - HIDDEN_WEIGHT).clamp_min(0.0) for c in covers[1:])]
+        self.shown = [(s.coc_px - self.low, cover) for s, cover in zip(surfaces, covers, strict=True)]
+        occupied = torch.cat([place.detach()[cover > 0] for place, cover in self.shown])
+        counts = torch.bincount(occupied.floor().long()).tolist()
         self.bins = sorted({k for i, count in enumerate(counts) if count for k in (i, i + 1)})
         # how many cells of 8 px above and left of each place show something in a bin
         self.sums = []
         for k in self.bins:
-            shown = ((coc_px.detach() - self.low - k).abs() < 1.0).to(torch.float32)
-            cells = functional.max_pool2d(shown, _COARSE_CELL, ceil_mode=True)[:, 0]
+            covered = sum(((place.detach() - k).abs() < 1.0) & (cover > 0) for place, cover in self.shown)
+            cells = functional.max_pool2d(covered.clamp(max=1).to(torch.float32), _COARSE_CELL, ceil_mode=True)[:, 0]
             self.sums.append(functional.pad(cells.cumsum(-1).cumsum(-2), (1, 0, 1, 0)))
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor, farthest: float) -> Tensor:
@@ -208,7 +214,12 @@ class _Hiding:
                 way = scale[hit, None] * step
                 rows, columns = (row[hit, None] + way)[:, :, None], (column[hit, None] + way)[:, None, :]
                 around, down, right = pixels.corners(item[hit, None, None], rows, columns, self.height, self.width)
-                shown = [(1.0 - (self.place[pixel] - k).abs()).clamp_min(0.0) for pixel in around]
-                upper, lower = torch.lerp(shown[0], shown[1], right), torch.lerp(shown[2], shown[3], right)
+                covered = [self._covered(pixel, k) for pixel in around]
+                upper, lower = torch.lerp(covered[0], covered[1], right), torch.lerp(covered[2], covered[3], right)
                 hidden = hidden.index_add(0, hit, torch.lerp(upper, lower, down))
         return hidden.clamp(max=1.0)
+
+    def _covered(self, pixel: Tensor, k: int) -> Tensor:
+        """Part of pixels (any shape) that surfaces in a bin cover."""
+        maps = [(place.flatten()[pixel], cover.flatten()[pixel]) for place, cover in self.shown]
+        return torch.stack([cover * (1.0 - (place - k).abs()).clamp_min(0.0) for place, cover in maps]).sum(0)

@@ -7,6 +7,7 @@ edges only.
 """
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as functional
@@ -14,27 +15,39 @@ from torch import Tensor
 
 from . import pixels
 
-__all__ = ["NEVER_PX", "matte"]
+__all__ = ["NEVER_PX", "Matted", "emitters_behind", "matte"]
 
 NEVER_PX = 1e9
 """A coc that no pixel has."""
 
-_EDGE_PX = 1.0  # difference in coc of neighbours from which on they may be two surfaces
-_REACH = 2  # pixels around a mixed pixel that tell what its two surfaces look like
-_UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
+_EDGE_PX = 0.5  # difference in coc of neighbours from which on they may be two surfaces
+_UNCLEAN = 1e-2  # weight of a pixel that may be mixed itself
+_FALLOFF = math.exp(-1 / 4.5)
 _TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
-_TEXTURE = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
-_LEAST_WEIGHT = 0.1  # a smaller weight is more likely texture than a second surface
+_EMITTER_REACH = 3  # pixels around a highlight that tell on which surface it lies
+_MOST_WEIGHT = 0.98  # of a highlight's pixel that a farther emitter may have
 
 
-def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+class Matted(NamedTuple):
+    """Surfaces of pixels: light of the own and of the other one ``[B, C, H, W]``, the other's coc and its weight.
+
+    The last two are ``[B, 1, H, W]``; the weight is the part of the pixel that the other surface covers, 0 away from
+    edges.
+    """
+
+    own: Tensor
+    other: Tensor
+    other_coc_px: Tensor
+    other_weight: Tensor
+
+
+def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     """Matting of pixels at depth edges: the surface they are attributed to, and the one across the edge.
 
-    With F and B the light of the two surfaces near the pixel, the weight ``a`` of F in a pixel is the least-squares
+    With F and B the light of the two surfaces beside the pixel, the weight ``a`` of F in a pixel is the least-squares
     solution of ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on
-    that surface) and drawn towards one surface alone where the contrast of the two is small against their texture, or
-    where the texture of the pixel's own surface explains it and moves little light. The light of the two parts sums to
-    the pixel's.
+    that surface) and drawn towards one surface alone where the contrast of the two is small against their texture. The
+    light of the two parts sums to the pixel's, and both lie within the light around.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -42,8 +55,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[T
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
 
     Returns:
-        ``(own, other, other_coc_px, other_weight)``: light of the pixel's own surface and the other ``[B, C, H, W]``,
-        the other's coc and the part of the pixel that it covers, in [0, 1/2], ``[B, 1, H, W]``; 0 away from edges.
+        The surfaces; the weight of the other one is in [0, 1/2].
     """
     # pixels beside another surface
     known = None if valid is None else valid > 0
@@ -52,66 +64,117 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[T
     is_edge = high + low > _EDGE_PX
     edge_pixels = pixels.indices(is_edge if known is None else is_edge & known)
 
-    # the two surfaces are as near and as far as the pixel's direct neighbours
+    # the two surfaces are as near and as far as the pixels around; no absolute level of light decides
     own_coc, colour = pixels.pick(coc_px, edge_pixels)[0], pixels.pick(light, edge_pixels)
-    neighbours = pixels.around(edge_pixels, coc_px, 1)
-    near = far = pixels.pick(coc_px, neighbours)[0]
+    window = pixels.around(edge_pixels, coc_px, 1)
+    window_light, window_coc = pixels.pick(light, window), pixels.pick(coc_px, window)[0]  # [C, 9, P], [9, P]
+    brightest = window_light.detach().amax((0, 1)).clamp_min(torch.finfo(light.dtype).tiny)
+    colour, window_light = colour / brightest, window_light / brightest
+    near = far = window_coc
     if known is not None:
-        known_neighbours = pixels.pick(known, neighbours)[0]
-        near = torch.where(known_neighbours, near, NEVER_PX)
-        far = torch.where(known_neighbours, far, -NEVER_PX)
+        window_known = pixels.pick(known, window)[0]
+        near, far = torch.where(window_known, near, NEVER_PX), torch.where(window_known, far, -NEVER_PX)
     near, far = near.amin(0), far.amax(0)
     is_near = own_coc - near < far - own_coc
     edge = ((far - near) / _EDGE_PX - 1.0).clamp(0.0, 1.0)  # how surely there are two
     edges = pixels.put(torch.zeros_like(coc_px), edge_pixels, edge)
     gap = (far - near).clamp_min(1e-6)
 
-    # their light: means over what is around, of pixels that lie on one of them and are hardly mixed themselves
-    window = pixels.around(edge_pixels, coc_px, _REACH)
-    window_light, window_coc, window_edge = (pixels.pick(t, window) for t in (light, coc_px, edges))  # [C or 1, n, P]
-    reach = range(-_REACH, _REACH + 1)
-    falloff = light.new_tensor([math.exp(-(dy * dy + dx * dx) / 4.5) for dy in reach for dx in reach])
-    weight = (1.0 - window_edge[0] + _UNCLEAN) * falloff[:, None]
+    # their light: means over pixels around that lie on one of them and are hardly mixed themselves
+    falloff = light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+    weight = (1.0 - pixels.pick(edges, window)[0] + _UNCLEAN) * falloff[:, None]
     if valid is not None:
         weight = weight * pixels.pick(valid, window)[0]
-    nearness = (far - window_coc[0]) / gap
+    nearness = (far - window_coc) / gap
     near_weight, far_weight = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
     back, back_variance = _mean(window_light, far_weight)
     # a thin foreground has no clean pixel: trust the one that differs most from what is behind
-    differs = near_weight * ((window_light - back[:, None]) ** 2).sum(0) + 1e-12
-    front, front_variance = _mean(window_light, torch.where(near_weight.sum(0) > 20 * _UNCLEAN, near_weight, differs))
+    differs = ((window_light - back[:, None]) ** 2).sum(0)
+    differs = (differs + 1e-12) / (differs.amax(0) + 1e-12)
+    clean = (0.1 * near_weight.sum(0) / _UNCLEAN - 1.0).clamp(0.0, 1.0)
+    front, front_variance = _mean(window_light, near_weight * torch.lerp(differs, torch.ones_like(clean), clean))
 
     # a = (I - B) (F - B) / (F - B)^2, as far as it can be trusted
     contrast = front - back
     strength = (contrast**2).sum(0)
     fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
     misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
-    trust = strength / (strength + 4e-4 + _TRUST * (back_variance + front_variance + misfit))
-    fitted_weight = torch.where(is_near, 1.0 - fitted, fitted)  # weight of the other surface
-    # what lies behind is seen sharp where it is nearer to focus, and so is every error of its matte
-    own_variance = torch.where(is_near, front_variance, back_variance)
-    texture_weight = (_TEXTURE * own_variance / strength.clamp_min(1e-12)).clamp_min(1e-12).sqrt()
-    trusted = fitted_weight - torch.where(far.abs() < near.abs(), texture_weight, 0.0)
-    trusted = trusted * (2.0 * trusted / _LEAST_WEIGHT - 1.0).clamp(0.0, 1.0)
-    # the light of a highlight counts even where its weight is small
-    moved = fitted_weight * (strength / (colour**2).sum(0).clamp_min(1e-18)).clamp_min(1e-12).sqrt()
-    trusted = torch.lerp(trusted, fitted_weight, (4.0 * moved - 1.0).clamp(0.0, 1.0))
+    trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit)).clamp_min(1e-12)
     # the pixel's depth must be that of one of the two: in between, a steep surface goes on
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
-    certainty = trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
-    other_weight = trusted.clamp(0.0, 0.5) * certainty * edge
+    certainty = edge * trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
+    weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * certainty  # of the other surface
 
-    # what the mean colours do not explain goes to both; the own part takes what the other leaves: no light is lost
+    # what the mean colours do not explain goes to both; no light is lost, and none is brighter or darker than the image
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
-    unexplained = colour - (1.0 - other_weight) * own_mean - other_weight * other_mean
-    other = (other_mean + unexplained * other_weight / (other_weight**2 + (1.0 - other_weight) ** 2)).clamp_min(0.0)
-    own = (colour - other_weight * other) / (1.0 - other_weight)
-    return (
-        pixels.put(light, edge_pixels, own),
-        pixels.put(torch.zeros_like(light), edge_pixels, other),
+    own_weight = 1.0 - weight
+    unexplained = colour - own_weight * own_mean - weight * other_mean
+    moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
+    item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
+    least, most = (light.detach().flatten(2).aminmax(dim=2)[i][item].t() / brightest for i in (0, 1))
+    moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
+    moved = torch.minimum(moved.maximum(weight * least), weight * most)
+    own = (colour - moved) / own_weight
+    other = torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
+    return Matted(
+        pixels.put(light, edge_pixels, own * brightest),
+        pixels.put(torch.zeros_like(light), edge_pixels, other * brightest),
         pixels.put(coc_px, edge_pixels, torch.where(is_near, far, near)),
-        pixels.put(torch.zeros_like(coc_px), edge_pixels, other_weight),
+        pixels.put(torch.zeros_like(coc_px), edge_pixels, weight),
     )
+
+
+def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Tensor | None, surfaces: Matted) -> Matted:
+    """Gives the light of highlights back to the farther surface on which they lie.
+
+    An emitter seen through hair or twigs shines into pixels whose depth is that of a strand. A highlight's pixel is
+    such a one where its own surface is dim beside it and farther pixels around are about as bright. Of its light what
+    exceeds the own surface's is then the farther surface's, which may cover more than half of the pixel.
+
+    Args:
+        light: ``[B, C, H, W]``.
+        coc_px: ``[B, 1, H, W]``, signed.
+        threshold: Light from which on a pixel is a highlight's, ``[B, 1, H, W]``.
+        valid: As for :func:`matte`.
+        surfaces: What :func:`matte` returns.
+
+    Returns:
+        The same, changed at those pixels.
+    """
+    brightest = light.amax(1, keepdim=True)
+    is_bright = brightest > threshold
+    bright = pixels.indices(is_bright if valid is None else is_bright & (valid > 0))
+    window = pixels.around(bright, coc_px, _EMITTER_REACH)
+    seen, own_coc, limit = pixels.pick(light, bright), pixels.pick(coc_px, bright)[0], pixels.pick(threshold, bright)[0]
+    peaks, own_peak = pixels.pick(brightest, window)[0], pixels.pick(brightest, bright)[0]
+    excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
+    scale = peaks.detach().amax(0)
+    colour, seen, peaks, own_peak = pixels.pick(light, window) / scale, seen / scale, peaks / scale, own_peak / scale
+    farther_by = pixels.pick(coc_px, window)[0] - own_coc
+    reach = range(-_EMITTER_REACH, _EMITTER_REACH + 1)
+    falloff = light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in reach for dx in reach])[:, None]
+    counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
+    farther, same = counted * (farther_by - 1.0).clamp(0.0, 1.0), counted * (2.0 - farther_by.abs()).clamp(0.0, 1.0)
+
+    # the own surface where it is dim, and how surely the emitter is the farther one
+    dim = same * falloff * (2.5 - 5.0 * peaks / own_peak.clamp_min(1e-12)).clamp(0.0, 1.0)
+    lit = farther * falloff * peaks**2
+    far_peak, same_peak = (farther * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
+    sureness = excess * (10.0 * far_peak / same_peak - 5.0).clamp(0.0, 1.0) * (10.0 * dim.sum(0)).clamp(max=1.0)
+
+    front = (colour * dim).sum(1) / dim.sum(0).clamp_min(1e-12)
+    floor, top = front.amax(0), torch.maximum(far_peak, same_peak)
+    weight = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
+    emitter = ((seen - (1.0 - weight) * front) / weight).clamp_min(0.0)
+    emitter_coc = own_coc + (farther_by * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
+    # what was found without it fades out first
+    _, other, other_coc, other_weight = (pixels.pick(t, bright) for t in surfaces)
+    is_emitter = sureness > 0.5
+    other, other_coc = torch.where(is_emitter, emitter * scale, other), torch.where(is_emitter, emitter_coc, other_coc)
+    weight = torch.where(is_emitter, weight, other_weight) * (2.0 * sureness - 1.0).abs()
+    own = (seen * scale - weight * other) / (1.0 - weight)
+    changed = zip(surfaces, (own, other, other_coc, weight), strict=True)
+    return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
 
 
 def _mean(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

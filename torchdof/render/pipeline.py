@@ -147,7 +147,7 @@ def _render_item(
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
     coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
     limit = None
-    if len(plan.nodes) > 1 and (options.occlusion or (coarse and bool((light.detach() > 1.0).any()))):
+    if len(plan.nodes) > 1 and (options.occlusion or coarse):
         limit = highlights.threshold(light, weight)
 
     # the surfaces of each pixel, and what is behind all of them
@@ -159,12 +159,13 @@ def _render_item(
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
         surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels)
 
-    # the highlights of these, ray by ray
+    # the highlights of these, ray by ray; a known background is in nobody's way
     splats = None
     if limit is not None and plan.rays:
+        shown = surfaces if behind_light is None else surfaces[1::-1]
         extracted = [highlights.extract(s, limit, coc if options.occlusion else None, crisp_px) for s in surfaces]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
-        splats = highlights.splat(rays, coc, options.table, options.occlusion) if rays else None
+        splats = highlights.splat(rays, shown, options.table, options.occlusion) if rays else None
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, splats)
     return out if valid is None else torch.where(valid, out, image)

@@ -95,24 +95,36 @@ void Job::take_scene() {
     surfaces.coc = clean_coc.data();
   }
   block_peak = Buffer<float>(surfaces.blocks.size());
-  auto find_ends = [&] {
-    parallel(surfaces.block_rows, [&](int by, int) {
-      for (int bx = 0; bx < surfaces.block_columns; bx++) {
-        const int y0 = by * BLOCK, x0 = bx * BLOCK, rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
-        const size_t at = (size_t)y0 * width + x0;
-        float block_least = NEVER, block_most = -NEVER, peak = -INFINITY;
-        ends_of(surfaces.coc + at, width, rows, columns, block_least, block_most);
-        float dimmest = INFINITY;
-        for (int c = 0; c < channels; c++) ends_of(surfaces.light + c * area + at, width, rows, columns, dimmest, peak);
-        const int block = by * surfaces.block_columns + bx;
-        block_low[block] = block_least;
-        block_high[block] = block_most;
-        block_peak[block] = peak;
-        if (block_least < low || block_most > high) beyond[by] = 1;
-      }
-    });
+  auto find_coc_ends = [&](int by, int bx) {
+    const int y0 = by * BLOCK, x0 = bx * BLOCK, block = by * surfaces.block_columns + bx;
+    float least = NEVER, most = -NEVER;
+    ends_of(surfaces.coc + (size_t)y0 * width + x0, width, std::min(BLOCK, height - y0), std::min(BLOCK, width - x0), least, most);
+    block_low[block] = least;
+    block_high[block] = most;
+    if (least < low || most > high) beyond[by] = 1;
   };
-  find_ends();
+  std::vector<float> leasts((size_t)channels * surfaces.block_rows, INFINITY), mosts(leasts.size(), -INFINITY);
+  parallel(surfaces.block_rows, [&](int by, int) {
+    for (int bx = 0; bx < surfaces.block_columns; bx++) {
+      find_coc_ends(by, bx);
+      const int y0 = by * BLOCK, x0 = bx * BLOCK, rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
+      float &peak = block_peak[by * surfaces.block_columns + bx];
+      peak = -INFINITY;
+      for (int c = 0; c < channels; c++) {
+        float least = INFINITY, most = -INFINITY;
+        ends_of(surfaces.light + c * area + (size_t)y0 * width + x0, width, rows, columns, least, most);
+        peak = std::max(peak, most);
+        leasts[by * channels + c] = std::min(leasts[by * channels + c], least);
+        mosts[by * channels + c] = std::max(mosts[by * channels + c], most);
+      }
+    }
+  });
+  light_least.assign(channels, INFINITY);
+  light_most.assign(channels, -INFINITY);
+  for (size_t i = 0; i < leasts.size(); i++) {
+    light_least[i % channels] = std::min(light_least[i % channels], leasts[i]);
+    light_most[i % channels] = std::max(light_most[i % channels], mosts[i]);
+  }
   constexpr float BRIGHTEST = 1.2676506e30f;  // 2 to the 100th
   for (size_t i = 0; i < surfaces.blocks.size(); i++)
     if (block_peak[i] > BRIGHTEST) throw TooBright();
@@ -124,7 +136,9 @@ void Job::take_scene() {
     });
     clean_coc = std::move(within);
     surfaces.coc = clean_coc.data();
-    find_ends();
+    parallel(surfaces.block_rows, [&](int by, int) {
+      for (int bx = 0; bx < surfaces.block_columns; bx++) find_coc_ends(by, bx);
+    });
   }
   if (surfaces.valid)
     for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
@@ -141,12 +155,8 @@ void Job::begin() {
   if (scene.kind == TORCHDOF_STACK) return;
   const bool several = layers.size() > 1, background = scene.kind == TORCHDOF_BACKGROUND;
   const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
-  bool bright = scene.occlusion;
-  if (several && !scene.occlusion && scene.highlights) {  // coarse layers soften what is brighter than a display shows
-    if (scene.crisp_px < reach)
-      for (size_t i = 0; i < surfaces.blocks.size(); i++) bright |= block_peak[i] > 1.0f;
-  }
-  const bool limited = several && bright;
+  // without occlusion highlights matter where coarse layers would soften them
+  const bool limited = several && (scene.occlusion || (scene.highlights && scene.crisp_px < reach));
   if (limited) find_threshold();
   if (background) {
     surfaces.count = 2;

@@ -159,6 +159,7 @@ struct Job {
 
   Buffer<float> clean_light, clean_coc, validity;  // copies of what is given, where it may not be taken as it is
   std::vector<Buffer<float>> copies;
+  std::vector<float> light_least, light_most;        // of each channel
   Buffer<float> block_low, block_high, block_peak;  // of each block the least and largest coc, and the largest light
 
   template <typename Body>

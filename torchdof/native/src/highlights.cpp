@@ -232,10 +232,22 @@ void Job::extract_highlights() {
   for (Ray &ray : rays) ray.radius = (int)(std::lower_bound(radii.begin(), radii.end(), ray.radius) - radii.begin());
 }
 
+// The surfaces that pixels show, own and other, in a row from column x on within one block column, with the part of a
+// pixel that each covers; what is hidden covers nothing.
+template <typename Body>
+static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
+  const int own = surfaces.whole() ? 1 : 0;  // before a known background the other surface comes first
+  const float *coc, *weight;
+  for (int i : {own, 1 - own}) {
+    if (!surfaces.row(i, y, x, light, coc, weight)) continue;
+    const float least = i == own ? 0.0f : HIDDEN_WEIGHT;
+    body(coc, [=](int j) { return weight ? std::max(weight[j] - least, 0.0f) : 1.0f; });
+  }
+}
+
 Visibility look_at(const Job &job) {
   Visibility v;
   const int H = job.height, W = job.width;
-  const float *coc = job.surfaces.coc;
   float low = NEVER, high = -NEVER;
   for (int i = 0; i < job.surfaces.block_rows * job.surfaces.block_columns; i++) {
     low = std::min(low, job.block_low[i]);
@@ -251,12 +263,17 @@ Visibility look_at(const Job &job) {
   std::vector<uint8_t> floors((size_t)v.cell_rows * bins);
   job.parallel(v.cell_rows, [&](int row, int) {
     uint8_t *here = floors.data() + (size_t)row * bins;
+    std::vector<const float *> light(job.channels);
     for (int y = row * CELL; y < std::min(H, (row + 1) * CELL); y++)
-      for (int x = 0; x < W; x++) {
-        const float place = coc[(size_t)y * W + x] - low;
-        here[(int)place] = 1;
-        v.cells[(size_t)row * v.cell_columns + x / CELL] |= 1ull << std::min((int)(place / v.class_width), CLASSES - 1);
-      }
+      for (int x = 0; x < W; x += BLOCK)
+        each_shown(job.surfaces, y, x, light.data(), [&](const float *coc, auto cover) {
+          for (int j = 0; j < std::min(BLOCK, W - x); j++) {
+            if (!(cover(j) > 0)) continue;
+            const float place = clamp(coc[j] - low, 0.0f, high - low);
+            here[(int)place] = 1;
+            v.cells[(size_t)row * v.cell_columns + (x + j) / CELL] |= 1ull << std::min((int)(place / v.class_width), CLASSES - 1);
+          }
+        });
   });
   for (size_t i = 0; i < floors.size(); i++)
     if (floors[i]) present[i % bins] = present[i % bins + 1] = 1;
@@ -265,35 +282,45 @@ Visibility look_at(const Job &job) {
   return v;
 }
 
+// How much of the pixels first to last of a row the surfaces at a place cover.
+static void cover_row(const Job &job, int y, int first, int last, float place, const float **light, float *covered) {
+  for (int x = first; x <= last;) {
+    const int n = std::min(last + 1, (x / BLOCK + 1) * BLOCK) - x;
+    float *to = covered + (x - first);
+    for (int j = 0; j < n; j++) to[j] = 0;
+    each_shown(job.surfaces, y, x, light, [&](const float *coc, auto cover) {
+      for (int j = 0; j < n; j++) to[j] += std::max(1.0f - std::fabs(coc[j] - place), 0.0f) * cover(j);
+    });
+    x += n;
+  }
+}
+
 // Adds how much of the rays of a row that land n pixels from column x on is taken by surfaces at a place.
-static void add_blocked(const Job &job, const Ray &ray, float place, int y, int x, int n, float *blocked) {
+static void add_blocked(const Job &job, const Ray &ray, float place, int y, int x, int n, const float **light, float *blocked) {
   constexpr int LONGEST = 256;
   const int H = job.height, W = job.width;
-  const float *coc = job.surfaces.coc;
   const float along = 1.0f - place / ray.coc;
   const float at_y = clamp(ray.row + (y - ray.row) * along, 0.0f, H - 1.0f);
-  const int row = std::min((int)at_y, std::max(0, H - 2));
+  const int row = std::min((int)at_y, std::max(0, H - 2)), below = H > 1 ? row + 1 : row;
   const float down = at_y - row;
-  const float *upper = coc + (size_t)row * W, *lower = upper + (H > 1 ? W : 0);
   auto column_of = [&](int i) { return clamp(ray.column + (x + i - ray.column) * along, 0.0f, W - 1.0f); };
-  auto share = [&](int column) {
-    const float a = std::max(1.0f - std::fabs(upper[column] - place), 0.0f), b = std::max(1.0f - std::fabs(lower[column] - place), 0.0f);
-    return a + down * (b - a);
-  };
-  const float ends[2] = {column_of(0), column_of(n - 1)};
-  const int first = (int)std::min(ends[0], ends[1]), last = std::min((int)std::max(ends[0], ends[1]) + 1, W - 1);
-  float shares[LONGEST];
-  const bool few = last - first + 2 <= LONGEST;  // columns that the row of rays meets
-  if (few) {
-    for (int i = 0; i <= last - first; i++) shares[i] = share(first + i);
-    shares[last - first + 1] = shares[last - first];
-  }
-  for (int i = 0; i < n; i++) {
-    const float at_x = column_of(i);
-    const int column = (int)at_x;
-    const float across = at_x - column;
-    const float a = few ? shares[column - first] : share(column), b = few ? shares[column - first + 1] : share(std::min(column + 1, W - 1));
-    blocked[i] += a + across * (b - a);
+  float upper[LONGEST], lower[LONGEST];
+  for (int i = 0; i < n;) {  // as many rays as meet a bounded number of columns
+    const float start = column_of(i);
+    int stop = i + 1;
+    while (stop < n && std::fabs(column_of(stop) - start) < LONGEST - 3) stop++;
+    const float ends[2] = {start, column_of(stop - 1)};
+    const int first = (int)std::min(ends[0], ends[1]), last = std::min((int)std::max(ends[0], ends[1]) + 1, W - 1);
+    cover_row(job, row, first, last, place, light, upper);
+    cover_row(job, below, first, last, place, light, lower);
+    for (int k = 0; k <= last - first; k++) upper[k] += down * (lower[k] - upper[k]);
+    upper[last - first + 1] = upper[last - first];
+    for (; i < stop; i++) {
+      const float at_x = column_of(i);
+      const int column = (int)at_x;
+      const float across = at_x - column, a = upper[column - first], b = upper[column - first + 1];
+      blocked[i] += a + across * (b - a);
+    }
   }
 }
 
@@ -301,6 +328,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
            const int32_t *halves, float *tile) {
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
   std::vector<int> nearer(v.bins.size());
+  std::vector<const float *> surface_light(C);
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
@@ -333,7 +361,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
         for (int y = py; y < py + ny; y++) {
           const size_t tap = (size_t)(y - ray.row + half) * side + (px - ray.column + half);
           float blocked[PATCH] = {};
-          for (int i = 0; i < m; i++) add_blocked(job, ray, v.low + nearer[i], y, px, nx, blocked);
+          for (int i = 0; i < m; i++) add_blocked(job, ray, v.low + nearer[i], y, px, nx, surface_light.data(), blocked);
           for (int c = 0; c < C; c++) {
             const float *taps = kernel + (E > 1 ? (size_t)c * side * side : 0) + tap;
             float *to = tile + (size_t)c * TILE * TILE + (y - y0) * TILE + (px - x0);

@@ -6,28 +6,30 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float EDGE_PX = 1.0f;  // difference in coc of neighbours from which on they may be two surfaces
-constexpr int REACH = 2;         // pixels around a mixed pixel that tell what its two surfaces look like
+constexpr float EDGE_PX = 0.5f;   // difference in coc of neighbours from which on they may be two surfaces
+constexpr float UNCLEAN = 1e-2f;  // weight of a pixel that may be mixed itself
+constexpr float TRUST = 4.0f;     // how much texture discredits the contrast of the two surfaces
+constexpr int EMITTER_REACH = 3;  // pixels around a highlight that tell on which surface it lies
+constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that a farther emitter may have
+constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is the surface that the image shows
+
+constexpr int REACH = 1;                   // pixels around a mixed pixel that tell what its two surfaces look like
 constexpr int AROUND = 2 * REACH + 1;
-constexpr float UNCLEAN = 1e-3f;  // weight of a pixel that may be mixed itself
-constexpr float TRUST = 4.0f;     // how much local contrast discredits a split
-constexpr float DOUBT = 4.0f / 3.0f;
-constexpr float LEAST_SHARE = 0.1f;
-constexpr float SAME_PX = 0.5f;  // a background whose coc differs by less is the surface that the image shows
+constexpr int MARGIN = REACH + 1;          // an edge is told by its neighbours
+constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
+constexpr int EDGES = BLOCK + 2 * REACH;   // of the windows of edges and light
+constexpr int PITCH = 24;                  // of both; four values may be read from any pixel's window
+typedef float f4 __attribute__((vector_size(16)));  // a row of a pixel's window, and one lane more
 
-constexpr int MARGIN = REACH + 1;              // an edge is told by its neighbours
-constexpr int SIDE = BLOCK + 2 * MARGIN;       // of the window of coc
-constexpr int EDGES = BLOCK + 2 * REACH;       // of the windows of edges and light
-constexpr int PITCH = 24;                      // of both; eight values may be read from any pixel's window
-typedef float f8 __attribute__((vector_size(32)));
-
-inline float sum(f8 v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
-inline f8 all8(float v) { return f8{v, v, v, v, v, v, v, v}; }
-inline f8 clamp_lanes(f8 v) {
-  f8 zero = all8(0.0f), one = all8(1.0f);
+inline float sum(f4 v) { return (v[0] + v[1]) + v[2]; }
+inline float largest(f4 v) { return std::max(std::max(v[0], v[1]), v[2]); }
+inline f4 all4(float v) { return f4{v, v, v, v}; }
+inline f4 clamp_lanes(f4 v) {
+  f4 zero = all4(0.0f), one = all4(1.0f);
   v = v > zero ? v : zero;
   return v < one ? v : one;
 }
+float falloff_at(int dy, int dx) { return (float)std::exp(-(dy * dy + dx * dx) / 4.5); }
 
 struct Window {
   float coc[SIDE * PITCH], valid[SIDE * PITCH], edge[EDGES * PITCH];
@@ -92,16 +94,16 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
 }
 
 // Weighted mean of the light around a pixel, and its variance, summed over colours.
-float mean(const Window &w, int channels, size_t first, const f8 *weight, float *mean) {
-  f8 whole = {};
+float mean(const Window &w, int channels, size_t first, float scale, const f4 *weight, float *mean) {
+  f4 whole = {};
   for (int r = 0; r < AROUND; r++) whole += weight[r];
   const float total = std::max(sum(whole), 1e-12f);
   float variance = 0;
   for (int c = 0; c < channels; c++) {
     const float *light = w.light.data() + (size_t)c * EDGES * PITCH + first;
-    f8 one = {}, two = {};
+    f4 one = {}, two = {};
     for (int r = 0; r < AROUND; r++) {
-      const f8 v = load<f8>(light + r * PITCH), weighted = v * weight[r];
+      const f4 v = load<f4>(light + r * PITCH) / all4(scale), weighted = v * weight[r];
       one += weighted;
       two += v * weighted;
     }
@@ -111,7 +113,7 @@ float mean(const Window &w, int channels, size_t first, const f8 *weight, float 
   return variance;
 }
 
-void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Block &block) {
+void split(const Job &job, Window &w, int y, int x, const f4 *falloff, const Block &block) {
   const int channels = job.channels;
   const bool masked = job.surfaces.valid;
   float near = NEVER, far = -NEVER;
@@ -123,37 +125,46 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
     }
   const float here = w.coc[(y + MARGIN) * PITCH + x + MARGIN], gap = std::max(far - near, 1e-6f);
   const size_t first = (size_t)y * PITCH + x;
-  f8 nearer[AROUND], farther[AROUND], inside = {1, 1, 1, 1, 1, 0, 0, 0};
+  float scale = 1.17549435e-38f;
+  for (int c = 0; c < channels; c++)
+    for (int r = 0; r < AROUND; r++) scale = std::max(scale, largest(load<f4>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH)));
+  f4 nearer[AROUND], farther[AROUND];
   for (int r = 0; r < AROUND; r++) {
     const size_t in_coc = (size_t)(y + 1 + r) * PITCH + x + 1;
-    f8 weight = (all8(1.0f + UNCLEAN) - load<f8>(w.edge + first + r * PITCH)) * falloff[r];
-    if (masked) weight *= load<f8>(w.valid + in_coc);
-    const f8 nearness = (all8(far) - load<f8>(w.coc + in_coc)) / all8(gap);
-    nearer[r] = weight * clamp_lanes(all8(4.0f) * nearness - all8(2.8f));
-    farther[r] = weight * clamp_lanes(all8(1.2f) - all8(4.0f) * nearness);
+    f4 weight = (all4(1.0f + UNCLEAN) - load<f4>(w.edge + first + r * PITCH)) * falloff[r];
+    if (masked) weight *= load<f4>(w.valid + in_coc);
+    const f4 nearness = (all4(far) - load<f4>(w.coc + in_coc)) / all4(gap);
+    nearer[r] = weight * clamp_lanes(all4(4.0f) * nearness - all4(2.8f));
+    farther[r] = weight * clamp_lanes(all4(1.2f) - all4(4.0f) * nearness);
   }
   float *front = w.front.data(), *behind = w.behind.data(), *colour = w.colour.data();
-  const float behind_spread = mean(w, channels, first, farther, behind);
-  f8 clean = {};
-  for (int r = 0; r < AROUND; r++) clean += nearer[r];
-  if (!(sum(clean) > 20 * UNCLEAN))  // a thin foreground: trust the pixel that differs most from what is behind
+  const float behind_variance = mean(w, channels, first, scale, farther, behind);
+  // a thin foreground has no clean pixel: trust the one that differs most from what is behind
+  f4 whole = {}, differs[AROUND] = {};
+  for (int r = 0; r < AROUND; r++) whole += nearer[r];
+  const float clean = clamp01(0.1f * sum(whole) / UNCLEAN - 1.0f);
+  if (clean < 1) {
+    float most = 0;
     for (int r = 0; r < AROUND; r++) {
-      f8 squares = {};
       for (int c = 0; c < channels; c++) {
-        const f8 d = load<f8>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH) - all8(behind[c]);
-        squares += d * d;
+        const f4 d = load<f4>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH) / all4(scale) - all4(behind[c]);
+        differs[r] += d * d;
       }
-      nearer[r] = nearer[r] * squares + inside * all8(1e-12f);
+      most = std::max(most, largest(differs[r]));
     }
-  const float front_spread = mean(w, channels, first, nearer, front);
+    for (int r = 0; r < AROUND; r++) {
+      const f4 part = (differs[r] + all4(1e-12f)) / all4(most + 1e-12f);
+      nearer[r] *= part + all4(clean) * (all4(1.0f) - part);
+    }
+  }
+  const float front_variance = mean(w, channels, first, scale, nearer, front);
 
-  float strength = 0, along = 0, brightness = 0, misfit = 0;
+  float strength = 0, along = 0, misfit = 0;
   for (int c = 0; c < channels; c++) {
     const float contrast = front[c] - behind[c];
-    colour[c] = w.light[(size_t)c * EDGES * PITCH + first + REACH * PITCH + REACH];
+    colour[c] = w.light[(size_t)c * EDGES * PITCH + first + REACH * PITCH + REACH] / scale;
     strength += contrast * contrast;
     along += (colour[c] - behind[c]) * contrast;
-    brightness += colour[c] * colour[c];
   }
   const bool is_near = here - near < far - here;
   const float fitted = clamp01(along / std::max(strength, 1e-12f));
@@ -161,34 +172,105 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
     const float left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
     misfit += left * left;
   }
-  const float trust = strength / (strength + 4e-4f + TRUST * (behind_spread + front_spread + misfit));
-  const float raw = is_near ? 1.0f - fitted : fitted, own_spread = is_near ? front_spread : behind_spread;
-  float doubt = 0;
-  if (std::fabs(far) < std::fabs(near)) doubt = std::sqrt(std::max(DOUBT * own_spread / std::max(strength, 1e-12f), 1e-12f));
-  float sure = raw - doubt;
-  sure *= clamp01(2.0f * sure / LEAST_SHARE - 1.0f);
-  const float moved = raw * std::sqrt(std::max(strength / std::max(brightness, 1e-18f), 1e-12f));
-  sure += (raw - sure) * clamp01(4.0f * moved - 1.0f);
+  const float trust = strength / std::max(strength + TRUST * (behind_variance + front_variance + misfit), 1e-12f);
   const float sided = std::fabs((here - near) - (far - here)) / gap;
-  const float share = clamp(sure, 0.0f, 0.5f) * trust * clamp01(4.0f * sided - 2.0f) *
-                      w.edge[first + REACH * PITCH + REACH];
-  const float norm = share * share + (1.0f - share) * (1.0f - share);
+  const float certainty = w.edge[first + REACH * PITCH + REACH] * trust * clamp01(4.0f * sided - 2.0f);
+  const float weight = std::min(is_near ? 1.0f - fitted : fitted, 0.5f) * certainty, rest = 1.0f - weight;
   const int at = y * BLOCK + x;
   for (int c = 0; c < channels; c++) {
-    const float mine = is_near ? front[c] : behind[c], its = is_near ? behind[c] : front[c];
-    const float rest = colour[c] - (1.0f - share) * mine - share * its;
-    const float other = std::max(its + rest * share / norm, 0.0f);
-    block.other[c * BLOCK_PIXELS + at] = other;
-    block.own[c * BLOCK_PIXELS + at] = (colour[c] - share * other) / (1.0f - share);
+    const float own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
+    const float unexplained = colour[c] - rest * own_mean - weight * other_mean;
+    const float least = job.light_least[c] / scale, most = job.light_most[c] / scale;
+    float moved = weight * (other_mean + unexplained * weight / (weight * weight + rest * rest));
+    moved = std::min(std::max(moved, colour[c] - rest * most), colour[c] - rest * least);
+    moved = std::min(std::max(moved, weight * least), weight * most);
+    block.own[c * BLOCK_PIXELS + at] = (colour[c] - moved) / rest * scale;
+    block.other[c * BLOCK_PIXELS + at] = weight > 0 ? moved / std::max(weight, 1e-12f) * scale : 0.0f;
   }
   block.coc[at] = is_near ? far : near;
-  block.weight[at] = share;
-  block.seen[at] = 1.0f - share;
+  block.weight[at] = weight;
+  block.seen[at] = rest;
   if (masked) {
     const float valid = w.valid[(y + MARGIN) * PITCH + x + MARGIN];
     block.weight[at] *= valid;
     block.seen[at] *= valid;
   }
+}
+
+void split_block(Job &job, int by, int bx, Window &w, const f4 *falloff) {
+  const int y0 = by * BLOCK, x0 = bx * BLOCK, height = job.height, width = job.width;
+  for (int c = 0; c < job.channels; c++)
+    for (int i = 0; i < EDGES; i++) {
+      const float *from = job.surfaces.light + c * job.surfaces.area() + (size_t)std::clamp(y0 - REACH + i, 0, height - 1) * width;
+      float *to = w.light.data() + ((size_t)c * EDGES + i) * PITCH;
+      for (int j = 0; j < EDGES; j++) to[j] = from[std::clamp(x0 - REACH + j, 0, width - 1)];
+    }
+  const Block block = job.surfaces.make_block(by * job.surfaces.block_columns + bx);
+  for (int y = 0; y < std::min(BLOCK, height - y0); y++)
+    for (int x = 0; x < std::min(BLOCK, width - x0); x++)
+      if (w.edge[(y + REACH) * PITCH + x + REACH] > 0) split(job, w, y, x, falloff, block);
+}
+
+// Gives the light of a highlight's pixel to the farther surface on which the emitter lies.
+void find_emitter(Job &job, int y, int x, float limit, const float *falloff) {
+  constexpr int COUNT = (2 * EMITTER_REACH + 1) * (2 * EMITTER_REACH + 1);
+  Surfaces &s = job.surfaces;
+  const int channels = job.channels;
+  const size_t at = (size_t)y * s.width + x, area = s.area();
+  auto peak_at = [&](size_t i) {
+    float peak = s.light[i];
+    for (int c = 1; c < channels; c++) peak = std::max(peak, s.light[c * area + i]);
+    return peak;
+  };
+  const float own_light = peak_at(at), own_coc = s.coc[at];
+  if (!(own_light > limit) || (s.valid && !(s.valid[at] > 0))) return;
+  float farther_by[COUNT], peaks[COUNT], scale = 0;
+  size_t around[COUNT];
+  bool any = false;
+  for (int i = 0, dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
+    for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++) {
+      around[i] = (size_t)std::clamp(y + dy, 0, s.height - 1) * s.width + std::clamp(x + dx, 0, s.width - 1);
+      farther_by[i] = s.coc[around[i]] - own_coc;
+      any |= farther_by[i] > 1;
+    }
+  if (!any) return;
+  for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks[i] = peak_at(around[i]));
+  const float own_peak = own_light / scale;
+  std::vector<float> front(channels, 0.0f);
+  float dim_sum = 0, lit_sum = 0, lit_coc = 0, far_peak = 0, same_peak = 1e-12f;
+  for (int i = 0; i < COUNT; i++) {
+    const float counted = s.valid ? s.valid[around[i]] : 1.0f, peak = peaks[i] / scale;
+    const float farther = counted * clamp01(farther_by[i] - 1.0f), same = counted * clamp01(2.0f - std::fabs(farther_by[i]));
+    const float dim = same * falloff[i] * clamp01(2.5f - 5.0f * peak / std::max(own_peak, 1e-12f)), lit = farther * falloff[i] * peak * peak;
+    dim_sum += dim;
+    for (int c = 0; c < channels; c++) front[c] += s.light[c * area + around[i]] / scale * dim;
+    lit_sum += lit;
+    lit_coc += farther_by[i] * lit;
+    far_peak = std::max(far_peak, farther * peak);
+    same_peak = std::max(same_peak, same * peak);
+  }
+  const float sureness = clamp01(own_light / limit - 1.0f) * clamp01(10.0f * far_peak / same_peak - 5.0f) * std::min(10.0f * dim_sum, 1.0f);
+  if (!(sureness > 0)) return;
+  const Block block = s.make_block(y / BLOCK * s.block_columns + x / BLOCK);
+  const int within = y % BLOCK * BLOCK + x % BLOCK;
+  float floor = -INFINITY;
+  for (int c = 0; c < channels; c++) floor = std::max(floor, front[c] /= std::max(dim_sum, 1e-12f));
+  const bool is_emitter = sureness > 0.5f;
+  float weight = block.weight[within];
+  if (is_emitter) {
+    weight = clamp((own_peak - floor) / std::max(std::max(far_peak, same_peak) - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
+    for (int c = 0; c < channels; c++) {
+      const float seen = s.light[c * area + at] / scale;
+      block.other[c * BLOCK_PIXELS + within] = std::max((seen - (1.0f - weight) * front[c]) / weight, 0.0f) * scale;
+    }
+    block.coc[within] = own_coc + lit_coc / std::max(lit_sum, 1e-12f);
+  }
+  // what was found without it fades out first
+  weight *= std::fabs(2.0f * sureness - 1.0f);
+  for (int c = 0; c < channels; c++)
+    block.own[c * BLOCK_PIXELS + within] = (s.light[c * area + at] - weight * block.other[c * BLOCK_PIXELS + within]) / (1.0f - weight);
+  block.weight[within] = weight;
+  block.seen[within] = 1.0f - weight;
 }
 
 }  // namespace
@@ -242,10 +324,13 @@ bool Surfaces::row(int i, int y, int x, const float **light_of, const float *&co
 }
 
 void Job::split_mixed() {
-  f8 falloff[AROUND] = {};
+  f4 falloff[AROUND] = {};
   for (int r = 0; r < AROUND; r++)
-    for (int d = 0; d < AROUND; d++)
-      falloff[r][d] = (float)std::exp(-((r - REACH) * (r - REACH) + (d - REACH) * (d - REACH)) / 4.5);
+    for (int d = 0; d < AROUND; d++) falloff[r][d] = falloff_at(r - REACH, d - REACH);
+  std::vector<float> around_emitter;
+  for (int dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
+    for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++) around_emitter.push_back(falloff_at(dy, dx));
+  const bool emitters = scene.kind != TORCHDOF_BACKGROUND;  // what lies behind is known then
   const int rows = surfaces.block_rows, columns = surfaces.block_columns;
   std::vector<std::unique_ptr<Window>> windows(std::max(1, scene.threads));
   parallel(rows, [&](int by, int worker) {
@@ -264,17 +349,14 @@ void Job::split_mixed() {
         }
       if (!(high - low > EDGE_PX)) continue;
       const int y0 = by * BLOCK, x0 = bx * BLOCK;
-      if (!find_edges(*this, y0, x0, w)) continue;
-      for (int c = 0; c < channels; c++)
-        for (int i = 0; i < EDGES; i++) {
-          const float *from = surfaces.light + c * surfaces.area() + (size_t)std::clamp(y0 - REACH + i, 0, height - 1) * width;
-          float *to = w.light.data() + ((size_t)c * EDGES + i) * PITCH;
-          for (int j = 0; j < EDGES; j++) to[j] = from[std::clamp(x0 - REACH + j, 0, width - 1)];
-        }
-      const Block block = surfaces.make_block(by * columns + bx);
-      for (int y = 0; y < std::min(BLOCK, height - y0); y++)
-        for (int x = 0; x < std::min(BLOCK, width - x0); x++)
-          if (w.edge[(y + REACH) * PITCH + x + REACH] > 0) split(*this, w, y, x, falloff, block);
+      if (find_edges(*this, y0, x0, w)) split_block(*this, by, bx, w, falloff);
+      if (!emitters || !(high - low > 1) || !(block_peak[by * columns + bx] > least_threshold(*this, y0, x0))) continue;
+      for (int y = y0; y < std::min(height, y0 + BLOCK); y++) {
+        float limit, step;
+        threshold_row(*this, y, x0, limit, step);
+        for (int x = x0; x < std::min(width, x0 + BLOCK); x++)
+          find_emitter(*this, y, x, limit + step * (x - x0), around_emitter.data());
+      }
     }
   });
 }
