@@ -11,7 +11,7 @@ from torchdof.render.border import continued
 
 def test_light_goes_on_as_half_the_nearest_pixel_and_half_a_mean_along_the_border() -> None:
     light = torch.rand(2, 3, 20, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    out = continued(light, None, (0, 0, 0, 9), 9)
+    out = continued(light, None, None, (0, 0, 0, 9), 9)
     assert out.shape == (2, 3, 29, 40)
     assert_close(out[..., :20, :], light)
     for distance in (1, 2, 4, 8):
@@ -24,8 +24,15 @@ def test_light_goes_on_as_half_the_nearest_pixel_and_half_a_mean_along_the_borde
 def test_what_a_surface_does_not_cover_is_not_in_its_mean() -> None:
     light, weight = torch.full((1, 1, 6, 30), 0.5), torch.ones(1, 1, 6, 30)
     light[..., 10:], weight[..., 10:] = 0.0, 0.0
-    out = continued(light, weight, (0, 0, 8, 8), 8)
+    out = continued(light, weight, None, (0, 0, 8, 8), 8)
     assert_close(out[..., :10], torch.full_like(out[..., :10], 0.5))
+
+
+def test_an_emitter_on_the_border_is_not_drawn_outwards() -> None:
+    light, limit = torch.full((1, 3, 8, 50), 0.1), torch.full((1, 1, 8, 50), 0.8)
+    light[..., -1, 20] = 300.0
+    out = continued(light, None, limit, (4, 4, 4, 4), 4)
+    assert float(out[..., 12:, :].max()) < 0.8
 
 
 def turned(values: Tensor, turns: int, flip: bool) -> Tensor:
@@ -38,8 +45,8 @@ def turned(values: Tensor, turns: int, flip: bool) -> Tensor:
 def test_light_goes_on_alike_however_the_frame_is_held(turns: int, flip: bool) -> None:
     light = torch.rand(1, 2, 13, 21, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     weight = torch.rand(1, 1, 13, 21, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    out = continued(light, weight, (6, 6, 6, 6), 6)
-    other = continued(turned(light, turns, flip), turned(weight, turns, flip), (6, 6, 6, 6), 6)
+    out = continued(light, weight, None, (6, 6, 6, 6), 6)
+    other = continued(turned(light, turns, flip), turned(weight, turns, flip), None, (6, 6, 6, 6), 6)
     assert_close(other, turned(out, turns, flip))
 
 

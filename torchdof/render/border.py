@@ -19,7 +19,9 @@ __all__ = ["continued"]
 _WIDTH = 4  # the mean reaches so many times as far to each side as the place lies beyond the border
 
 
-def continued(light: Tensor, weight: Tensor | None, ends: tuple[int, int, int, int], farthest: int) -> Tensor:
+def continued(
+    light: Tensor, weight: Tensor | None, limit: Tensor | None, ends: tuple[int, int, int, int], farthest: int
+) -> Tensor:
     """Light ``[B, C, H, W]`` of a surface with so many pixels more at the left, right, top and bottom.
 
     Beyond a corner the continuations of the two rows that meet there are mixed by how far each goes.
@@ -27,13 +29,20 @@ def continued(light: Tensor, weight: Tensor | None, ends: tuple[int, int, int, i
     Args:
         light: Of the surface.
         weight: How much of each pixel it covers, ``[B, 1, H, W]``: the weight in means. None is 1.
+        limit: Largest light that is no highlight's, ``[B, 1, H, W]``: a highlight is nowhere else but in its place.
+            None: there are none.
         ends: Pixels to add; in traced code they may be symbols.
         farthest: Number that none of them exceeds.
     """
     weight = torch.ones_like(light[:, :1]) if weight is None else weight
 
     def beyond(dim: int, index: int, reach: int) -> Tensor:
-        return _beyond(light.select(dim, index), weight.select(dim, index), reach, farthest)
+        line = light.select(dim, index)
+        if limit is not None:
+            brightest, most = line.amax(1, keepdim=True), limit.select(dim, index)
+            is_bright = brightest > most
+            line = line * torch.where(is_bright, most / torch.where(is_bright, brightest, 1.0), 1.0)
+        return _beyond(line, weight.select(dim, index), reach, farthest)
 
     left, right = (beyond(-1, index, reach) for index, reach in zip((0, -1), ends[:2], strict=True))  # [B, C, reach, H]
     top, bottom = (beyond(-2, index, reach) for index, reach in zip((0, -1), ends[2:], strict=True))  # [B, C, reach, W]

@@ -138,6 +138,7 @@ def framed(
     blurs: Sequence[Blur],
     stacked: bool,
     lit: bool = True,
+    limit: Tensor | None = None,
     align: Callable[[int], int] | None = None,
 ) -> Frame:
     """Surfaces of an image as a frame: they go on beyond the border as they are at it (:mod:`torchdof.render.border`).
@@ -149,6 +150,7 @@ def framed(
         blurs: Kernel and resolution of each layer.
         stacked: As in :class:`Frame`.
         lit: Light goes on beyond the border as well; False: nothing comes from there.
+        limit: Largest light that is no highlight's, ``[B, 1, H, W]``; None: all of it goes on.
         align: What the area must be a multiple of, given the margin; None: the coarsest layer's pixel.
     """
     coarsest = max(blur.scale for blur in blurs)
@@ -160,7 +162,7 @@ def framed(
     ends = (margin, margin + beyond[1], margin, margin + beyond[3])
     placed = []
     for light, coc, weight in surfaces:
-        light = continued(light, weight, ends, margin + multiple - 1) if lit else functional.pad(light, ends)
+        light = continued(light, weight, limit, ends, margin + multiple - 1) if lit else functional.pad(light, ends)
         x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
     if behind is not None:

@@ -15,7 +15,10 @@ Border border_of(const Job &job, int farthest) {
   while (farthest >> border.levels_) border.levels_++;
   border.levels_++;
   for (auto side : {Border::TOP, Border::BOTTOM, Border::LEFT, Border::RIGHT})
+    {
     border.means_[side].resize(border.start(side, s.count, 0, 0));
+    border.shares_[side].resize((size_t)s.count * border.length(side));
+  }
   job.parallel(4, [&](int which, int) {
     const auto side = (Border::Side)which;
     const bool upright = side >= Border::LEFT;
@@ -30,7 +33,15 @@ Border border_of(const Job &job, int farthest) {
         double *after = &until[(size_t)(at + 1) * sums];
         const bool there = s.row(i, y, x, light.data(), coc, weight);
         const double w = !there ? 0.0 : weight ? *weight : 1.0;
-        for (int c = 0; c < C; c++) after[c] = before[c] + (there ? *light[c] * w : 0.0);
+        float share = 1.0f;  // of its light that is no highlight's
+        if (there && !job.threshold.empty()) {
+          float brightest = *light[0], limit, step;
+          for (int c = 1; c < C; c++) brightest = std::max(brightest, *light[c]);
+          threshold_row(job, y, x, limit, step);
+          if (brightest > limit) share = limit / brightest;
+        }
+        border.shares_[side][(size_t)i * length + at] = share;
+        for (int c = 0; c < C; c++) after[c] = before[c] + (there ? *light[c] * share * w : 0.0);
         after[C] = before[C] + w;
       }
       for (int level = 0; level < border.levels_; level++) {
@@ -58,7 +69,8 @@ void Border::continue_row(int surface, int channel, int y, int x, int n, float *
   const float part = (float)far / (1 << level) - 1.0f;
   const Side side = y < 0 ? TOP : BOTTOM;
   const float *nearer = means_[side].data() + start(side, surface, channel, level) + x, *farther = nearer + length(side);
-  for (int i = 0; i < n; i++) row[i] = 0.5f * (row[i] + nearer[i] + part * (farther[i] - nearer[i]));
+  const float *share = shares_[side].data() + (size_t)surface * length(side) + x;
+  for (int i = 0; i < n; i++) row[i] = 0.5f * (row[i] * share[i] + nearer[i] + part * (farther[i] - nearer[i]));
 }
 
 }  // namespace TORCHDOF_SIMD

@@ -147,7 +147,7 @@ void Job::begin() {
       for (size_t i = 0; i < surfaces.blocks.size(); i++) bright |= block_peak[i] > 1.0f;
   }
   const bool limited = several && bright;
-  if (limited) find_threshold();
+  if (limited || scene.occlusion || scene.normalize) find_threshold();
   if (background) {
     surfaces.count = 2;
     split_mixed();

@@ -187,10 +187,19 @@ class Border {
   float light(int surface, int channel, int y, int x, float nearest) const {
     if (dark_) return 0;
     const int far = y < 0 ? -y : std::max(y - height_ + 1, 0), across = x < 0 ? -x : std::max(x - width_ + 1, 0);
-    float from_row = 0, from_column = 0;
-    if (far) from_row = mean(y < 0 ? TOP : BOTTOM, surface, channel, far, std::min(std::max(x, 0), width_ - 1));
-    if (across) from_column = mean(x < 0 ? LEFT : RIGHT, surface, channel, across, std::min(std::max(y, 0), height_ - 1));
-    return 0.5f * (nearest + (from_row * far + from_column * across) / (far + across));
+    const int at_y = std::clamp(y, 0, height_ - 1), at_x = std::clamp(x, 0, width_ - 1);
+    float from_row = 0, from_column = 0, share = 1;
+    if (far) {
+      const Side side = y < 0 ? TOP : BOTTOM;
+      from_row = mean(side, surface, channel, far, at_x);
+      share = shares_[side][(size_t)surface * width_ + at_x];
+    }
+    if (across) {
+      const Side side = x < 0 ? LEFT : RIGHT;
+      from_column = mean(side, surface, channel, across, at_y);
+      share = shares_[side][(size_t)surface * height_ + at_y];
+    }
+    return 0.5f * (nearest * share + (from_row * far + from_column * across) / (far + across));
   }
   // The same of n pixels above or below the frame.
   void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
@@ -211,6 +220,7 @@ class Border {
   }
   int height_ = 0, width_ = 0, channels_ = 0, levels_ = 0;
   bool dark_ = false;  // nothing comes from there
+  std::vector<float> shares_[4];  // of each side, [surfaces, length]: of the light there, what is no highlight's
   std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; level l is that of 2^l pixels
 };
 Border border_of(const Job &job, int farthest);

@@ -172,7 +172,6 @@ void Job::extract_highlights() {
       const float blur = std::fabs(p.coc);
       if (blur >= scene.crisp_px) return true;
       if (!occlusion) return false;
-      if (p.row == 0 || p.row == height - 1 || p.column == 0 || p.column == width - 1) return true;
       float inner = NEARER_PX;
       int radius = 1;
       for (const auto &cells : nearest_around) {
