@@ -43,12 +43,10 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     rows, columns = (n // length for n in frame.area)
     parts = [t for s in frame.surfaces for t in s if t is not None]
     batch, colours = parts[0].shape[0], int(parts[0].shape[1])
-    if frame.known is not None:
-        parts.append(frame.known.expand(batch, -1, -1, -1))
     if frame.behind is not None:
         parts.append(functional.pad(frame.behind, (margin,) * 4))
     channels = [int(t.shape[1]) for t in parts]
-    weighted, known, backed = frame.surfaces[0].weight is not None, frame.known is not None, frame.behind is not None
+    weighted, backed = frame.surfaces[0].weight is not None, frame.behind is not None
     across = torch.arange(window)
     tiles = torch.cat(parts, 1)
     tiles = tiles[:, :, (torch.arange(rows) * length)[:, None] + across]  # [B, P, rows, window, W]
@@ -62,10 +60,9 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
         fields = [t.clone() for t in tile.reshape(1, sum(channels), window, window).split(channels, 1)]
         inner = slice(margin, margin + length)
         behind = fields.pop()[..., inner, inner] if backed else None
-        seen = fields.pop() if known else None
         each = 3 if weighted else 2
         surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
-        piece = Frame(surfaces, frame.nodes, seen, behind, margin, (length, length), (length, length))
+        piece = Frame(surfaces, frame.nodes, behind, margin, (length, length), (length, length))
         tile = render(piece, [Blur(kernel.reshape(shape), scale) for kernel, shape, scale in bank])
         return count + 1, tile.reshape(colours, length, length)
 

@@ -13,7 +13,6 @@ from .validation import show
 __all__ = [
     "NAMED",
     "OPTION_NAMES",
-    "Border",
     "Method",
     "OptionArguments",
     "Options",
@@ -25,7 +24,6 @@ __all__ = [
 ]
 
 Method = Literal["layered", "fold"]
-Border = Literal["normalize", "extend"]
 Tolerance = float | Literal["draft", "preview", "final"]
 """RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and full resolution."""
 
@@ -49,8 +47,6 @@ class Options:
             are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
         normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.
         method: ``"layered"`` spreads layers by convolution (fast); ``"fold"`` by the paper's literal scatter.
-        border: ``"normalize"`` counts only light that was seen: what is outside the frame is unknown and weighs
-            nothing. ``"extend"`` continues the light at the frame's border outwards, as if it were known.
         max_coc_px: Largest radius that a static plan (compiled, exported) covers; larger ones are rendered with it.
         check: Look for NaN and non-positive depths and non-finite light before rendering, and refuse them. False skips
             that (and its cost); a pixel with a bad depth then passes through sharp and touches nothing else.
@@ -68,7 +64,6 @@ class Options:
     occlusion: bool = True
     normalize: bool = True
     method: Method = "layered"
-    border: Border = "normalize"
     max_coc_px: float = 64.0
     check: bool = True
 
@@ -82,8 +77,6 @@ class Options:
                 raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
         if not isinstance(self.method, str) or self.method not in ("layered", "fold"):
             raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
-        if not isinstance(self.border, str) or self.border not in ("normalize", "extend"):
-            raise ValueError(f"border must be 'normalize' or 'extend', got {show(self.border)}")
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
         reach = self.max_coc_px
@@ -125,7 +118,6 @@ class OptionArguments(TypedDict, total=False):
     occlusion: bool
     normalize: bool
     method: Method
-    border: Border
     max_coc_px: float
     check: bool
 

@@ -93,7 +93,7 @@ def settings_of(**said: Any) -> RenderSettings:
 
 
 OPTIONS: dict[str, Any] = {
-    "table": RING, "tolerance": 0.01, "occlusion": True, "normalize": True, "method": "layered", "border": "extend",
+    "table": RING, "tolerance": 0.01, "occlusion": True, "normalize": True, "method": "layered",
     "max_coc_px": 8.0, "check": True,
 }  # fmt: skip
 CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {

@@ -103,7 +103,6 @@ def random_scene(seed: int, height: int | None = None, width: int | None = None)
     options: dict[str, Any] = {
         "table": draw.choice(TABLES if image.shape[1] == 3 else TABLES[:3]),
         "tolerance": tolerance,
-        "border": draw.choice(["normalize", "normalize", "extend"]),
         "occlusion": draw.random() < 0.7,
     }
     if not options["occlusion"]:
@@ -166,7 +165,6 @@ def test_engines_agree_on_stacks(seed: int, by_both: Any) -> None:
     depth = 0.5 + 5.0 * torch.rand(items, count, 1, *(size if seed % 2 else (1, 1)))
     dof = DepthOfField(
         Camera(focus_m=1.7, f_number=1.4, sensor_width_mm=8.0),
-        border=("normalize", "extend")[seed // 4],
         check=seed != 3,
     )
     if seed == 3:
@@ -276,7 +274,7 @@ def scenes() -> list[Scene]:
     masked = torch.where(torch.rand(coc.shape) < 0.02, torch.nan, coc)
     return [
         Scene(image, coc, {}),
-        Scene(image, coc, {"occlusion": False, "border": "extend"}),
+        Scene(image, coc, {"occlusion": False}),
         Scene(image, masked, {"check": False}),
         Scene(image, coc, {"background": image.flip(3), "background_coc_px": coc + 3.3}),
     ]

@@ -46,7 +46,7 @@ def test_a_plane_at_a_layer_is_exact() -> None:
 
 @pytest.mark.parametrize("times", [1, 3], ids=["12 px", "36 px"])
 def test_layers_lie_close_where_a_slope_leaves_the_frame(times: int) -> None:
-    """Light from outside is unknown: the layer that stands for it may hold only what is beside the border."""
+    """What is beyond the frame is as blurred as the border: layers far from these blurs would show."""
     height, width = 240, 320
     y = torch.linspace(0, 1, height)[:, None].expand(height, width)
     coc = torch.where(torch.arange(width) < 20, -13.0, -12.0 * y**2)[None, None] * times  # a post is nearer yet

@@ -53,10 +53,6 @@ def export(
         Literal["layered", "fold"],
         typer.Option(help="fold is the literal scatter: exact, slow, for small radii.", rich_help_panel=_BLUR),
     ] = "layered",
-    border: Annotated[
-        Literal["normalize", "extend"],
-        typer.Option(help="Beyond the frame light is unknown, or goes on.", rich_help_panel=_BLUR),
-    ] = "normalize",
     inputs: Annotated[
         Literal["depth", "coc_px"],
         typer.Option(
@@ -109,7 +105,6 @@ def export(
         tolerance=tolerance_of_text(tolerance),
         occlusion=not no_occlusion,
         method=method,
-        border=border,
         max_coc_px=max_coc,
         check=False,
     )

@@ -45,7 +45,6 @@ class _Scene(ctypes.Structure):
         ("coc", ctypes.POINTER(ctypes.c_void_p)),
         ("weight", ctypes.POINTER(ctypes.c_void_p)),
         ("occlusion", ctypes.c_int32),
-        ("extend", ctypes.c_int32),
         ("normalize", ctypes.c_int32),
         ("masked", ctypes.c_int32),
         ("highlights", ctypes.c_int32),
@@ -105,7 +104,6 @@ def render(
     layers: Sequence[tuple[Tensor, int]],
     psfs: Callable[[list[int]], Sequence[Tensor]],
     occlusion: bool,
-    extend: bool,
     normalize: bool,
     masked: bool,
     highlights: bool,
@@ -120,7 +118,6 @@ def render(
         layers: Kernel ``[1 or C, k, k]`` and resolution (every so many pixels) of each.
         psfs: Kernels ``[1 or C, k, k]`` for signed radii of highlights, in steps of 1/32 pixel.
         occlusion: As in :class:`torchdof.DepthOfField`.
-        extend: Light goes on beyond the frame.
         normalize: As in :class:`torchdof.DepthOfField`.
         masked: Values may be NaN or infinite; such pixels pass through.
         highlights: Highlights are splatted ray by ray where layers would not do.
@@ -151,7 +148,6 @@ def render(
         _pointers(cocs),
         _pointers(weights),
         occlusion,
-        extend,
         normalize,
         masked,
         highlights,

@@ -82,7 +82,6 @@ def _render(
         layers=[(blur.kernel, blur.scale) for blur in blurs],
         psfs=functools.partial(_psfs, options.table, int(width), int(max(height, width))),
         occlusion=options.occlusion,
-        extend=options.border == "extend",
         normalize=options.normalize,
         masked=kind != "stack" and not options.check,
         highlights=plan.rays,

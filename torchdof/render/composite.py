@@ -26,9 +26,7 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
     ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
     Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
-    blurred edge of what is in front. Outside the frame surfaces go on as they are at the border, but their light is
-    unknown and weighs nothing: colours are means over what was seen. Where all layers leave a pixel uncovered, what is
-    behind them shows.
+    blurred edge of what is in front. Where all layers leave a pixel uncovered, what is behind them shows.
 
     Args:
         frame: The surfaces seen in each pixel.
@@ -41,13 +39,8 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     colours, each = frame.colours, blurs[0].kernel.shape[0]
 
     def normalised(layer: Tensor) -> Tensor:
-        """Colour and coverage, from scattered ``m_k I``, ``m_k``, ``M_k`` and the ``m_k`` that was seen."""
-        light_and_weight, visible, seen = layer.tensor_split((colours + each, colours + 2 * each), 1)
-        if seen.shape[1]:  # light that was not seen: the colour of what was, fading out with the last of it
-            light, weight = light_and_weight.tensor_split((colours,), 1)
-            floor = weight.clamp(_LEAST**2, _LEAST)
-            light = light * (weight / torch.maximum(seen, floor))
-            light_and_weight = torch.cat([light, weight * (seen / floor).clamp(max=1.0)], 1)
+        """Colour and coverage, from scattered ``m_k I``, ``m_k`` and ``M_k``."""
+        light_and_weight, visible = layer.tensor_split((colours + each,), 1)
         visible = visible.clamp_min(_LEAST)
         return light_and_weight / (visible if each == 1 else visible.repeat(1, 2, 1, 1))
 
@@ -69,8 +62,8 @@ def accumulate(
 ) -> Tensor:
     """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
 
-    Not normalised, the plain sum is dark at the frame's border and uneven at depth edges. ``highlights`` is light that
-    was extracted from the layers and splatted ray by ray; else arguments are those of :func:`over`.
+    Not normalised, the plain sum of what was seen is dark at the border and uneven at depth edges. ``highlights`` is
+    light that was extracted from the layers and splatted ray by ray; else arguments are those of :func:`over`.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
@@ -95,9 +88,9 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Ten
     weights = torch.cat([frame.layer(k, halo, visibility=True)[1] for k in range(len(blurs))], 1)
     kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
     light = frame.surfaces[0].light
-    known = torch.ones_like(light) if frame.known is None else frame.known.expand_as(light)
     each = kernels.shape[1]
-    summed = fold(torch.cat([light, known[:, :each]], 1), kernels.repeat(1, min(2, each), 1, 1), halo, weights)
+    light = torch.cat([light, torch.ones_like(light[:, :each])], 1)
+    summed = fold(light, kernels.repeat(1, min(2, each), 1, 1), halo, weights)
     summed = summed[..., : frame.size[0], : frame.size[1]]
     return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
 

@@ -6,9 +6,8 @@ pixel at ``p`` with coc ``c`` through the point ``u`` of the lens lands at ``p +
 with coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sharp image itself tells which rays pass.
 
 Highlights are few. What exceeds the threshold of what is around it is extracted from the layers, and splatted as
-rays: where something nearer could stand in the way, where its layer is too coarse for a crisp edge, and at the frame's
-border, where layers make up for the light that is not seen with the light that is. Without occlusion nothing stands in
-the way, and the rays' light is divided by the same sum of weights as the layers'.
+rays: where something nearer could stand in the way, and where its layer is too coarse for a crisp edge. Without
+occlusion nothing stands in the way, and the rays' light is divided by the same sum of weights as the layers'.
 """
 
 import math
@@ -105,15 +104,14 @@ def extract(
 
 
 def _need_splats(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
-    """Whether a ray of a pixel could meet a nearer surface, or land where layers would scale it; none too few.
+    """Whether a ray of a pixel could meet a nearer surface; none too few.
 
-    They do so beside the border and beside what is nearer. Wider and wider windows are looked at, in cells: a surface
-    that is nearer by ``d`` hides from at most ``d`` pixels away.
+    Wider and wider windows are looked at, in cells: a surface that is nearer by ``d`` hides from at most ``d`` pixels
+    away.
     """
     height, width = nearest_px.shape[-2:]
     item, row, column = pixels.places(bright, height, width)
-    to_border = torch.minimum(torch.minimum(row, height - 1 - row), torch.minimum(column, width - 1 - column)) + 0.5
-    needed = 2.0 * coc.abs() > to_border
+    needed = torch.zeros_like(coc, dtype=torch.bool)
     cells = functional.max_pool2d(-nearest_px.detach(), _COARSE_CELL, ceil_mode=True)
     rows, columns = row // _COARSE_CELL, column // _COARSE_CELL
     inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells

@@ -73,8 +73,8 @@ def plane_nodes(coc_px: Tensor, tolerance: float) -> list[float]:
 def border_nodes(coc_px: Tensor) -> list[float]:
     """Places at which much of the frame's border lies.
 
-    Surfaces go on beyond the frame as they are at its border. Light from there is not known; what stands for it is
-    light of the same layer, which therefore must not reach far into the frame.
+    Surfaces go on beyond the frame as they are at its border, so what comes from there comes from few blurs: layers far
+    from these show.
     """
     border = torch.cat([coc_px[..., 0, :], coc_px[..., -1, :], coc_px[..., 0], coc_px[..., -1]], -1)
     return _crowded(on_axis(border, max(coc_px.shape[-2:])).flatten(), width=1.0, least_share=0.03)

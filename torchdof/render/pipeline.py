@@ -97,6 +97,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     """Depth of field of checked layers ``[B, N, C + 1, H, W]``; see :meth:`torchdof.DepthOfField.layers`."""
     wide = torch.float64 if torch.float64 in (rgba.dtype, coc_px.dtype) else torch.float32
     light, coc = rgba.to(wide), coc_px.to(wide)
+    order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far
     cover = light[:, :, -1:].clamp(0.0, 1.0)
     valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
@@ -104,7 +105,6 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     moves = torch.is_grad_enabled() and coc.requires_grad
     plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), options.tolerance)
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
-    order = coc.argsort(1)  # near to far
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
     return _render_item(plan, options, light, coc, cover=cover).to(rgba.dtype)
 
@@ -146,28 +146,27 @@ def _render_item(
     # what is a highlight; without occlusion it matters only where a light is too bright for a coarse layer
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
     coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
-    limit = None
-    if len(plan.nodes) > 1 and (options.occlusion or coarse):
-        limit = highlights.threshold(light, weight)
+    limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
+    splatted = len(plan.nodes) > 1 and (options.occlusion or coarse)
 
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
     if behind_light is not None and behind_coc is not None:
         surfaces = _before_background(surfaces[0], behind_light, behind_coc, (low, high), options)
-    elif options.occlusion and limit is not None:
+    elif options.occlusion and limit is not None and splatted:
         widest = max(2.0, *(abs(c) for c in plan.coc_px))
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
         surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels)
 
     # the highlights of these, ray by ray; a known background is in nobody's way
     splats = None
-    if limit is not None and plan.rays:
+    if limit is not None and splatted and plan.rays:
         shown = surfaces if behind_light is None else surfaces[1::-1]
         extracted = [highlights.extract(s, limit, coc if options.occlusion else None, crisp_px) for s in surfaces]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         splats = highlights.splat(rays, shown, options.table, options.occlusion) if rays else None
 
-    out = _composite(surfaces, behind, plan, options, behind_light is not None, splats)
+    out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
     return out if valid is None else torch.where(valid, out, image)
 
 
@@ -197,6 +196,7 @@ def _composite(
     plan: Plan,
     options: Options,
     stacked: bool,
+    limit: Tensor | None = None,
     splats: Tensor | None = None,
 ) -> Tensor:
     """Surfaces, and the light of highlights, to a picture."""
@@ -204,7 +204,7 @@ def _composite(
     layered, tiles = options.method == "layered", tiling.get() if torch.compiler.is_exporting() else None
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
     align = None if tiles is None else tiles.align
-    frame = framed(surfaces, behind, plan.nodes, blurs, options.border == "extend", stacked, align)
+    frame = framed(surfaces, behind, plan.nodes, blurs, stacked, options.occlusion or options.normalize, limit, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
         scatter = convolve if layered else fold

@@ -9,6 +9,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..validation import is_traced
+from .border import continued
 from .disocclusion import BEHIND_STEP, behind_size, fill_hidden
 from .downsampling import upsampled
 from .layer_weights import blur_axis, weight_at_or_behind
@@ -44,7 +45,6 @@ class Frame:
     Args:
         surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area.
         nodes: Places of the layers on the blur axis, near to far.
-        known: 1 where light was seen, 0 where it is unknown, ``[1 or B, 1, ...]`` as they are; None: all is known.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
         margin: Pixels on each side, as many as the widest kernel reaches.
         area: Height and width, continued to whole blocks of the coarsest layer.
@@ -55,7 +55,6 @@ class Frame:
 
     surfaces: Sequence[Placed]
     nodes: Sequence[float]
-    known: Tensor | None
     behind: Tensor | None
     margin: int
     area: tuple[int, int]
@@ -89,17 +88,13 @@ class Frame:
         return torch.stack([((x > low) & (x < high)).any() for x in places]).any()
 
     def layer(self, k: int, halo: int, visibility: bool) -> list[Tensor]:
-        """What layer k scatters, with so many pixels beyond the area: light ``m_k I`` and the weight ``m_k`` seen.
+        """What layer k scatters, with so many pixels beyond the area: light ``m_k I`` and its weight ``m_k``.
 
-        With visibility all of ``m_k``, then ``M_k``, the weight at or behind the layer; and what of ``m_k`` was seen,
-        where some was not.
+        With visibility ``M_k`` as well, the weight at or behind the layer.
         """
         surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
-        known = None if self.known is None else self.cut(self.known, halo)
         light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, self.nodes, k)
-        if not visibility:
-            return [light, weight if known is None else weight * known]
-        return [light, weight, behind] if known is None else [light, weight, behind, weight * known]
+        return [light, weight, behind] if visibility else [light, weight]
 
 
 def _mixed(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -141,19 +136,21 @@ def framed(
     behind: Tensor | None,
     nodes: Sequence[float],
     blurs: Sequence[Blur],
-    extend: bool,
     stacked: bool,
+    lit: bool = True,
+    limit: Tensor | None = None,
     align: Callable[[int], int] | None = None,
 ) -> Frame:
-    """Surfaces of an image as a frame: they go on beyond the border as they are at it; light there is 0 and unknown.
+    """Surfaces of an image as a frame: they go on beyond the border as they are at it (:mod:`torchdof.render.border`).
 
     Args:
         surfaces: Near to far if stacked.
         nodes: As in :class:`Frame`; surfaces beyond the outermost ones belong to these.
         behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
         blurs: Kernel and resolution of each layer.
-        extend: Continue light over the border as well, as if it were known.
         stacked: As in :class:`Frame`.
+        lit: Light goes on beyond the border as well; False: nothing comes from there.
+        limit: Largest light that is no highlight's, ``[B, 1, H, W]``; None: all of it goes on.
         align: What the area must be a multiple of, given the margin; None: the coarsest layer's pixel.
     """
     coarsest = max(blur.scale for blur in blurs)
@@ -165,14 +162,13 @@ def framed(
     ends = (margin, margin + beyond[1], margin, margin + beyond[3])
     placed = []
     for light, coc, weight in surfaces:
-        light = functional.pad(light, ends, mode="replicate" if extend else "constant")
+        light = continued(light, weight, limit, ends, margin + multiple - 1) if lit else functional.pad(light, ends)
         x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
-    known = None if extend else functional.pad(torch.ones_like(surfaces[0].coc_px[:1]), ends)
     if behind is not None:
         behind = upsampled(behind, BEHIND_STEP)[..., : size[0], : size[1]]
         behind = functional.pad(behind, beyond, mode="replicate")
-    return Frame(placed, nodes, known, behind, margin, (height, width), size, stacked)
+    return Frame(placed, nodes, behind, margin, (height, width), size, stacked)
 
 
 def surfaces_of_image(

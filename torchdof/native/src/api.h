@@ -33,7 +33,6 @@ typedef struct {
   const float *const *coc;     // of each surface [height, width]: signed radius in pixels, negative in front of the focus
   const float *const *weight;  // of each surface [height, width], or null: it covers its pixels wholly
   int32_t occlusion;           // 0: light accumulates, whatever lies in front
-  int32_t extend;              // 1: light goes on beyond the frame as it is at its border
   int32_t normalize;           // 0: without occlusion, the plain sum
   int32_t masked;  // 1: values may be NaN or infinite (of a stack never); such pixels pass through and touch nothing else
   int32_t highlights;          // 0: highlights are spread with their layers

@@ -33,7 +33,7 @@ struct Run {
 };
 
 // Parts of blocks of pixels that lie between two nodes: for each its place in the window, the node before, and
-// 2 (channels + 2) sums: share, seen share and light; and these times how far between the nodes each pixel lies.
+// 2 (channels + 1) sums: share and light; and these times how far between the nodes each pixel lies.
 struct Pieces {
   std::vector<int> at, node, order;
   std::vector<float> values;  // of more pieces than there are
@@ -50,9 +50,8 @@ struct Pieces {
 struct Scratch {
   std::vector<float> memory;
   std::vector<float *> light, coc, weight;  // of each surface (light: [surfaces, channels])
-  float *known;
-  std::vector<float *> term;    // what a layer spreads: light, share, room, seen
-  std::vector<float *> spread;  // the same spread: light, then share, room and seen of each colour
+  std::vector<float *> term;    // what a layer spreads: light, share, room
+  std::vector<float *> spread;  // the same spread: light, then share and room of each colour
   std::vector<float *> canvas;  // light and coverage of a tile
   std::vector<float *> mine;    // a row of each surface's share
   float *rest;                  // what lies wholly behind a coarse layer
@@ -72,7 +71,6 @@ class Composite {
   void run() {
     H_ = job_.height, W_ = job_.width, C_ = job_.channels, E_ = job_.colours, N_ = (int)layers_.size();
     over_ = job_.scene.occlusion;
-    extend_ = job_.scene.extend;
     low_ = (float)layers_.front().node;
     high_ = (float)layers_.back().node;
     int half = 0;
@@ -95,6 +93,9 @@ class Composite {
     pitch_ = (window_ + 15) / 16 * 16 + 3 * BLOCK;  // rows are read in whole blocks
     scratches_.resize(std::max(1, job_.scene.threads));
     index();
+    int farthest = 0;  // beyond the frame
+    for (const Layer &l : layers_) farthest = std::max(farthest, l.scale * (l.half + 2) + 2 * BLOCK);
+    border_ = border_of(job_, farthest);
     std::vector<std::pair<int, int>> coarse;  // run and tile
     for (int r = 0; r < (int)runs_.size(); r++) {
       Run &run = runs_[r];
@@ -119,16 +120,15 @@ class Composite {
       scratches_[worker].reset(new Scratch());
       Scratch &b = *scratches_[worker];
       const size_t plane = (size_t)window_ * pitch_;
-      const int count = s_.count, planes = count * (C_ + 2) + 1 + (C_ + 3) + 1;
-      b.memory.assign(planes * plane + (size_t)(2 * C_ + 4 * E_) * TILE_PIXELS + (size_t)count * pitch_ * 2 + 16, 0.0f);
+      const int count = s_.count, planes = count * (C_ + 2) + (C_ + 2) + 1;
+      b.memory.assign(planes * plane + (size_t)(2 * C_ + 3 * E_) * TILE_PIXELS + (size_t)count * pitch_ * 2 + 16, 0.0f);
       float *p = b.memory.data();
       auto take = [&](size_t size) { return (p += size) - size; };
       for (int i = 0; i < count * C_; i++) b.light.push_back(take(plane));
       for (int i = 0; i < count; i++) b.coc.push_back(take(plane)), b.weight.push_back(take(plane));
-      b.known = take(plane);
-      for (int i = 0; i < C_ + 3; i++) b.term.push_back(take(plane));
+      for (int i = 0; i < C_ + 2; i++) b.term.push_back(take(plane));
       b.rest = take(plane);
-      for (int i = 0; i < C_ + 3 * E_; i++) b.spread.push_back(take(TILE_PIXELS));
+      for (int i = 0; i < C_ + 2 * E_; i++) b.spread.push_back(take(TILE_PIXELS));
       for (int i = 0; i < C_ + E_; i++) b.canvas.push_back(take(TILE_PIXELS));
       for (int i = 0; i < 2 * count; i++) b.mine.push_back(take(pitch_));
       b.rows.resize(window_);
@@ -279,7 +279,6 @@ class Composite {
       return;
     }
     run.used[which] = 1;
-    const bool border = !extend_ && (top < 0 || left < 0 || (top + height) * s > H_ || (left + width) * s > W_);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
     if (!s_.independent) {
       if (C_ == 3) gather<3>(run, top, left, height, width, b); else gather<0>(run, top, left, height, width, b);
@@ -294,7 +293,7 @@ class Composite {
         block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, shift, b);
       else
         add_pieces(run, k, height, b);
-      lay(b, l, rows, columns, shift, border);
+      lay(b, l, rows, columns, shift);
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
@@ -307,7 +306,7 @@ class Composite {
   // order[i] to order[i + 1].
   template <int CHANNELS>
   void gather(const Run &run, int top, int left, int height, int width, Scratch &b) {
-    const int C = CHANNELS ? CHANNELS : C_, s = run.scale, stride = 2 * (C + 2), L = run.last - run.first + 2;
+    const int C = CHANNELS ? CHANNELS : C_, s = run.scale, stride = 2 * (C + 1), L = run.last - run.first + 2;
     const float each = 1.0f / (s * s);
     Pieces &p = b.pieces;
     p.at.clear();
@@ -319,9 +318,6 @@ class Composite {
       for (int bx = 0; bx < width; bx++) {
         const int y0 = (top + by) * s, x0 = (left + bx) * s, place = by * pitch_ + bx;
         const bool inside = y0 >= 0 && x0 >= 0 && y0 + s <= H_ && x0 + s <= W_;
-        // beyond the frame all rows of a block are alike, or all columns
-        const int rows = y0 + s <= 0 || y0 >= H_ ? 1 : s, columns = x0 + s <= 0 || x0 >= W_ ? 1 : s;
-        const float times = (float)(s / rows * (s / columns));
         int count = s_.count;
         if (inside) {
           bool before = false, behind = false, here = false, single = true;  // layers of its cells relative to the run
@@ -374,19 +370,19 @@ class Composite {
             if (node < 0) return;
             memcpy(p.add(place, node - run.first + 1, stride), sums.data(), stride * sizeof(float));
           };
-          for (int y = 0; y < rows; y++) {
+          for (int y = 0; y < s; y++) {
             const int at_y = std::clamp(y0 + y, 0, H_ - 1);
             if (inside) s_.row(i, at_y, x0, light, coc, weight);
-            for (int x = 0; x < columns; x++) {
+            for (int x = 0; x < s; x++) {
               int at = x, at_x = x0 + x;
-              bool known = true;
+              bool beyond = false;
               if (!inside) {
-                known = extend_ || (y0 + y == at_y && at_x >= 0 && at_x < W_);
                 at_x = std::clamp(at_x, 0, W_ - 1);
+                beyond = y0 + y != at_y || x0 + x != at_x;
                 at = 0;
                 if (!s_.row(i, at_y, at_x, light, coc, weight)) continue;
               }
-              const float w = weight ? weight[at] * times : times;
+              const float w = weight ? weight[at] : 1.0f;
               if (w == 0) continue;
               const int k = intervals_[i][(size_t)at_y * W_ + at_x];
               if (k + 1 < run.first) continue;
@@ -400,16 +396,13 @@ class Composite {
                 std::fill(sums.begin(), sums.end(), 0.0f);
               }
               const float part = (axis(coc[at], low_, high_) - layers_[k].at) * layers_[k].per_after;
-              float *one = sums.data(), *two = one + C + 2;
+              float *one = sums.data(), *two = one + C + 1;
               one[0] += w;
               two[0] += w * part;
-              if (!known) continue;
-              one[1] += w;
-              two[1] += w * part;
               for (int c = 0; c < C; c++) {
-                const float v = light[c][at] * w;
-                one[2 + c] += v;
-                two[2 + c] += v * part;
+                const float v = w * (beyond ? border_.light(i, c, y0 + y, x0 + x, light[c][at]) : light[c][at]);
+                one[1 + c] += v;
+                two[1 + c] += v * part;
               }
             }
           }
@@ -461,11 +454,11 @@ class Composite {
               [&](const float *from) { return load<f4>(from + y * light_step + x); });
     }
     auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
-    out[0] = out[1] = sum(share);
-    out[CHANNELS + 2] = out[CHANNELS + 3] = sum(part_sum);
+    out[0] = sum(share);
+    out[CHANNELS + 1] = sum(part_sum);
     for (int c = 0; c < CHANNELS; c++) {
-      out[2 + c] = sum(one[c]);
-      out[CHANNELS + 4 + c] = sum(two[c]);
+      out[1 + c] = sum(one[c]);
+      out[CHANNELS + 2 + c] = sum(two[c]);
     }
   }
 
@@ -486,19 +479,17 @@ class Composite {
 
   // What layer k spreads of the pieces of its run; what lies behind it is added to the rest.
   void add_pieces(const Run &run, int k, int height, Scratch &b) {
-    const int C = C_, stride = 2 * (C + 2), L = run.last - run.first + 2;
+    const int C = C_, stride = 2 * (C + 1), L = run.last - run.first + 2;
     const float each = 1.0f / (run.scale * run.scale);
     Pieces &p = b.pieces;
-    for (int c = 0; c < C + 3; c++)
-      if (c != C + 1) memset(b.term[c], 0, sizeof(float) * height * pitch_);
+    for (int c = 0; c < C + 1; c++) memset(b.term[c], 0, sizeof(float) * height * pitch_);
     auto add = [&](int node, bool behind) {  // pieces before the layer's node, or behind it
       for (int i = p.order[node]; i < p.order[node + 1]; i++) {
         const int piece = p.order[L + 2 + i], at = p.at[piece];
-        const float *one = &p.values[(size_t)piece * stride], *two = one + C + 2;
+        const float *one = &p.values[(size_t)piece * stride], *two = one + C + 1;
         auto part = [&](int v) { return (behind ? one[v] - two[v] : two[v]) * each; };
         b.term[C][at] += part(0);
-        b.term[C + 2][at] += part(1);
-        for (int c = 0; c < C; c++) b.term[c][at] += part(2 + c);
+        for (int c = 0; c < C; c++) b.term[c][at] += part(1 + c);
         if (behind)
           b.rest[at] += one[0] * each;
         else
@@ -514,32 +505,28 @@ class Composite {
   void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
-    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + 1 + C_ + 3 + 2 * s_.count) * (n + LANES));
+    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + C_ + 2 + 2 * s_.count) * (n + LANES));
     float *m = memory.data();
     auto take = [&] { return (m += n + LANES) - (n + LANES); };  // vectors may read beyond the end
-    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 3), mine(2 * s_.count);
+    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 2), mine(2 * s_.count);
     for (auto *v : {&light, &coc, &weight, &term, &mine})
       for (float *&row : *v) row = take();
-    float *known = take();
     for (int by = 0; by < height; by++) {
       const size_t to = shift + (size_t)by * pitch_;
-      for (int c = 0; c < C_ + 3; c++) memset(b.term[c] + to, 0, width * sizeof(float));
+      for (int c = 0; c < C_ + 2; c++) memset(b.term[c] + to, 0, width * sizeof(float));
       for (int y = 0; y < s; y++) {
-        read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), known, b);
+        read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), b);
         row_terms(layers_[k], n, false, light.data(), coc.data(), weight.data(), mine.data(), term.data());
-        for (int x = 0; x < n; x++) {
+        for (int x = 0; x < n; x++)
           for (int c = 0; c < C_ + 2; c++) b.term[c][to + x / s] += term[c][x] * each;
-          b.term[C_ + 2][to + x / s] += term[C_][x] * known[x] * each;
-        }
       }
     }
   }
 
   // A row of all surfaces, continued beyond the frame: light [surfaces, channels], place on the blur axis and weight.
-  void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight, float *known, Scratch &b) {
+  void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight, Scratch &b) {
     const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1), last = std::clamp(x0 + n - 1, 0, W_ - 1);
     const int before = std::max(0, std::min(n, -x0)), after = std::max(0, std::min(n, x0 + n - W_));
-    const bool row_known = extend_ || y == at_y;
     for (int i = 0; i < (single ? 1 : s_.count); i++) {
       const float *from_coc, *from_weight;
       for (int x = first; x <= last;) {
@@ -571,21 +558,21 @@ class Composite {
           copy(weight[i], from_weight);
         x = end;
       }
-      auto go_on = [&](float *row, bool light_row) {
-        const int inner = std::min(before, n - 1), end = std::max(n - after, 1) - 1;
-        const float l = row[inner], r = row[end];
-        for (int x = 0; x < before; x++) row[x] = light_row && !extend_ ? 0.0f : l;
-        for (int x = n - after; x < n; x++) row[x] = light_row && !extend_ ? 0.0f : r;
+      auto go_on = [&](float *row) {
+        std::fill(row, row + before, row[std::min(before, n - 1)]);
+        std::fill(row + n - after, row + n, row[std::max(n - after, 1) - 1]);
       };
       for (int c = 0; c < C_; c++) {
-        go_on(light[i * C_ + c], true);
-        if (!row_known) memset(light[i * C_ + c], 0, n * sizeof(float));
+        float *row = light[i * C_ + c];
+        go_on(row);
+        for (int x = 0; x < before; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
+        for (int x = n - after; x < n; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
+        if (y != at_y && before + after < n) border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
       }
-      go_on(coc[i], false);
-      go_on(weight[i], false);
+      go_on(coc[i]);
+      go_on(weight[i]);
       for (int x = 0; x < n; x += LANES) store(coc[i] + x, axis(load<vec>(coc[i] + x), low_, high_));
     }
-    for (int x = 0; x < n; x++) known[x] = row_known && (extend_ || (x >= before && x < n - after));
   }
 
   // What a layer spreads of a row: light, share, and the share at or behind it, its room.
@@ -653,7 +640,7 @@ class Composite {
   }
 
   // Spreads the terms of a layer, which begin at an offset, and lays them on the tile's canvas.
-  void lay(Scratch &b, const Layer &l, int rows, int columns, size_t shift, bool border) {
+  void lay(Scratch &b, const Layer &l, int rows, int columns, size_t shift) {
     const int C = C_, E = E_, height = rows + 2 * l.half, width = columns + 2 * l.half;
     const int whole_rows = (rows + 3) / 4 * 4, whole_columns = (columns + 15) / 16 * 16;
     // where there is anything; whether nothing lies behind the layer, or before it
@@ -697,9 +684,9 @@ class Composite {
     for (int c = 0; c < C; c++) spread(c, b.rows.data(), l.kernels[E > 1 ? c : 0], b.spread[c]);
     for (int e = 0; e < E; e++) {
       const Kernel &kernel = l.kernels[e];
-      float *share = b.spread[C + e], *room = b.spread[C + E + e], *seen = b.spread[C + 2 * E + e];
+      float *share = b.spread[C + e], *room = b.spread[C + E + e];
       if (!over_) {
-        spread(border ? C + 2 : C, b.rows.data(), kernel, share);
+        spread(C, b.rows.data(), kernel, share);
         for (int c = 0; c < C; c++)
           if (E == 1 || c == e) add_to(b.canvas[c], b.spread[c]);
         add_to(b.canvas[C + e], share);
@@ -713,22 +700,12 @@ class Composite {
         memcpy(share, room, whole_rows * TILE * sizeof(float));
       else
         spread(C, b.rows.data(), kernel, share);
-      if (border) spread(C + 2, b.rows.data(), kernel, seen);
-      // colour = light / room, coverage = share / room; where not all light was seen, the colour of what was, fading
-      // out with the last of it
+      // colour = light / room, coverage = share / room
       for (int i = 0; i < whole_rows * TILE; i += LANES) {
-        const vec all_room = load<vec>(room + i), its_share = load<vec>(share + i), one = all(1.0f);
-        const vec per_room = one / most(all_room, all(LEAST));
-        vec gain = per_room, cover = its_share;
-        if (border) {
-          const vec floor = least(most(its_share, all(LEAST * LEAST)), all(LEAST)), was_seen = load<vec>(seen + i);
-          gain *= its_share / most(was_seen, floor);
-          cover *= least(was_seen / floor, one);
-        }
-        cover *= per_room;
+        const vec one = all(1.0f), per_room = one / most(load<vec>(room + i), all(LEAST)), cover = load<vec>(share + i) * per_room;
         const vec left = most(one - cover, vec{});
         for (int c = 0; c < C; c++)
-          if (E == 1 || c == e) store(b.canvas[c] + i, load<vec>(b.spread[c] + i) * gain + left * load<vec>(b.canvas[c] + i));
+          if (E == 1 || c == e) store(b.canvas[c] + i, load<vec>(b.spread[c] + i) * per_room + left * load<vec>(b.canvas[c] + i));
         store(b.canvas[C + e] + i, cover + left * load<vec>(b.canvas[C + e] + i));
       }
     }
@@ -810,25 +787,22 @@ class Composite {
       reaching.push_back(k);
       halo = std::max(halo, l.half);
     }
-    const bool border = !extend_ && (y0 < halo || x0 < halo || y0 + TILE + halo > H_ || x0 + TILE + halo > W_);
     bool single = false;
     int left = x0;  // where rows begin
     if (!reaching.empty()) {
       single = look_around(y0, x0, ceil_div(halo, CELL), b);
       std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
-      float *known = b.known;
       left = floor_div(x0 - halo, BLOCK) * BLOCK;
       const int across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
       for (int y = y0 - halo; y < y0 + rows + halo; y++) {
-        read_row(y, left, across, single, light.data(), coc.data(), weight.data(), known, b);
+        read_row(y, left, across, single, light.data(), coc.data(), weight.data(), b);
         for (auto *v : {&light, &coc, &weight})
           for (float *&row : *v) row += pitch_;
-        known += pitch_;
       }
     }
     size_t next = 0;
     std::vector<const float *> light(s_.count * C_), coc(s_.count), weight(s_.count);
-    std::vector<float *> term(C_ + 3);
+    std::vector<float *> term(C_ + 2);
     for (int r = (int)runs_.size() - 1; r >= 0; r--) {
       const Run &run = runs_[r];
       if (run.scale > 1) {
@@ -845,12 +819,10 @@ class Composite {
             coc[i] = b.coc[i] + from;
             weight[i] = b.weight[i] + from;
           }
-          for (int c = 0; c < C_ + 3; c++) term[c] = b.term[c] + to;
+          for (int c = 0; c < C_ + 2; c++) term[c] = b.term[c] + to;
           row_terms(l, width, single, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
-          if (border)
-            for (int x = 0; x < width; x += LANES) store(term[C_ + 2] + x, load<vec>(term[C_] + x) * load<vec>(b.known + from + x));
         }
-        lay(b, l, rows, columns, 0, border);
+        lay(b, l, rows, columns, 0);
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);
@@ -949,7 +921,7 @@ class Composite {
   const int32_t *ray_halves_;
   float *out_;
   int H_, W_, C_, E_, N_;
-  bool over_, extend_;
+  bool over_;
   float low_, high_;  // the outermost nodes
   std::vector<Run> runs_;
   int window_, pitch_;
@@ -958,6 +930,7 @@ class Composite {
   std::vector<uint64_t> cells_;            // layers that occur in each cell, a bit each
   std::vector<uint8_t> single_;            // cells that show the first surface alone, whole
   std::vector<Buffer<uint16_t>> intervals_;
+  Border border_;
   Visibility visibility_;
   std::vector<int> ray_start_, ray_list_;
 };

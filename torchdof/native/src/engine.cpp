@@ -157,7 +157,7 @@ void Job::begin() {
   const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
   // without occlusion highlights matter where coarse layers would soften them
   const bool limited = several && (scene.occlusion || (scene.highlights && scene.crisp_px < reach));
-  if (limited) find_threshold();
+  if (limited || scene.occlusion || scene.normalize) find_threshold();
   if (background) {
     surfaces.count = 2;
     split_mixed();

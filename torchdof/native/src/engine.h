@@ -181,6 +181,51 @@ float least_threshold(const Job &job, int y0, int x0);
 // Highlight threshold of a row of pixels within one block: the first, and how it grows by pixel.
 void threshold_row(const Job &job, int y, int x, float &first, float &step);
 
+// Light beyond the frame; border.cpp
+class Border {
+ public:
+  // Light of a surface at a place beyond the frame, given that of the nearest pixel.
+  float light(int surface, int channel, int y, int x, float nearest) const {
+    if (dark_) return 0;
+    const int far = y < 0 ? -y : std::max(y - height_ + 1, 0), across = x < 0 ? -x : std::max(x - width_ + 1, 0);
+    const int at_y = std::clamp(y, 0, height_ - 1), at_x = std::clamp(x, 0, width_ - 1);
+    float from_row = 0, from_column = 0, share = 1;
+    if (far) {
+      const Side side = y < 0 ? TOP : BOTTOM;
+      from_row = mean(side, surface, channel, far, at_x);
+      share = shares_[side][(size_t)surface * width_ + at_x];
+    }
+    if (across) {
+      const Side side = x < 0 ? LEFT : RIGHT;
+      from_column = mean(side, surface, channel, across, at_y);
+      share = shares_[side][(size_t)surface * height_ + at_y];
+    }
+    return 0.5f * (nearest * share + (from_row * far + from_column * across) / (far + across));
+  }
+  // The same of n pixels above or below the frame.
+  void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
+
+ private:
+  friend Border border_of(const Job &job, int farthest);
+  enum Side { TOP, BOTTOM, LEFT, RIGHT };
+  int length(Side side) const { return side <= BOTTOM ? width_ : height_; }
+  size_t start(Side side, int surface, int channel, int level) const {
+    return ((size_t)(surface * channels_ + channel) * levels_ + level) * length(side);
+  }
+  float mean(Side side, int surface, int channel, int distance, int at) const {
+    int level = 0;
+    while (2 << level <= distance) level++;
+    const float part = (float)distance / (1 << level) - 1.0f;
+    const float *nearer = means_[side].data() + start(side, surface, channel, level) + at, *farther = nearer + length(side);
+    return *nearer + part * (*farther - *nearer);
+  }
+  int height_ = 0, width_ = 0, channels_ = 0, levels_ = 0;
+  bool dark_ = false;  // nothing comes from there
+  std::vector<float> shares_[4];  // of each side, [surfaces, length]: of the light there, what is no highlight's
+  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; level l is that of 2^l pixels
+};
+Border border_of(const Job &job, int farthest);
+
 // What the image shows, as rays of highlights meet it; highlights.cpp
 struct Visibility {
   float low = 0, class_width = 1;

@@ -172,8 +172,6 @@ void Job::extract_highlights() {
       const float blur = std::fabs(p.coc);
       if (blur >= scene.crisp_px) return true;
       if (!occlusion) return false;
-      const int to_row = std::min(p.row, height - 1 - p.row), to_column = std::min(p.column, width - 1 - p.column);
-      if (2.0f * blur > std::min(to_row, to_column) + 0.5f) return true;
       float inner = NEARER_PX;
       int radius = 1;
       for (const auto &cells : nearest_around) {

@@ -1,0 +1,61 @@
+"""Light beyond the frame: the border's own, smoothed along it, and nothing that depends on how the frame is held."""
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from torchdof import blur_by_coc
+from torchdof.render.border import continued
+
+
+def test_light_goes_on_as_half_the_nearest_pixel_and_half_a_mean_along_the_border() -> None:
+    light = torch.rand(2, 3, 20, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    out = continued(light, None, None, (0, 0, 0, 9), 9)
+    assert out.shape == (2, 3, 29, 40)
+    assert_close(out[..., :20, :], light)
+    for distance in (1, 2, 4, 8):
+        mean = light[..., -1, 20 - 4 * distance if distance < 5 else 0 : 20 + 4 * distance + 1].mean(-1)
+        expected = (light[..., -1, 20] + mean) / 2
+        assert_close(out[..., 19 + distance, 20], expected)
+    assert_close(out[..., 19 + 3, :], (out[..., 19 + 2, :] + out[..., 19 + 4, :]) / 2)
+
+
+def test_what_a_surface_does_not_cover_is_not_in_its_mean() -> None:
+    light, weight = torch.full((1, 1, 6, 30), 0.5), torch.ones(1, 1, 6, 30)
+    light[..., 10:], weight[..., 10:] = 0.0, 0.0
+    out = continued(light, weight, None, (0, 0, 8, 8), 8)
+    assert_close(out[..., :10], torch.full_like(out[..., :10], 0.5))
+
+
+def test_an_emitter_on_the_border_is_not_drawn_outwards() -> None:
+    light, limit = torch.full((1, 3, 8, 50), 0.1), torch.full((1, 1, 8, 50), 0.8)
+    light[..., -1, 20] = 300.0
+    out = continued(light, None, limit, (4, 4, 4, 4), 4)
+    assert float(out[..., 12:, :].max()) < 0.8
+
+
+def turned(values: Tensor, turns: int, flip: bool) -> Tensor:
+    values = torch.rot90(values, turns, (-2, -1))
+    return values.flip(-1) if flip else values
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_light_goes_on_alike_however_the_frame_is_held(turns: int, flip: bool) -> None:
+    light = torch.rand(1, 2, 13, 21, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weight = torch.rand(1, 1, 13, 21, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    out = continued(light, weight, None, (6, 6, 6, 6), 6)
+    other = continued(turned(light, turns, flip), turned(weight, turns, flip), None, (6, 6, 6, 6), 6)
+    assert_close(other, turned(out, turns, flip))
+
+
+@pytest.mark.parametrize("engine", ["native", "torch"])
+def test_a_texture_is_not_drawn_outwards(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stripes that meet the border average out beyond it; the one pixel at it would leave them."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    stripes = torch.tensor([0.2, 0.8, 0.8, 0.2]).repeat(24)
+    image = stripes.expand(1, 3, 96, 96).clone()
+    coc = torch.full((1, 1, 96, 96), 9.0)
+    out = blur_by_coc(image, coc)
+    assert float((out[..., 0, 30:66] - 0.5).abs().max()) < 0.02

@@ -1,0 +1,87 @@
+"""Light beyond the frame's border, continued from what is seen along it.
+
+Nothing tells what is out there, but the spectrum of images falls with the square of the frequency, and of such an image
+the expectation beyond a straight border is the harmonic continuation: the row at the border, smoothed along it the more
+the farther out. Half of the nearest pixel's light and half of a mean along the border, four times as wide to each side
+as the place is far, come close to it.
+
+Reference:
+    Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
+    of the Optical Society of America A 4(12), 1987 (the spectrum).
+"""
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+__all__ = ["continued"]
+
+_WIDTH = 4  # the mean reaches so many times as far to each side as the place lies beyond the border
+
+
+def continued(
+    light: Tensor, weight: Tensor | None, limit: Tensor | None, ends: tuple[int, int, int, int], farthest: int
+) -> Tensor:
+    """Light ``[B, C, H, W]`` of a surface with so many pixels more at the left, right, top and bottom.
+
+    Beyond a corner the continuations of the two rows that meet there are mixed by how far each goes.
+
+    Args:
+        light: Of the surface.
+        weight: How much of each pixel it covers, ``[B, 1, H, W]``: the weight in means. None is 1.
+        limit: Largest light that is no highlight's, ``[B, 1, H, W]``: a highlight is nowhere else but in its place.
+            None: there are none.
+        ends: Pixels to add; in traced code they may be symbols.
+        farthest: Number that none of them exceeds.
+    """
+    weight = torch.ones_like(light[:, :1]) if weight is None else weight
+
+    def beyond(dim: int, index: int, reach: int) -> Tensor:
+        line = light.select(dim, index)
+        if limit is not None:
+            brightest, most = line.amax(1, keepdim=True), limit.select(dim, index)
+            is_bright = brightest > most
+            line = line * torch.where(is_bright, most / torch.where(is_bright, brightest, 1.0), 1.0)
+        return _beyond(line, weight.select(dim, index), reach, farthest)
+
+    left, right = (beyond(-1, index, reach) for index, reach in zip((0, -1), ends[:2], strict=True))  # [B, C, reach, H]
+    top, bottom = (beyond(-2, index, reach) for index, reach in zip((0, -1), ends[2:], strict=True))  # [B, C, reach, W]
+    rows = []
+    for above, index in ((top.flip(-2), 0), (light, None), (bottom, -1)):
+        sides = []
+        for side, column in ((left, 0), (right, -1)):
+            if index is None:
+                sides.append(side.transpose(-1, -2))
+                continue
+            # the corner: the row's own continuation and the column's
+            one, other = above[..., column, None], side[..., index][..., None, :]
+            far = _distances(above, above.shape[-2])[:, None]
+            far = far.flip(0) if index == 0 else far
+            across = _distances(above, side.shape[-2])
+            sides.append((one * far + other * across) / (far + across))
+        rows.append(torch.cat([sides[0].flip(-1), above, sides[1]], -1))
+    return torch.cat(rows, -2)
+
+
+def _distances(like: Tensor, reach: int) -> Tensor:
+    """Pixels from the last one of the frame, 1, 2, ... ``reach``."""
+    return torch.arange(1, reach + 1, device=like.device).to(like.dtype)
+
+
+def _beyond(line: Tensor, weight: Tensor, reach: int, farthest: int) -> Tensor:
+    """What follows on a line ``[B, C, n]`` at the border, nearest first: ``[B, C, reach, n]``."""
+    # means for distances that are powers of two; between them linear
+    means = []
+    for level in range(farthest.bit_length() + 1):
+        half = _WIDTH * 2**level
+        summed, total = (
+            functional.avg_pool1d(t, 2 * half + 1, stride=1, padding=half) for t in (line * weight, weight)
+        )
+        means.append(summed / torch.where(total > 0, total, 1.0))
+    distance = torch.arange(1, reach + 1, device=line.device)
+    powers = torch.tensor([2**level for level in range(1, len(means))], device=line.device)
+    level = (distance[:, None] >= powers).sum(1)
+    stack = torch.stack(means, 2)  # [B, C, levels, n]
+    part = (distance / 2**level - 1.0).to(line.dtype)[:, None]
+    mean = torch.lerp(stack.index_select(2, level), stack.index_select(2, level + 1), part)
+    return torch.lerp(line[:, :, None], mean, 0.5)
