@@ -52,7 +52,7 @@ LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
 _INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
-_SMALLEST = 1e-4  # px; a length below it is rendered as this, which is a kernel of one pixel
+_SMALLEST = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
 _CACHED_HALF_WIDTH = 64
 _LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
 _ALWAYS_WHOLE = 256  # px on each side of the centre; a kernel up to there is computed whole, whatever its window
@@ -66,7 +66,7 @@ Number = float | Tensor
 
 
 def gaussian(sigma: Number, size: int | None = None) -> Tensor:
-    """Gaussian of standard deviation ``sigma`` along each axis; its pixel integral is a product of two erf differences.
+    """Gaussian of standard deviation ``sigma`` along each axis.
 
     Args:
         sigma: Pixels, >= 0, float or ``[...]``.
@@ -107,15 +107,15 @@ def disc(radius: Number, size: int | None = None) -> Tensor:
     """Uniform disc: the image of a point through a perfect lens with a round aperture.
 
     Args:
-        radius: Pixels, >= 0, float or ``[...]``. Up to half a pixel the kernel is a single pixel.
+        radius: Pixels, >= 0, float or ``[...]``.
         size: Odd width of the kernel; None takes the smallest that holds it.
 
     Returns:
         ``[..., size, size]``, float64.
 
     Example:
-        >>> disc(0.5).tolist()
-        [[1.0]]
+        >>> disc(0.5).shape
+        torch.Size([3, 3])
     """
     return pixel_kernels("disc", {"radius": radius}, size)
 
@@ -192,7 +192,7 @@ def pixel_kernels(
     cell = (reach / _CELLS).clamp(max=1.0)
     in_cells = {k: v / cell if k in LENGTHS else v for k, v in lengths.items()}
     farthest = math.ceil(min(float(reach.detach().max()), half + _AROUND))  # pixels, which are cells in large kernels
-    cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1))
+    cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, whole))
     kernel = _settled(_interpolated(cells, cell, half + _AROUND))[..., _AROUND:-_AROUND, _AROUND:-_AROUND]
     total = kernel.sum((-2, -1), keepdim=True) if half == whole else _mass(family, in_cells, whole)[..., None, None]
     centre = torch.zeros_like(kernel)
@@ -317,14 +317,17 @@ def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
     return (1.0 + params["b"] * (r / params["radius"]) ** params["m"]).clamp_min(0.0)
 
 
-def _cells(family: str, lengths: Mapping[str, Tensor], half: int) -> Tensor:
-    """Integral of a profile over each square cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``."""
+def _cells(family: str, lengths: Mapping[str, Tensor], half: int, whole: int) -> Tensor:
+    """Integral of a profile over each square cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``.
+
+    They are the middle of a PSF that reaches ``whole`` pixels.
+    """
     if family == "gaussian":
         quadrant = _gaussian_quadrant(lengths["sigma"], half)
     elif family == "disc":
         quadrant = _disc_quadrant(lengths["radius"], half)
     else:
-        quadrant = _sliced_quadrant(family, lengths, half)
+        quadrant = _sliced_quadrant(family, lengths, half, slices=16 if whole <= 64 else 8)
     cells = torch.cat([quadrant[..., 1:, :].flip(-2), quadrant], -2)
     return torch.cat([cells[..., 1:].flip(-1), cells], -1)
 
@@ -419,9 +422,8 @@ def _twice(index: Tensor) -> Tensor:
     return twice[:, None] * twice[None, :]
 
 
-def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int) -> Tensor:
+def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, slices: int) -> Tensor:
     """Integral of any profile over each cell right of and below its centre, cut by circles into thin slices."""
-    slices = 16 if half <= 64 else 8  # finer where a cell is a larger part of the kernel
     rows = max(1, _AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):

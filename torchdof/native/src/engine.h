@@ -132,8 +132,27 @@ struct Layer {
   std::vector<Kernel> kernels;  // one, or one a colour
 };
 
-// Signed coc of a place on the blur axis.
-inline float coc_at(double node) { return (float)(node == 0 ? 0 : node > 0 ? node + 0.5 : node - 0.5); }
+// The blur axis, as render/layer_weights.py tells it: the place of a signed coc, from low to high, and the coc of a place.
+constexpr double ROUND_PX = 0.5, IN_FOCUS = 1e-4;
+inline float root(float v) { return std::sqrt(v); }
+template <typename V>
+inline V root(V v) {
+  for (size_t i = 0; i < sizeof(V) / sizeof(float); i++) v[i] = std::sqrt(v[i]);
+  return v;
+}
+template <typename V>
+inline V axis(V coc, float low, float high) {
+  const V zero = {}, lowest = zero + low, highest = zero + high;
+  V size = root(coc * coc + (float)(ROUND_PX * ROUND_PX)) - (float)(ROUND_PX + IN_FOCUS);
+  size = size > zero ? size : zero;
+  V x = coc < zero ? -size : size;
+  x = x > lowest ? x : lowest;
+  return x < highest ? x : highest;
+}
+inline float coc_at(double node) {
+  const double beyond = std::fabs(node) + IN_FOCUS;
+  return (float)(node == 0 ? 0 : std::copysign(std::sqrt(beyond * (beyond + 2 * ROUND_PX)), node));
+}
 
 struct Job {
   explicit Job(const torchdof_scene &scene);
