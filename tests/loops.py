@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdof import BlurTable
 
-IN_FOCUS = 1e-4  # on the blur axis; what lies nearer to focus is as it is
+IN_FOCUS = 2e-4  # on the blur axis; what lies nearer to focus is as it is
 
 
 def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tensor:
@@ -39,16 +39,16 @@ def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tens
 def kernel_between(coc: float, nodes: list[float] | None, table: BlurTable, width: int) -> Tensor:
     """Kernel of one pixel: its own (nodes None), or those of the two layers next to it, mixed linearly.
 
-    The nodes are places of layers on the blur axis: signed, sqrt(radius^2 + 1/4) - 1/2 less what is in focus.
+    The nodes are places of layers on the blur axis: signed, radius^2 / (radius + 1/2) less what is in focus.
     """
 
     def at(signed: float) -> Tensor:
         return table.kernels(torch.tensor([signed], dtype=torch.float64), width)[0]
 
     def in_pixels(x: float) -> float:
-        return 0.0 if x == 0 else math.copysign(math.sqrt((abs(x) + IN_FOCUS + 0.5) ** 2 - 0.25), x)
+        return 0.0 if x == 0 else math.copysign(((y := abs(x) + IN_FOCUS) + math.sqrt(y * y + 2.0 * y)) / 2.0, x)
 
-    x = math.copysign(max(math.hypot(coc, 0.5) - 0.5 - IN_FOCUS, 0.0), coc)
+    x = math.copysign(max(coc**2 / (abs(coc) + 0.5) - IN_FOCUS, 0.0), coc)
     if nodes is None:
         return at(coc if x else 0.0)
     x = min(max(x, nodes[0]), nodes[-1])

@@ -133,25 +133,21 @@ struct Layer {
 };
 
 // The blur axis, as render/layer_weights.py tells it: the place of a signed coc, from low to high, and the coc of a place.
-constexpr double ROUND_PX = 0.5, IN_FOCUS = 1e-4;
-inline float root(float v) { return std::sqrt(v); }
-template <typename V>
-inline V root(V v) {
-  for (size_t i = 0; i < sizeof(V) / sizeof(float); i++) v[i] = std::sqrt(v[i]);
-  return v;
-}
+constexpr double SQUARE_PX = 0.5, IN_FOCUS = 2e-4;
 template <typename V>
 inline V axis(V coc, float low, float high) {
-  const V zero = {}, lowest = zero + low, highest = zero + high;
-  V size = root(coc * coc + (float)(ROUND_PX * ROUND_PX)) - (float)(ROUND_PX + IN_FOCUS);
-  size = size > zero ? size : zero;
-  V x = coc < zero ? -size : size;
+  const V zero = {}, lowest = zero + low, highest = zero + high, focus = zero + (float)IN_FOCUS;
+  const V size = coc < zero ? -coc : coc;
+  V x = coc * size / (size + (float)SQUARE_PX);
+  V middle = x > -focus ? x : -focus;
+  middle = middle < focus ? middle : focus;
+  x = x - middle;
   x = x > lowest ? x : lowest;
   return x < highest ? x : highest;
 }
 inline float coc_at(double node) {
-  const double beyond = std::fabs(node) + IN_FOCUS;
-  return (float)(node == 0 ? 0 : std::copysign(std::sqrt(beyond * (beyond + 2 * ROUND_PX)), node));
+  const double beyond = (std::fabs(node) + IN_FOCUS) / 2;
+  return (float)(node == 0 ? 0 : std::copysign(beyond + std::sqrt(beyond * (beyond + 2 * SQUARE_PX)), node));
 }
 
 struct Job {
