@@ -3,12 +3,16 @@
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
+import torch.nn.functional as functional
+from scipy.interpolate import CubicSpline
+from scipy.optimize import nnls
 from torch import Tensor
 
 from torchdof import BlurTable
 
-SHARP_PX = 0.5  # a circle of confusion up to half a pixel leaves the pixel as it is
+IN_FOCUS = 2e-4  # on the blur axis; what lies nearer to focus is as it is
 
 
 def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tensor:
@@ -35,18 +39,18 @@ def scatter(light: Tensor, kernel_of: Callable[[int, int, int], Tensor]) -> Tens
 def kernel_between(coc: float, nodes: list[float] | None, table: BlurTable, width: int) -> Tensor:
     """Kernel of one pixel: its own (nodes None), or those of the two layers next to it, mixed linearly.
 
-    The nodes are places of layers on the blur axis: signed, the radius less half a pixel.
+    The nodes are places of layers on the blur axis: signed, radius^2 / (radius + 1/2) less what is in focus.
     """
 
     def at(signed: float) -> Tensor:
         return table.kernels(torch.tensor([signed], dtype=torch.float64), width)[0]
 
     def in_pixels(x: float) -> float:
-        return 0.0 if x == 0 else x + math.copysign(SHARP_PX, x)
+        return 0.0 if x == 0 else math.copysign(((y := abs(x) + IN_FOCUS) + math.sqrt(y * y + 2.0 * y)) / 2.0, x)
 
+    x = math.copysign(max(coc**2 / (abs(coc) + 0.5) - IN_FOCUS, 0.0), coc)
     if nodes is None:
-        return at(coc if abs(coc) > SHARP_PX else 0.0)
-    x = math.copysign(max(abs(coc) - SHARP_PX, 0.0), coc)
+        return at(coc if x else 0.0)
     x = min(max(x, nodes[0]), nodes[-1])
     for low, high in zip(nodes, nodes[1:], strict=False):
         if low <= x <= high:
@@ -97,10 +101,91 @@ def disc_by_columns(radius: float, size: int) -> Tensor:
     return kernel / kernel.sum()
 
 
-def supersampled(profile: Callable[[Tensor], Tensor], size: int, samples: int = 64) -> Tensor:
-    """Isotropic profile integrated over the pixels by the midpoints of `samples` x `samples` cells a pixel."""
-    half = size // 2
-    axis = (torch.arange(size * samples, dtype=torch.float64) + 0.5) / samples - half - 0.5
-    fine = profile(torch.hypot(axis[:, None], axis[None, :]))
-    kernel = fine.reshape(size, samples, size, samples).mean((1, 3))
+def interpolated(profile: Callable[[Tensor], Tensor], reach: float, size: int, samples: int = 200) -> Tensor:
+    """Isotropic profile of so large a reach, sampled finely and seen by the interpolator of each pixel.
+
+    The interpolator is the cubic spline through a single 1 among 0s, at most twice the hat of linear interpolation in
+    effect; what is negative is taken from the four neighbours in proportion to their light.
+    """
+    knots = np.arange(-40, 41)
+    cardinal = CubicSpline(knots, (knots == 0).astype(float), bc_type="natural")
+    places = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples * 2 * reach - reach
+    light = profile(torch.hypot(places[:, None], places[None, :]))
+    half = size // 2 + 2
+    away = torch.arange(-half, half + 1, dtype=torch.float64)[:, None] - places
+    spline, hat = torch.from_numpy(cardinal(away.numpy())), (1 - away.abs()).clamp_min(0.0)
+    kernel = torch.minimum(spline @ light @ spline.T, 2 * hat @ light @ hat.T)
+    settled = kernel.clamp_min(0.0)
+    for row in range(1, 2 * half):
+        for column in range(1, 2 * half):
+            owed = -float(kernel[row, column])
+            givers = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
+            wealth = sum(max(float(kernel[giver]), 0.0) for giver in givers)
+            for giver in givers if owed > 0 and wealth > 0 else []:
+                settled[giver] -= owed * max(float(kernel[giver]), 0.0) / wealth
+    settled = settled.clamp_min(0.0)[2:-2, 2:-2]
+    return settled / settled.sum()
+
+
+PERIOD = 32  # pixels
+_FREQUENCY = torch.fft.fftfreq(PERIOD, dtype=torch.float64)
+
+
+def _powers_and_targets(spectrum: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Of pixels of photographs, at each frequency: power, and this times the PSF's spectrum and its square."""
+    zero = torch.zeros(PERIOD, PERIOD, dtype=torch.float64)
+    sums = [zero, zero, zero]
+    for down in range(-3, 4):
+        for right in range(-3, 4):
+            y, x = (_FREQUENCY + down)[:, None], _FREQUENCY + right
+            size = torch.hypot(y, x)
+            power = (torch.sinc(y) * torch.sinc(x)) ** 2 / size.clamp_min(1 / PERIOD) ** 2
+            psf = spectrum(size)
+            sums = [total + power * factor for total, factor in zip(sums, (1.0, psf, psf**2), strict=True)]
+    return sums[0], sums[1], sums[2]
+
+
+def expected_error(kernel: Tensor, spectrum: Callable[[Tensor], Tensor]) -> float:
+    """Squared error of a kernel on pixels of photographs, of power 1 / f^2, against a PSF of this spectrum."""
+    power, meant, squares = _powers_and_targets(spectrum)
+    half = kernel.shape[-1] // 2
+    axis = torch.arange(-half, half + 1, dtype=torch.float64)
+    wave = torch.cos(2 * math.pi * _FREQUENCY[:, None] * axis)  # kernels are symmetric
+    made = wave @ kernel @ wave.T
+    return float((power * made**2 - 2 * meant * made + squares).sum())
+
+
+def best_kernel(spectrum: Callable[[Tensor], Tensor], half: int) -> Tensor:
+    """The kernel of least expected error that is nowhere negative and sums to 1, by non-negative least squares."""
+    power, meant, _ = _powers_and_targets(spectrum)
+    orbits: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for y in range(-half, half + 1):
+        for x in range(-half, half + 1):
+            orbits.setdefault((max(abs(y), abs(x)), min(abs(y), abs(x))), []).append((y, x))
+    columns = []
+    for pixels in orbits.values():
+        waves = sum(torch.cos(2 * math.pi * (_FREQUENCY[:, None] * y + _FREQUENCY * x)) for y, x in pixels)
+        columns.append((waves * power.sqrt()).flatten())
+    most = 1e3 * torch.tensor([[float(len(pixels)) for pixels in orbits.values()]], dtype=torch.float64)
+    left = torch.cat([torch.stack(columns, 1), most])
+    right = torch.cat([(meant / power.sqrt()).flatten(), most.new_tensor([1e3])])
+    weights, _ = nnls(left.numpy(), right.numpy())
+    kernel = torch.zeros(2 * half + 1, 2 * half + 1, dtype=torch.float64)
+    for pixels, weight in zip(orbits.values(), weights, strict=True):
+        for y, x in pixels:
+            kernel[y + half, x + half] = weight
     return kernel / kernel.sum()
+
+
+def natural_scene(size: int, seed: int) -> Tensor:
+    """A random scene `[1, 1, size, size]` whose power falls with the square of the frequency, as photographs' does."""
+    frequency = torch.fft.fftfreq(size, dtype=torch.float64)
+    falls = 1 / torch.hypot(frequency[:, None], frequency).clamp_min(1 / size)
+    noise = torch.randn(size, size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return torch.fft.ifft2(torch.fft.fft2(noise) * falls).real[None, None]
+
+
+def spread(values: Tensor, kernel: Tensor) -> Tensor:
+    """Values `[1, 1, H, W]` convolved with a kernel, continued beyond the frame as they are at it."""
+    half = kernel.shape[-1] // 2
+    return functional.conv2d(functional.pad(values, (half,) * 4, mode="replicate"), kernel[None, None])

@@ -129,10 +129,20 @@ def test_kernels_are_differentiable_in_the_coc() -> None:
 
 
 @pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])
-def test_kernels_are_one_pixel_up_to_a_coc_of_half_a_pixel(name: str) -> None:
+def test_kernels_are_one_pixel_in_focus_and_move_light_with_the_square_of_the_coc(name: str) -> None:
     table = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}.get(name, lambda: BlurTable.load(name))()
-    kernels = table.kernels(torch.tensor([-0.5, 0.0, 0.3, 0.5]), 100, size=5)
-    assert_close(kernels[:, 0, 2, 2], torch.ones(4, dtype=torch.float64), rtol=0.0, atol=1e-12)
+    moved = 1.0 - table.kernels(torch.tensor([0.0, 0.01, -0.01, 0.02], dtype=torch.float64), 100, size=5)[:, 0, 2, 2]
+    assert float(moved[0]) == pytest.approx(0.0, abs=1e-12)
+    assert_close(moved[1], moved[2])
+    assert 5e-5 < float(moved[1]) < 2e-4 and float(moved[3] / moved[1]) == pytest.approx(4.0, rel=0.03)
+
+
+def test_a_blur_that_a_table_has_in_focus_fades_in_with_the_square_of_the_coc() -> None:
+    table = BlurTable("gaussian", [0.0, 1.0], {"sigma": [0.8, 0.8]})
+    kernels = table.kernels(torch.tensor([0.0, 0.1, 0.5, 1.0], dtype=torch.float64), 100, size=9)
+    moved = 1.0 - kernels[:, 0, 4, 4]
+    assert_close(moved, moved[3] * torch.tensor([0.0, 0.01, 0.25, 1.0], dtype=torch.float64), rtol=1e-12, atol=1e-12)
+    assert_close(kernels[3, 0], psf.gaussian(0.8, size=9))
 
 
 @pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])

@@ -5,6 +5,7 @@ import torch
 
 import torchdof
 from torchdof.render import layer_cocs
+from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
 WIDE = 2.7 / 255  # a tolerance for which layers lie 2 px apart where these planes are
@@ -12,7 +13,7 @@ WIDE = 2.7 / 255  # a tolerance for which layers lie 2 px apart where these plan
 
 def coc_at(x: torch.Tensor) -> torch.Tensor:
     """Coc of places on the blur axis."""
-    return x + 0.5 * x.sign()
+    return torch.tensor([from_blur_axis(place) for place in x.flatten().tolist()]).reshape(x.shape)
 
 
 def test_planes_are_found_where_they_lie_and_slopes_are_none() -> None:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
+from torchdof import BlurTable
 from torchdof.render.layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
 
 NODES = (-4.0, -1.5, 0.0, 0.5, 2.0)
@@ -16,16 +17,32 @@ def weights(x: Tensor) -> Tensor:
     return behind[:-1] - behind[1:]
 
 
-def test_blur_axis_leaves_out_half_a_pixel_around_focus() -> None:
-    coc = torch.tensor([-3.0, -0.5, -0.2, 0.0, 0.5, 0.75, 100.0])
-    assert blur_axis(coc).tolist() == [-2.5, 0.0, 0.0, 0.0, 0.0, 0.25, 99.5]
+def test_blur_axis_is_the_square_of_the_coc_near_focus_and_the_coc_far_from_it() -> None:
+    coc = torch.tensor([-3.0, -0.01, 0.0, 0.009, 0.5, 100.0], dtype=torch.float64)
+    expected = torch.tensor([-9.0 / 3.5 + 2e-4, 0.0, 0.0, 0.0, 0.25 - 2e-4, 1e4 / 100.5 - 2e-4], dtype=torch.float64)
+    assert_close(blur_axis(coc), expected, rtol=0.0, atol=1e-12)
+    assert float(blur_axis(torch.tensor(0.05))) == pytest.approx(0.0025 / 0.55 - 2e-4, rel=1e-4)
+
+
+@given(st.floats(-3.0, 3.0))
+def test_the_blur_axis_has_no_jump(coc: float) -> None:
+    place, beside = blur_axis(torch.tensor([coc, coc + 1e-4], dtype=torch.float64)).tolist()
+    assert 0.0 <= beside - place <= 1.2e-4  # nowhere steeper than 9 / 8
+
+
+def test_what_is_in_focus_is_less_blur_than_moves_two_ten_thousandths_of_the_light() -> None:
+    edge = from_blur_axis(1e-12)
+    assert edge == pytest.approx(0.01, rel=0.02)
+    for table in (BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")):
+        kernel = table.kernels(torch.tensor([edge], dtype=torch.float64), 500)[0, 0]
+        assert 1.0 - float(kernel.max()) < 2e-4
 
 
 @given(st.floats(-100.0, 100.0))
 def test_blur_axis_and_back_is_the_coc_of_what_is_blurred_and_zero_of_what_is_not(coc: float) -> None:
     there = float(blur_axis(torch.tensor(coc, dtype=torch.float64)))
     back = from_blur_axis(there)
-    assert back == pytest.approx(coc if there != 0 else 0.0, abs=1e-12)
+    assert back == pytest.approx(coc if there != 0 else 0.0, abs=1e-11)
 
 
 def test_a_pixel_on_a_node_belongs_to_that_layer_alone() -> None:

@@ -168,10 +168,10 @@ class BlurTable:
         return mixed
 
     def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
-        """Pixel-integrated kernels at a signed coc.
+        """Kernels at a signed coc: what the PSF does to a picture made of pixels (:mod:`torchdof.optics.psf`).
 
-        A blur below the resolution of a pixel passes light through unchanged: for ``|coc_px| <= 0.5`` the kernel is a
-        single pixel. A kernel that is wider than that there fades in until ``|coc_px| = 1``.
+        In focus the kernel is a single pixel, for what is in focus is as sharp in the image as it shall be. Where the
+        table has a blur of its own there, that fades in with the square of the coc until ``|coc_px| = 1``.
 
         Args:
             coc_px: Signed coc in pixels ``[n]``.
@@ -190,9 +190,9 @@ class BlurTable:
         if coc_px.ndim != 1 or not coc_px.numel():
             raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
         kernels = psf.pixel_kernels(self.family, params, size, window).transpose(0, 1)
-        if self.family == "disc" and self.reach_px(0.5, width) <= 0.5 + 1e-9:
+        if all(psf.support(self.family, self._side_params(sign, torch.zeros(1))) == 0.0 for sign in (-1, 1)):
             return kernels
-        fade = (2 * coc_px.to(torch.float64).abs() - 1).clamp(0.0, 1.0)[:, None, None, None]
+        fade = coc_px.to(torch.float64).square().clamp(max=1.0)[:, None, None, None]
         centre = torch.zeros_like(kernels)
         centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
         return torch.lerp(centre, kernels, fade)

@@ -100,11 +100,11 @@ def _aliases(values: Tensor, scale: int) -> Tensor:
 
 
 def _by_moments(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
-    """The factor that leaves out the second moments of averaging, interpolation and the coarser pixel."""
+    """The factor that leaves out the second moments of averaging and interpolation."""
     # second moment of the kernel along an axis; that of a large one from a smaller one of the same shape
     smaller = max(1.0, min(table.reach_px(coc_px, width) / _MOMENT_REACH, abs(coc_px)))
     kernel = table.kernels(torch.tensor([coc_px / smaller], dtype=torch.float64), width / smaller)[0]
     axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
-    variance = smaller**2 * (float((kernel.mean(0).sum(0) * axis**2).sum()) - 1 / 12)
-    others = 1 / 3 - 1 / (12 * scale**2)
+    variance = smaller**2 * (float((kernel.mean(0).sum(0) * axis**2).sum()))
+    others = 1 / 4 - 1 / (12 * scale**2)
     return math.sqrt(max(_LEAST**2, 1 - others / variance))

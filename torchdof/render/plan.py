@@ -12,7 +12,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
 from . import layer_cocs
 from .downsampling import shrink
-from .layer_weights import from_blur_axis, weight_at_or_behind
+from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
@@ -91,7 +91,7 @@ class Plan:
     @classmethod
     def all(cls, max_coc_px: float, tolerance: float) -> "Plan":
         """Layers for every scene up to a radius: the plan of a compiled or exported module."""
-        reach = max_coc_px - 0.5
+        reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64)))
         last = reach - 0.3 * layer_cocs.spacing(reach, tolerance)
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays=False)

@@ -12,10 +12,6 @@ constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alo
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
 
-inline float axis(float coc, float low, float high) { return clamp(coc - clamp(coc, -0.5f, 0.5f), low, high); }
-inline vec axis(vec coc, float low, float high) {
-  return least(most(coc - least(most(coc, all(-0.5f)), all(0.5f)), all(low)), all(high));
-}
 inline bool any_positive(vec v) {
   typedef long long wide __attribute__((vector_size(LANES * 4)));
   const wide bits = (wide)(v > vec{});
@@ -434,7 +430,7 @@ class Composite {
     const float node = layers_[k].at, per_after = layers_[k].per_after;
     f4 share = {}, part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
     auto add = [&](const f4 w, const f4 at, auto light_at) {
-      const f4 part = (axis4(at) - node) * per_after * w;
+      const f4 part = (axis(at, low_, high_) - node) * per_after * w;
       share += w;
       part_sum += part;
       for (int c = 0; c < CHANNELS; c++) {
@@ -460,16 +456,6 @@ class Composite {
       out[1 + c] = sum(one[c]);
       out[CHANNELS + 2 + c] = sum(two[c]);
     }
-  }
-
-  template <typename F4>
-  F4 axis4(F4 coc) const {
-    const F4 zero = {}, half = zero + 0.5f, low = zero + low_, high = zero + high_;
-    F4 middle = coc > -half ? coc : -half;
-    middle = middle < half ? middle : half;
-    F4 x = coc - middle;
-    x = x > low ? x : low;
-    return x < high ? x : high;
   }
 
   static uint64_t below(int k, int word) {  // bits of layers before layer k

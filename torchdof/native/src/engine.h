@@ -132,8 +132,23 @@ struct Layer {
   std::vector<Kernel> kernels;  // one, or one a colour
 };
 
-// Signed coc of a place on the blur axis.
-inline float coc_at(double node) { return (float)(node == 0 ? 0 : node > 0 ? node + 0.5 : node - 0.5); }
+// The blur axis, as render/layer_weights.py tells it: the place of a signed coc, from low to high, and the coc of a place.
+constexpr double SQUARE_PX = 0.5, IN_FOCUS = 2e-4;
+template <typename V>
+inline V axis(V coc, float low, float high) {
+  const V zero = {}, lowest = zero + low, highest = zero + high, focus = zero + (float)IN_FOCUS;
+  const V size = coc < zero ? -coc : coc;
+  V x = coc * size / (size + (float)SQUARE_PX);
+  V middle = x > -focus ? x : -focus;
+  middle = middle < focus ? middle : focus;
+  x = x - middle;
+  x = x > lowest ? x : lowest;
+  return x < highest ? x : highest;
+}
+inline float coc_at(double node) {
+  const double beyond = (std::fabs(node) + IN_FOCUS) / 2;
+  return (float)(node == 0 ? 0 : std::copysign(beyond + std::sqrt(beyond * (beyond + 2 * SQUARE_PX)), node));
+}
 
 struct Job {
   explicit Job(const torchdof_scene &scene);
