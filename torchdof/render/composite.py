@@ -18,6 +18,7 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
+_KNOWN = 0.001  # share of scattered weight from which on a layer is known in full
 
 
 def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
@@ -26,9 +27,10 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
     ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
     Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
-    blurred edge of what is in front. Outside the frame surfaces go on as they are at the border, but their light is
-    unknown and weighs nothing: colours are means over what was seen. Where all layers leave a pixel uncovered, what is
-    behind them shows.
+    blurred edge of what is in front. A layer of which next to nothing is known covers next to nothing: without that, a
+    hair more or less in it would change the picture. Outside the frame surfaces go on as they are at the border, but
+    their light is unknown and weighs nothing: colours are means over what was seen. Where all layers leave a pixel
+    uncovered, what is behind them shows.
 
     Args:
         frame: The surfaces seen in each pixel.
@@ -48,7 +50,8 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
             floor = weight.clamp(_LEAST**2, _LEAST)
             light = light * (weight / torch.maximum(seen, floor))
             light_and_weight = torch.cat([light, weight * (seen / floor).clamp(max=1.0)], 1)
-        visible = visible.clamp_min(_LEAST)
+        little = visible.clamp(max=_KNOWN)
+        visible = visible - little + 0.5 * (_KNOWN + little * little / _KNOWN)
         return light_and_weight / (visible if each == 1 else visible.repeat(1, 2, 1, 1))
 
     def composited(front: Tensor, behind: Tensor) -> Tensor:

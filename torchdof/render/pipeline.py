@@ -203,7 +203,7 @@ def _composite(
     layered, tiles = options.method == "layered", tiling.get() if torch.compiler.is_exporting() else None
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
     align = None if tiles is None else tiles.align
-    frame = framed(surfaces, behind, plan.nodes, blurs, options.border == "extend", stacked, align)
+    frame = framed(surfaces, behind, plan.nodes, blurs, options.border == "extend", options.occlusion, stacked, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
         scatter = convolve if layered else fold
