@@ -24,6 +24,7 @@ _REACH = 2  # pixels around a mixed pixel that tell what its two surfaces look l
 _UNCLEAN = 1e-3  # weight of a pixel that may be mixed itself
 _TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
 _TEXTURE = 4.0 / 3.0  # times the variance of the own surface's light, all colours, is what its texture may explain
+_HEADROOM = 8.0  # light so many times its mean around is a highlight's
 _LEAST_WEIGHT = 0.1  # a smaller weight is more likely texture than a second surface
 
 
@@ -104,7 +105,13 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[T
     # what the mean colours do not explain goes to both; the own part takes what the other leaves: no light is lost
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
     unexplained = colour - (1.0 - other_weight) * own_mean - other_weight * other_mean
-    other = (other_mean + unexplained * other_weight / (other_weight**2 + (1.0 - other_weight) ** 2)).clamp_min(0.0)
+    other = other_mean + unexplained * other_weight / (other_weight**2 + (1.0 - other_weight) ** 2)
+    # neither beyond the light around, but for highlights, of which each pixel may hold a part
+    least, most = torch.aminmax(window_light, dim=1)
+    most = most + _HEADROOM * (most - _HEADROOM * window_light.mean(1)).clamp_min(0.0)
+    own_room = (1.0 - other_weight) / other_weight.clamp_min(1e-6)
+    other = torch.maximum(other, torch.maximum(least, colour - own_room * (most - colour)))
+    other = torch.minimum(other, torch.minimum(most, colour + own_room * (colour - least)))
     own = (colour - other_weight * other) / (1.0 - other_weight)
     return (
         pixels.put(light, edge_pixels, own),

@@ -13,6 +13,7 @@ constexpr float UNCLEAN = 1e-3f;  // weight of a pixel that may be mixed itself
 constexpr float TRUST = 4.0f;     // how much local contrast discredits a split
 constexpr float DOUBT = 4.0f / 3.0f;
 constexpr float LEAST_SHARE = 0.1f;
+constexpr float HEADROOM = 8.0f;  // light so many times its mean around is a highlight's
 constexpr float SAME_PX = 0.5f;  // a background whose coc differs by less is the surface that the image shows
 
 constexpr int MARGIN = REACH + 1;              // an edge is told by its neighbours
@@ -177,7 +178,20 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
   for (int c = 0; c < channels; c++) {
     const float mine = is_near ? front[c] : behind[c], its = is_near ? behind[c] : front[c];
     const float rest = colour[c] - (1.0f - share) * mine - share * its;
-    const float other = std::max(its + rest * share / norm, 0.0f);
+    // neither beyond the light around, but for highlights, of which each pixel may hold a part
+    const float *light = w.light.data() + (size_t)c * EDGES * PITCH + first;
+    float least = light[0], most = light[0], total = 0;
+    for (int r = 0; r < AROUND; r++)
+      for (int d = 0; d < AROUND; d++) {
+        const float v = light[r * PITCH + d];
+        least = std::min(least, v);
+        most = std::max(most, v);
+        total += v;
+      }
+    most += HEADROOM * std::max(most - HEADROOM * total / (AROUND * AROUND), 0.0f);
+    const float own_room = (1.0f - share) / std::max(share, 1e-6f);
+    float other = std::max(its + rest * share / norm, std::max(least, colour[c] - own_room * (most - colour[c])));
+    other = std::min(other, std::min(most, colour[c] + own_room * (colour[c] - least)));
     block.other[c * BLOCK_PIXELS + at] = other;
     block.own[c * BLOCK_PIXELS + at] = (colour[c] - share * other) / (1.0f - share);
   }
