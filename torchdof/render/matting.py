@@ -80,7 +80,9 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[T
     back, back_variance = _mean(window_light, far_weight)
     # a thin foreground has no clean pixel: trust the one that differs most from what is behind
     differs = near_weight * ((window_light - back[:, None]) ** 2).sum(0) + 1e-12
-    front, front_variance = _mean(window_light, torch.where(near_weight.sum(0) > 20 * _UNCLEAN, near_weight, differs))
+    clean = (near_weight.sum(0) / (20 * _UNCLEAN) - 0.5).clamp(0.0, 1.0)
+    near_part, differing_part = clean / near_weight.sum(0).clamp_min(1e-12), (1.0 - clean) / differs.sum(0)
+    front, front_variance = _mean(window_light, near_weight * near_part + differs * differing_part)
 
     # a = (I - B) (F - B) / (F - B)^2, as far as it can be trusted
     contrast = front - back
@@ -92,7 +94,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[T
     # what lies behind is seen sharp where it is nearer to focus, and so is every error of its matte
     own_variance = torch.where(is_near, front_variance, back_variance)
     texture_weight = (_TEXTURE * own_variance / strength.clamp_min(1e-12)).clamp_min(1e-12).sqrt()
-    trusted = fitted_weight - torch.where(far.abs() < near.abs(), texture_weight, 0.0)
+    trusted = fitted_weight - texture_weight * ((near.abs() - far.abs()) / _EDGE_PX).clamp(0.0, 1.0)
     trusted = trusted * (2.0 * trusted / _LEAST_WEIGHT - 1.0).clamp(0.0, 1.0)
     # the light of a highlight counts even where its weight is small
     moved = fitted_weight * (strength / (colour**2).sum(0).clamp_min(1e-18)).clamp_min(1e-12).sqrt()

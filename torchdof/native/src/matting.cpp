@@ -135,17 +135,22 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
   }
   float *front = w.front.data(), *behind = w.behind.data(), *colour = w.colour.data();
   const float behind_spread = mean(w, channels, first, farther, behind);
-  f8 clean = {};
-  for (int r = 0; r < AROUND; r++) clean += nearer[r];
-  if (!(sum(clean) > 20 * UNCLEAN))  // a thin foreground: trust the pixel that differs most from what is behind
+  f8 all_near = {}, all_differing = {};
+  for (int r = 0; r < AROUND; r++) all_near += nearer[r];
+  const float near_sum = sum(all_near), clean = clamp01(near_sum / (20 * UNCLEAN) - 0.5f);
+  if (clean < 1) {  // a thin foreground: trust the pixel that differs most from what is behind
+    f8 differing[AROUND];
     for (int r = 0; r < AROUND; r++) {
       f8 squares = {};
       for (int c = 0; c < channels; c++) {
         const f8 d = load<f8>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH) - all8(behind[c]);
         squares += d * d;
       }
-      nearer[r] = nearer[r] * squares + inside * all8(1e-12f);
+      all_differing += differing[r] = nearer[r] * squares + inside * all8(1e-12f);
     }
+    const float near_part = clean / std::max(near_sum, 1e-12f), differing_part = (1.0f - clean) / sum(all_differing);
+    for (int r = 0; r < AROUND; r++) nearer[r] = nearer[r] * near_part + differing[r] * differing_part;
+  }
   const float front_spread = mean(w, channels, first, nearer, front);
 
   float strength = 0, along = 0, brightness = 0, misfit = 0;
@@ -165,7 +170,8 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
   const float trust = strength / (strength + 4e-4f + TRUST * (behind_spread + front_spread + misfit));
   const float raw = is_near ? 1.0f - fitted : fitted, own_spread = is_near ? front_spread : behind_spread;
   float doubt = 0;
-  if (std::fabs(far) < std::fabs(near)) doubt = std::sqrt(std::max(DOUBT * own_spread / std::max(strength, 1e-12f), 1e-12f));
+  const float sharper = clamp01((std::fabs(near) - std::fabs(far)) / EDGE_PX);
+  if (sharper > 0) doubt = sharper * std::sqrt(std::max(DOUBT * own_spread / std::max(strength, 1e-12f), 1e-12f));
   float sure = raw - doubt;
   sure *= clamp01(2.0f * sure / LEAST_SHARE - 1.0f);
   const float moved = raw * std::sqrt(std::max(strength / std::max(brightness, 1e-18f), 1e-12f));
