@@ -162,7 +162,9 @@ def _render_item(
     # the highlights of these, ray by ray
     splats = None
     if limit is not None and plan.rays:
-        extracted = [highlights.extract(s, limit, coc if options.occlusion else None, crisp_px) for s in surfaces]
+        # without occlusion only those that coarse layers would soften
+        from_px = 0.0 if options.occlusion else crisp_px - 1.0
+        extracted = [highlights.extract(s, limit, from_px) for s in surfaces]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         splats = highlights.splat(rays, coc, options.table, options.occlusion) if rays else None
 

@@ -958,7 +958,7 @@ class Composite {
     auto each_tile = [&](auto body) {
       for (int i = 0; i < (int)job_.rays.size(); i++) {
         const Ray &ray = job_.rays[i];
-        const int half = ray_halves_[ray.radius];
+        const int half = std::max(ray_halves_[ray.radius], ray_halves_[ray.radius + 1]);
         const int r0 = std::max(ray.row - half, 0) / TILE, r1 = std::min(ray.row + half, H_ - 1) / TILE;
         const int c0 = std::max(ray.column - half, 0) / TILE, c1 = std::min(ray.column + half, W_ - 1) / TILE;
         for (int r = r0; r <= r1; r++)
