@@ -62,7 +62,8 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
         behind = fields.pop()[..., inner, inner] if backed else None
         each = 3 if weighted else 2
         surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
-        piece = Frame(surfaces, frame.nodes, behind, margin, (length, length), (length, length))
+        whole = (length, length)
+        piece = Frame(surfaces, frame.nodes, behind, margin, whole, whole, frame.occlusion)
         tile = render(piece, [Blur(kernel.reshape(shape), scale) for kernel, shape, scale in bank])
         return count + 1, tile.reshape(colours, length, length)
 

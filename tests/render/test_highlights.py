@@ -88,7 +88,7 @@ def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) 
         y, x = (y * 2 / (height - 1) - 1)[:, :, None], (x * 2 / (width - 1) - 1)[:, None, :]
         y, x = y.expand_as(wanted), x.expand_as(wanted)
         seen = functional.grid_sample(layer, torch.stack([x, y], -1), padding_mode="border", align_corners=True)
-        wanted += seen[:, 0] * (coc - 1.5 >= hiding.low + k)[:, None, None]
+        wanted += seen[:, 0] * (coc - 1.0 - (hiding.low + k)).clamp(0.0, 1.0)[:, None, None]
     wanted = wanted.clamp(max=1.0)
     assert 0.1 < float(wanted.mean()) < 0.9, "the scene tests nothing"
     torch.testing.assert_close(hidden, wanted, rtol=0, atol=1e-9)
@@ -105,14 +105,14 @@ def test_splatting_in_parts_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
 def test_light_below_the_threshold_stays_in_the_layers() -> None:
     image = torch.rand(1, 3, 64, 80, generator=torch.Generator().manual_seed(1))
     coc = torch.linspace(-9, 9, 80).expand(1, 1, 64, 80)
-    left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image), coc, 1.0)
+    left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
     assert rays is None
     assert left.light is image
 
 
 def test_what_is_extracted_and_what_is_left_sum_to_the_light() -> None:
     image, coc, (row, column) = street()
-    left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image), coc, 1.0)
+    left, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
     assert rays is not None
     assert rays.pixels.tolist() == [row * 96 + column]
     torch.testing.assert_close(left.light[0, :, row, column] + rays.light[:, 0], image[0, :, row, column])
@@ -122,7 +122,7 @@ def test_what_is_extracted_and_what_is_left_sum_to_the_light() -> None:
 def test_where_a_surface_is_not_it_has_no_rays() -> None:
     image, coc, _ = street()
     surface = Surface(image, coc, torch.zeros_like(coc))
-    left, rays = highlights.extract(surface, highlights.threshold(image), coc, 1.0)
+    left, rays = highlights.extract(surface, highlights.threshold(image))
     assert rays is None
     assert left.light is image
 
@@ -132,11 +132,33 @@ def test_many_bright_pixels_are_left_to_the_layers_but_for_the_brightest() -> No
     image = torch.rand(1, 1, 128, 128, generator=generator)
     image = torch.where(torch.rand(image.shape, generator=generator) < 0.05, 100.0 * (1.0 + image), 0.01 * image)
     coc = torch.full((1, 1, 128, 128), 20.0)
-    _, rays = highlights.extract(Surface(image, coc), highlights.threshold(image), coc, 1.0)
+    _, rays = highlights.extract(Surface(image, coc), highlights.threshold(image))
     assert rays is not None
-    assert len(rays.pixels) * 41**2 <= highlights._TAPS_PER_PIXEL * 128**2
+    assert len(rays.pixels) * 41**2 <= 2 * highlights._TAPS_PER_PIXEL * 128**2
     taken = torch.zeros(128 * 128, dtype=torch.bool).index_fill(0, rays.pixels, True)
     assert image.flatten()[taken].min() >= image.flatten()[~taken].max()
+
+
+@pytest.mark.parametrize("range_of_light", [0.0, 1.0])
+def test_bright_pixels_that_become_too_many_fade_into_the_layers(range_of_light: float) -> None:
+    generator = torch.Generator().manual_seed(2)
+    image = torch.full((1, 1, 64, 64), 0.01)
+    image[..., ::5, ::5] = 1.0 + range_of_light * torch.rand(1, 1, 13, 13, generator=generator)
+    limit, light = highlights.threshold(image), []
+    for coc_px in torch.linspace(9.0, 15.0, 600).tolist():
+        _, rays = highlights.extract(Surface(image, torch.full_like(image, coc_px)), limit)
+        light.append(0.0 if rays is None else float(rays.light.sum()))
+    steps = torch.tensor(light).diff()
+    assert light[0] > 1.3 * light[-1], "the scene tests nothing"
+    assert float(steps.abs().max()) < 0.02 * light[0]
+
+
+@pytest.mark.parametrize(("height", "width"), [(66, 99), (31, 70), (2, 35), (1, 1)])
+def test_the_threshold_of_a_flipped_image_is_the_flipped_threshold(height: int, width: int) -> None:
+    image = torch.rand(1, 3, height, width)
+    limit = highlights.threshold(image)
+    for turned in (lambda t: t.flip(-1), lambda t: t.flip(-2), lambda t: t.mT):
+        torch.testing.assert_close(highlights.threshold(turned(image)), turned(limit), rtol=1e-6, atol=0.0)
 
 
 def test_light_that_is_not_known_makes_nothing_a_highlight() -> None:

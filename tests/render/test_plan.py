@@ -153,11 +153,17 @@ def test_depths_that_are_not_numbers_count_as_in_focus_when_a_plan_is_told() -> 
     assert pixels is not None and pixels[0] == pytest.approx(799 / 4000)
 
 
-def test_kernels_of_highlights_are_those_of_the_nearest_thirty_second_of_a_pixel() -> None:
-    table, coc = BlurTable.disc(), torch.tensor([3.01, -7.26, 3.0])
+def test_kernels_of_highlights_lie_between_those_of_whole_thirty_seconds_of_a_pixel() -> None:
+    table, coc = BlurTable.disc(), torch.tensor([3.0, 3.0078125, -7.26], dtype=torch.float64)
     kernels = kernels_for(table, coc, 100, 100)
-    expected = table.kernels(torch.tensor([3.0, -7.25, 3.0], dtype=torch.float64), 100)
-    torch.testing.assert_close(kernels, expected)
+    low, high = (
+        table.kernels(torch.tensor([3.0, 3.03125, -7.28125, -7.25], dtype=torch.float64), 100)
+        .unflatten(0, (2, 2))
+        .unbind(1)
+    )
+    torch.testing.assert_close(kernels[0], low[0])
+    torch.testing.assert_close(kernels[1], torch.lerp(low[0], high[0], 0.25))
+    torch.testing.assert_close(kernels[2], torch.lerp(low[1], high[1], 0.68))
     assert kernels_for(table, coc, 100, 4).shape[-1] == 7
     moving = coc.double().requires_grad_()
     torch.testing.assert_close(kernels_for(table, moving, 100, 100), table.kernels(moving, 100))

@@ -18,6 +18,7 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
+_KNOWN = 0.001  # share of scattered weight from which on a layer is known in full
 
 
 def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
@@ -26,7 +27,9 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
     ``colour = K_k * (m_k I) / K_k * M_k``, coverage ``a = K_k * m_k / K_k * M_k``, ``out = colour + (1 - a) out``.
     Dividing by ``K_k * M_k`` keeps a surface that spans several layers closed and lets the background reach under the
-    blurred edge of what is in front. Where all layers leave a pixel uncovered, what is behind them shows.
+    blurred edge of what is in front. A layer of which next to nothing is known covers next to nothing: without that, a
+    hair more or less in it would change the picture. Where all layers leave a pixel uncovered, what is behind them
+    shows.
 
     Args:
         frame: The surfaces seen in each pixel.
@@ -41,7 +44,8 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     def normalised(layer: Tensor) -> Tensor:
         """Colour and coverage, from scattered ``m_k I``, ``m_k`` and ``M_k``."""
         light_and_weight, visible = layer.tensor_split((colours + each,), 1)
-        visible = visible.clamp_min(_LEAST)
+        little = visible.clamp(max=_KNOWN)
+        visible = visible - little + 0.5 * (_KNOWN + little * little / _KNOWN)
         return light_and_weight / (visible if each == 1 else visible.repeat(1, 2, 1, 1))
 
     def composited(front: Tensor, behind: Tensor) -> Tensor:

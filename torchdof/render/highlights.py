@@ -5,9 +5,10 @@ disc of a highlight everybody sees it, for a post in front of a lamp draws a cri
 pixel at ``p`` with coc ``c`` through the point ``u`` of the lens lands at ``p + c u``, and it passes a nearer surface
 with coc ``c'`` where the image shows the position ``p + (c - c') u``. So the sharp image itself tells which rays pass.
 
-Highlights are few. What exceeds the threshold of what is around it is extracted from the layers, and splatted as
-rays: where something nearer could stand in the way, and where its layer is too coarse for a crisp edge. Without
-occlusion nothing stands in the way, and the rays' light is divided by the same sum of weights as the layers'.
+Highlights are few. What exceeds the threshold of what is around it is extracted from the layers, and splatted as rays.
+Without occlusion nothing stands in the way: there rays are for what layers would be too coarse for, and their light is
+divided by the same sum of weights as the layers'. Nothing of it sets in at once: what a highlight exceeds, how much it
+is blurred, what stands before it and how many there are fade in.
 """
 
 import math
@@ -29,9 +30,12 @@ __all__ = ["FACTOR", "Highlights", "extract", "splat", "threshold"]
 FACTOR = 8.0
 """Light above so many times what is around it is a highlight's."""
 
-_CELL = 32  # pixels over which the threshold is decided
+_STEP = 3  # every so many pixels one tells the threshold; odd, as the next, that a flip of an image flips them
+_CELL = 11  # of them over which it is decided
+_LEAST_PX = 1.0  # blur from which on there are rays
 _COARSE_CELL = 8  # pixels in which nearer surfaces are looked for
-_NEARER_PX = 1.5  # difference in coc from which on a surface is another one, in front
+_NEARER_PX = 1.0  # difference in coc from which on a surface is another one, in front: wholly at 1 px more
+_WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, what counts of its rays
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
 _TAPS = 2**21  # rays splatted together
 
@@ -50,80 +54,78 @@ def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
     It is :data:`FACTOR` times what four fifths of the pixels of a cell stay below, interpolated between cells.
     """
     height, width = light.shape[-2:]
-    brightest = light.detach()[..., ::2, ::2].amax(1, keepdim=True)
+    brightest = light.detach().amax(1, keepdim=True)
     if valid is not None:
-        brightest = torch.where(valid[..., ::2, ::2] > 0, brightest, torch.inf)
-    # as in `disocclusion`: in this form exported code knows that the sizes are multiples
-    cell, (rows, columns) = _CELL // 2, brightest.shape[-2:]
-    more = 2 * cell - 1
-    ends = (0, (columns + more) // cell * cell - columns, 0, (rows + more) // cell * cell - rows)
-    cells = functional.pixel_unshuffle(functional.pad(brightest, ends, mode="replicate"), cell)
+        brightest = torch.where(valid > 0, brightest, torch.inf)
+    side = _STEP * _CELL
+    (top, rows), (left, columns) = (_cells(n, side, light.device) for n in (height, width))
+    cells = functional.pixel_unshuffle(brightest[..., rows, :][..., columns], _CELL)
     level = torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
     level = FACTOR * level.clamp(0.0, torch.finfo(light.dtype).max / FACTOR)
-    level = functional.interpolate(level, scale_factor=float(_CELL), mode="bilinear", align_corners=False)
-    return level[..., :height, :width]
+    level = functional.interpolate(level, scale_factor=float(side), mode="bilinear", align_corners=False)
+    return level[..., top : top + height, left : left + width]
 
 
-def extract(
-    surface: Surface, limit: Tensor, nearest_px: Tensor | None, crisp_px: float
-) -> tuple[Surface, Highlights | None]:
-    """Take the light above a limit out of a surface of an image, where it needs to be splatted ray by ray.
+def _cells(size: int, side: int, device: torch.device) -> tuple[int, Tensor]:
+    """Pixels by which cells along an axis begin before it, as they end after it, and the pixels that tell of them.
+
+    Two cells at least. Beyond its ends the axis is mirrored.
+    """
+    count = (size + 2 * side - 1) // side
+    count = count + (count + size) % 2
+    before = (count * side - size) // 2
+    place = (torch.arange(count * _CELL, device=device) * _STEP + (_STEP // 2 - before)) % (2 * size)
+    return before, torch.minimum(place, 2 * size - 1 - place)
+
+
+def extract(surface: Surface, limit: Tensor, from_px: float = _LEAST_PX) -> tuple[Surface, Highlights | None]:
+    """Take the light above a limit out of a surface of an image, to be splatted ray by ray.
 
     Args:
         surface: Of an image.
         limit: As :func:`threshold` gives it, ``[B, 1, H, W]``.
-        nearest_px: Coc of what each pixel shows, ``[B, 1, H, W]``; None if nothing hides anything.
-        crisp_px: Blurs from this radius on lose their edge in coarse layers, so they are splatted in any case.
+        from_px: Blur from which on there are rays; all of the light above the limit is theirs at 1 px more.
 
     Returns:
         The surface with what is left of its light, and the highlights if there are any.
     """
     light, coc_px, weight = surface
+    from_px = max(from_px, _LEAST_PX)
     brightest = light.amax(1, keepdim=True)
-    is_bright = brightest > limit
+    is_bright = (brightest > limit) & (coc_px.detach().abs() > from_px)
     bright = pixels.indices(is_bright if weight is None else is_bright & (weight > 0))
-    coc = pixels.pick(coc_px.detach(), bright)[0]
-    needed = coc.abs() >= crisp_px
-    if nearest_px is not None and len(bright):
-        needed |= _need_splats(bright, coc, nearest_px)
-    bright = bright[needed & (coc.abs() > 1.0)]
-    peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
-    order = torch.argsort(peak.detach(), descending=True)
-    taps = ((2.0 * coc.detach().abs() + 1.0) ** 2)[order].cumsum(0)
-    count = int((taps <= _TAPS_PER_PIXEL * coc_px.numel()).sum())
-    if count == 0:
+    if len(bright) == 0:
         return surface, None
-    if count < len(bright):  # too many: the brightest of them, and only what they are brighter by
-        most = torch.maximum(most, peak[order[count]].detach())
-        bright, peak, coc, most = (t[order[:count]] for t in (bright, peak, coc, most))
-    # from nothing at a radius of 1 px to all of it at 2
-    excess = pixels.pick(light, bright) * ((1.0 - most / peak) * (coc.abs() - 1.0).clamp(max=1.0))
+    peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
+    fades = (coc.abs() - from_px).clamp(max=1.0)
+    least = _least_peak(peak.detach(), coc.detach(), ((1.0 - most / peak) * fades).detach(), coc_px.numel())
+    if least > 0.0:  # too many: the brightest of them, and only what they are brighter by
+        kept = peak.detach() > least
+        bright, peak, fades, coc, most = (t[kept] for t in (bright, peak, fades, coc, most))
+        most = most.clamp_min(least)
+        if len(bright) == 0:
+            return surface, None
+    excess = pixels.pick(light, bright) * ((1.0 - most / peak) * fades)
     left = pixels.put(light, bright, pixels.pick(light, bright) - excess)
     highlights = Highlights(bright, excess if weight is None else excess * pixels.pick(weight, bright), coc)
     return surface._replace(light=left), highlights
 
 
-def _need_splats(bright: Tensor, coc: Tensor, nearest_px: Tensor) -> Tensor:
-    """Whether a ray of a pixel could meet a nearer surface; none too few.
+def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, area: int) -> float:
+    """Light up to which highlights ``[n]`` are left to the layers of a frame, lest there be too many rays; 0: all fit.
 
-    Wider and wider windows are looked at, in cells: a surface that is nearer by ``d`` hides from at most ``d`` pixels
-    away.
+    It is the ``L`` at which the rays of those with a peak ``p`` above it, weighted by ``1 - L / (2 p)``, are as many as
+    there may be. So it grows smoothly with their number, for equal ones too, and at most twice as many are splatted.
     """
-    height, width = nearest_px.shape[-2:]
-    item, row, column = pixels.places(bright, height, width)
-    needed = torch.zeros_like(coc, dtype=torch.bool)
-    cells = functional.max_pool2d(-nearest_px.detach(), _COARSE_CELL, ceil_mode=True)
-    rows, columns = row // _COARSE_CELL, column // _COARSE_CELL
-    inner, radius = _NEARER_PX, 1  # of the window, in pixels and cells
-    farthest = float(torch.maximum(coc.max() + cells.max(), 2.0 * coc.abs().max()))
-    while inner < farthest:
-        down, right = (min(radius, n) for n in cells.shape[-2:])
-        around = functional.max_pool2d(cells, (2 * down + 1, 1), stride=1, padding=(down, 0))
-        around = functional.max_pool2d(around, (1, 2 * right + 1), stride=1, padding=(0, right))
-        near = -around[item, 0, rows, columns]
-        needed |= (near < coc - inner) | ((near < coc - _NEARER_PX) & (2.0 * coc.abs() > inner))
-        inner, radius = max(_NEARER_PX, float(radius * _COARSE_CELL)), 2 * radius
-    return needed
+    budget = float(_TAPS_PER_PIXEL * area)
+    taps = ((2.0 * coc.abs() + 1.0) ** 2 * (_WHOLE * share).clamp(max=1.0)).double()
+    if float(taps.sum()) <= budget:
+        return 0.0
+    peak, order = peak.double().sort(descending=True)
+    count, slope = taps[order].cumsum(0), (0.5 * taps[order] / peak).cumsum(0)
+    at_next = count - functional.pad(peak[1:], (0, 1)) * slope  # how many there are at the next peak
+    last = int((at_next >= budget).nonzero()[0])
+    return min(float((count[last] - budget) / slope[last]), float(peak[last]))
 
 
 def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable, occlusion: bool = True) -> Tensor:
@@ -207,14 +209,15 @@ class _Hiding:
             )
             count = sums[item, bottom + 1, right + 1] - sums[item, top, right + 1]
             count = count - sums[item, bottom + 1, left] + sums[item, top, left]
-            hit = ((count > 0) & (coc.detach() - _NEARER_PX >= nearer)).nonzero()[:, 0]
+            fades = (coc - _NEARER_PX - nearer).clamp(0.0, 1.0)
+            hit = ((count > 0) & (fades.detach() > 0)).nonzero()[:, 0]
             if len(hit):
                 way = scale[hit, None] * step
                 rows, columns = (row[hit, None] + way)[:, :, None], (column[hit, None] + way)[:, None, :]
                 around, down, right = pixels.corners(item[hit, None, None], rows, columns, self.height, self.width)
                 covered = [self._covered(pixel, k) for pixel in around]
                 upper, lower = torch.lerp(covered[0], covered[1], right), torch.lerp(covered[2], covered[3], right)
-                hidden = hidden.index_add(0, hit, torch.lerp(upper, lower, down))
+                hidden = hidden.index_add(0, hit, torch.lerp(upper, lower, down) * fades[hit, None, None])
         return hidden.clamp(max=1.0)
 
     def _covered(self, pixel: Tensor, k: int) -> Tensor:

@@ -5,6 +5,9 @@ two nodes is divided linearly, which makes the picture continuous and differenti
 of it follows from one ramp: the weight of a pixel at or behind node k is
 ``clamp((x - nodes[k-1]) / (nodes[k] - nodes[k-1]))``; its weight in layer k is the difference of two ramps.
 
+Where layers occlude each other their light is divided by the weight at or behind them, and there the ramp is eased: the
+share of a pixel a hair behind a node is next to nothing, and what is divided by it would be all that its layer knows.
+
 Nodes live on the *blur axis* ``x = sign(coc) * max(coc^2 / (|coc| + 0.5) - 2e-4, 0)``. Far from focus it goes as the
 coc does, near focus as its square, which is how the light goes that a small kernel moves. So a mixture of the sharp
 layer, at x = 0, and the first blurred one stands for the blurs between them. What lies at x = 0 is in focus and passes
@@ -17,10 +20,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["blur_axis", "from_blur_axis", "weight_at_or_behind"]
+__all__ = ["blur_axis", "eased", "from_blur_axis", "weight_at_or_behind"]
 
 _SQUARE_PX = 0.5  # coc around which the axis goes over from the square to the coc itself
 _IN_FOCUS = 2e-4  # where focus ends: a coc of 0.01 px
+
+
+_FOOT = 0.1  # share up to which an eased ramp rises by its square
 
 
 def blur_axis(coc_px: Tensor) -> Tensor:
@@ -49,3 +55,10 @@ def weight_at_or_behind(x: Tensor, nodes: Sequence[float], k: int) -> Tensor:
     if k == len(nodes):
         return torch.zeros_like(x)
     return ((x - nodes[k - 1]) / (nodes[k] - nodes[k - 1])).clamp(0.0, 1.0)
+
+
+def eased(weight: Tensor) -> Tensor:
+    """A ramp from 0 to 1 whose foot is a parabola, so that it leaves 0 slowly."""
+    slope = 1.0 / (1.0 - 0.5 * _FOOT)
+    foot = weight.clamp(max=_FOOT)
+    return torch.maximum(1.0 - slope * (1.0 - weight), (0.5 * slope / _FOOT) * foot * foot)

@@ -162,7 +162,9 @@ def _render_item(
     splats = None
     if limit is not None and splatted and plan.rays:
         shown = surfaces if behind_light is None else surfaces[1::-1]
-        extracted = [highlights.extract(s, limit, coc if options.occlusion else None, crisp_px) for s in surfaces]
+        # without occlusion only those that coarse layers would soften
+        from_px = 0.0 if options.occlusion else crisp_px - 1.0
+        extracted = [highlights.extract(s, limit, from_px) for s in surfaces]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         splats = highlights.splat(rays, shown, options.table, options.occlusion) if rays else None
 
@@ -204,7 +206,8 @@ def _composite(
     layered, tiles = options.method == "layered", tiling.get() if torch.compiler.is_exporting() else None
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
     align = None if tiles is None else tiles.align
-    frame = framed(surfaces, behind, plan.nodes, blurs, stacked, options.occlusion or options.normalize, limit, align)
+    lit = options.occlusion or options.normalize
+    frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
         scatter = convolve if layered else fold

@@ -162,15 +162,17 @@ class Plan:
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:
     """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, of signed coc ``[n]``.
 
-    Each is that of the nearest 1/32 px where no gradient asks for more. They are cut to what reaches within a frame
-    whose longer side is ``longest`` pixels.
+    Each is interpolated between those of whole 1/32 px where no gradient asks for more. They are cut to what reaches
+    within a frame whose longer side is ``longest`` pixels.
     """
     if torch.is_grad_enabled() and coc_px.requires_grad:
         kernels = table.kernels(coc_px, width)
     else:
-        steps = (coc_px.double() * KERNELS_PER_PX).round() / KERNELS_PER_PX
-        radii, which = torch.unique(steps, return_inverse=True)
-        kernels = table.kernels(radii.cpu(), width).to(coc_px.device)[which]
+        steps = coc_px.double() * KERNELS_PER_PX
+        below = steps.floor()
+        radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
+        low, high = (table.kernels(radii.cpu() / KERNELS_PER_PX, width).to(coc_px.device)[i] for i in which)
+        kernels = torch.lerp(low, high, (steps - below)[:, None, None, None])
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
     return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
 

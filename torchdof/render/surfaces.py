@@ -12,11 +12,15 @@ from ..validation import is_traced
 from .border import continued
 from .disocclusion import BEHIND_STEP, behind_size, fill_hidden
 from .downsampling import upsampled
-from .layer_weights import blur_axis, weight_at_or_behind
+from .layer_weights import blur_axis, eased, weight_at_or_behind
 from .matting import emitters_behind, matte
 from .plan import Blur
 
 __all__ = ["Frame", "Placed", "Surface", "framed", "surfaces_of_image"]
+
+
+_HAIR = 0.03
+"""Share of a surface up to which, in a layer, it does not yet hide what is known behind it."""
 
 
 class Surface(NamedTuple):
@@ -49,6 +53,7 @@ class Frame:
         margin: Pixels on each side, as many as the widest kernel reaches.
         area: Height and width, continued to whole blocks of the coarsest layer.
         size: Height and width of the image.
+        occlusion: Layers occlude each other, and the ramps between them are eased.
         stacked: The surfaces of a pixel, near to far, each cover it by their weight, whatever the others do. False:
             their weights sum to at most 1.
     """
@@ -59,6 +64,7 @@ class Frame:
     margin: int
     area: tuple[int, int]
     size: tuple[int, int]
+    occlusion: bool
     stacked: bool = False
 
     @property
@@ -93,16 +99,21 @@ class Frame:
         With visibility ``M_k`` as well, the weight at or behind the layer.
         """
         surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
-        light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, self.nodes, k)
+        ramps = [[weight_at_or_behind(s.x, self.nodes, i) for i in (k, k + 1)] for s in surfaces]
+        if self.occlusion:
+            ramps = [[eased(ramp) for ramp in pair] for pair in ramps]
+        light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, ramps)
         return [light, weight, behind] if visibility else [light, weight]
 
 
-def _mixed(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
-    """``m_k I``, ``m_k`` and ``M_k`` of surfaces that share their pixels: each is a sum over them."""
+def _mixed(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+    """``m_k I``, ``m_k`` and ``M_k`` of surfaces that share their pixels: each is a sum over them.
+
+    Ramps are how much of each surface lies at or behind layer k, and behind it.
+    """
     sums: list[Tensor] = []
-    for light, x, cover in surfaces:
-        behind = weight_at_or_behind(x, nodes, k)
-        own = behind - weight_at_or_behind(x, nodes, k + 1)
+    for (light, _, cover), (behind, beyond) in zip(surfaces, ramps, strict=True):
+        own = behind - beyond
         if cover is not None:
             behind, own = behind * cover, own * cover
         terms = [light * own, own, behind]
@@ -110,23 +121,23 @@ def _mixed(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[
     return sums[0], sums[1], sums[2]
 
 
-def _stacked(surfaces: Sequence[Placed], nodes: Sequence[float], k: int) -> tuple[Tensor, Tensor, Tensor]:
+def _stacked(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """The same of surfaces that cover a pixel independently, near to far.
 
-    A pixel counts for layer k as far as what is at or behind it is known, but for what that has in front.
+    A pixel counts for layer k as far as what is at or behind it is known, but for what that has in front. A surface of
+    which only a hair lies there is in front of it.
     """
     visible = torch.ones_like(surfaces[0].x)
     arriving = unknown = visible
     stopped = []
-    for _, x, weight in surfaces:
-        behind = weight_at_or_behind(x, nodes, k)
-        own = behind - weight_at_or_behind(x, nodes, k + 1)
+    for (_, x, weight), (behind, beyond) in zip(surfaces, ramps, strict=True):
         cover = torch.ones_like(x) if weight is None else weight
-        passes = torch.where(behind > 0, 1.0 - cover * (1.0 - behind), 1.0)  # what layers in front leave
-        stops = cover * own / passes.clamp_min(1e-6)  # of what arrives at the surface in this layer
+        here = cover * eased((behind / _HAIR).clamp(max=1.0))
+        passes = 1.0 - here * (1.0 - behind)  # what layers in front leave
+        stops = cover * (behind - beyond) / passes.clamp_min(1e-6)  # of what arrives at the surface in this layer
         stopped.append(arriving * stops)
         arriving, visible = arriving * (1.0 - stops), visible * passes
-        unknown = torch.where(behind > 0, unknown * (1.0 - cover), unknown)
+        unknown = unknown * (1.0 - here)
     light = torch.stack([s.light * (visible * part) for s, part in zip(surfaces, stopped, strict=True)]).sum(0)
     return light, visible * torch.stack(stopped).sum(0), visible * (1.0 - unknown)
 
@@ -136,6 +147,7 @@ def framed(
     behind: Tensor | None,
     nodes: Sequence[float],
     blurs: Sequence[Blur],
+    occlusion: bool,
     stacked: bool,
     lit: bool = True,
     limit: Tensor | None = None,
@@ -148,6 +160,7 @@ def framed(
         nodes: As in :class:`Frame`; surfaces beyond the outermost ones belong to these.
         behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
         blurs: Kernel and resolution of each layer.
+        occlusion: As in :class:`Frame`.
         stacked: As in :class:`Frame`.
         lit: Light goes on beyond the border as well; False: nothing comes from there.
         limit: Largest light that is no highlight's, ``[B, 1, H, W]``; None: all of it goes on.
@@ -168,7 +181,7 @@ def framed(
     if behind is not None:
         behind = upsampled(behind, BEHIND_STEP)[..., : size[0], : size[1]]
         behind = functional.pad(behind, beyond, mode="replicate")
-    return Frame(placed, nodes, behind, margin, (height, width), size, stacked)
+    return Frame(placed, nodes, behind, margin, (height, width), size, occlusion, stacked)
 
 
 def surfaces_of_image(

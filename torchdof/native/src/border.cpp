@@ -35,9 +35,9 @@ Border border_of(const Job &job, int farthest) {
         const double w = !there ? 0.0 : weight ? *weight : 1.0;
         float share = 1.0f;  // of its light that is no highlight's
         if (there && !job.threshold.empty()) {
-          float brightest = *light[0], limit, step;
+          float brightest = *light[0];
           for (int c = 1; c < C; c++) brightest = std::max(brightest, *light[c]);
-          threshold_row(job, y, x, limit, step);
+          const float limit = threshold_at(job, y, x);
           if (brightest > limit) share = limit / brightest;
         }
         border.shares_[side][(size_t)i * length + at] = share;

@@ -8,10 +8,25 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing is known
+constexpr float KNOWN = 1e-3f;    // and from which on a layer is known in full
+constexpr float FOOT = 0.1f;      // share up to which a ramp between layers rises by its square,
+constexpr float SLOPE = 1 / (1 - FOOT / 2);  // and how it goes on
+constexpr float HAIR = 0.03f;     // share of a surface up to which it does not yet hide what is known behind it
 constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
 
+// A ramp from 0 to 1, exactly, whose foot is a parabola.
+inline float eased(float v) {
+  const float foot = std::min(v, FOOT);
+  return std::max(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
+}
+template <typename V>
+inline V eased(V v) {
+  const V most = V{} + FOOT, foot = v < most ? v : most;
+  const V line = 1.0f - SLOPE * (1.0f - v), parabola = SLOPE / (2 * FOOT) * foot * foot;
+  return line > parabola ? line : parabola;
+}
 inline bool any_positive(vec v) {
   typedef long long wide __attribute__((vector_size(LANES * 4)));
   const wide bits = (wide)(v > vec{});
@@ -391,7 +406,8 @@ class Composite {
                 node = k;
                 std::fill(sums.begin(), sums.end(), 0.0f);
               }
-              const float part = (axis(coc[at], low_, high_) - layers_[k].at) * layers_[k].per_after;
+              const float ramp = clamp01((axis(coc[at], low_, high_) - layers_[k].at) * layers_[k].per_after);
+              const float part = over_ ? eased(ramp) : ramp;
               float *one = sums.data(), *two = one + C + 1;
               one[0] += w;
               two[0] += w * part;
@@ -429,8 +445,14 @@ class Composite {
     typedef float f4 __attribute__((vector_size(16)));
     const float node = layers_[k].at, per_after = layers_[k].per_after;
     f4 share = {}, part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
+    const f4 none = {}, whole = {1, 1, 1, 1};
     auto add = [&](const f4 w, const f4 at, auto light_at) {
-      const f4 part = (axis(at, low_, high_) - node) * per_after * w;
+      f4 ramp = (axis(at, low_, high_) - node) * per_after;
+      if (over_) {
+        ramp = ramp < whole ? ramp : whole;
+        ramp = eased(ramp > none ? ramp : none);
+      }
+      const f4 part = ramp * w;
       share += w;
       part_sum += part;
       for (int c = 0; c < CHANNELS; c++) {
@@ -439,7 +461,6 @@ class Composite {
         two[c] += v * part;
       }
     };
-    const f4 whole = {1, 1, 1, 1};
     if (s == 2) {
       auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
       add(WEIGHTED ? four(weight, light_step) : whole, four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
@@ -566,10 +587,18 @@ class Composite {
                  float *const *mine, float *const *term) const {
     const float before = l.before, per_before = l.per_before, at = l.at, per_after = l.per_after;
     const float first = l.first ? 1.0f : 0.0f;
+    auto at_or_behind = [&](vec p) {
+      const vec ramp = clamp01((p - before) * per_before + first);
+      return over_ ? eased(ramp) : ramp;
+    };
+    auto beyond = [&](vec p) {
+      const vec ramp = clamp01((p - at) * per_after);
+      return over_ ? eased(ramp) : ramp;
+    };
     float *share = term[C_], *room = term[C_ + 1];
     if (single) {
       for (int i = 0; i < n; i += LANES) {
-        const vec p = load<vec>(x[0] + i), h = clamp01((p - before) * per_before + first), g = h - clamp01((p - at) * per_after);
+        const vec p = load<vec>(x[0] + i), h = at_or_behind(p), g = h - beyond(p);
         store(room + i, h);
         store(share + i, g);
         for (int c = 0; c < C_; c++) store(term[c] + i, load<vec>(light[c] + i) * g);
@@ -580,8 +609,8 @@ class Composite {
       for (int i = 0; i < n; i += LANES) {
         vec shares = {}, rooms = {};
         for (int j = 0; j < s_.count; j++) {
-          const vec p = load<vec>(x[j] + i), w = load<vec>(weight[j] + i), h = clamp01((p - before) * per_before + first);
-          const vec m = (h - clamp01((p - at) * per_after)) * w;
+          const vec p = load<vec>(x[j] + i), w = load<vec>(weight[j] + i), h = at_or_behind(p);
+          const vec m = (h - beyond(p)) * w;
           store(mine[j] + i, m);
           shares += m;
           rooms += h * w;
@@ -602,14 +631,14 @@ class Composite {
         const float *p = x[j], *w = weight[j];
         float *m = mine[j];
         for (int i = 0; i < n; i++) {
-          const float h = clamp01((p[i] - before) * per_before + first), cover = w[i];
-          const float g = h - clamp01((p[i] - at) * per_after);
-          const float there = h > 0 ? 1.0f - cover * (1.0f - h) : 1.0f;
+          const float ramp = clamp01((p[i] - before) * per_before + first), next = clamp01((p[i] - at) * per_after), cover = w[i];
+          const float h = over_ ? eased(ramp) : ramp, g = h - (over_ ? eased(next) : next);
+          const float here = cover * eased(std::min(h / HAIR, 1.0f)), there = 1.0f - here * (1.0f - h);
           const float stops = cover * g / std::max(there, LEAST);
           m[i] = left[i] * stops;
           left[i] *= 1.0f - stops;
           room[i] *= there;
-          unknown[i] = h > 0 ? unknown[i] * (1.0f - cover) : unknown[i];
+          unknown[i] *= 1.0f - here;
         }
       }
       for (int i = 0; i < n; i++) share[i] = 0;
@@ -688,7 +717,9 @@ class Composite {
         spread(C, b.rows.data(), kernel, share);
       // colour = light / room, coverage = share / room
       for (int i = 0; i < whole_rows * TILE; i += LANES) {
-        const vec one = all(1.0f), per_room = one / most(load<vec>(room + i), all(LEAST)), cover = load<vec>(share + i) * per_room;
+          const vec one = all(1.0f), all_room = load<vec>(room + i), little = least(all_room, all(KNOWN));
+          const vec per_room = one / (all_room - little + 0.5f * (all(KNOWN) + little * little / KNOWN));
+          const vec cover = load<vec>(share + i) * per_room;
         const vec left = most(one - cover, vec{});
         for (int c = 0; c < C; c++)
           if (E == 1 || c == e) store(b.canvas[c] + i, load<vec>(b.spread[c] + i) * per_room + left * load<vec>(b.canvas[c] + i));
@@ -886,7 +917,7 @@ class Composite {
     auto each_tile = [&](auto body) {
       for (int i = 0; i < (int)job_.rays.size(); i++) {
         const Ray &ray = job_.rays[i];
-        const int half = ray_halves_[ray.radius];
+        const int half = std::max(ray_halves_[ray.radius], ray_halves_[ray.radius + 1]);
         const int r0 = std::max(ray.row - half, 0) / TILE, r1 = std::min(ray.row + half, H_ - 1) / TILE;
         const int c0 = std::max(ray.column - half, 0) / TILE, c1 = std::min(ray.column + half, W_ - 1) / TILE;
         for (int r = r0; r <= r1; r++)

@@ -213,8 +213,7 @@ class Filling {
       float most = out[i];
       for (int c = 1; c < C; c++) most = std::max(most, out[c * BLOCK + i]);
       if (!(most > least_limit)) continue;
-      float limit, step;
-      threshold_row(job_, y, std::min(x0 + i, job_.width - 1), limit, step);
+      const float limit = threshold_at(job_, y, std::min(x0 + i, job_.width - 1));
       if (most > limit)  // what is hidden beside a highlight is none
         for (int c = 0; c < C; c++) out[c * BLOCK + i] *= limit / most;
     }

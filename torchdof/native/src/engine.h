@@ -112,7 +112,8 @@ class Surfaces {
 
 struct Ray {
   int row, column;
-  int radius;  // index of its kernel
+  int radius;  // index of the smaller of its two kernels
+  float part;  // of the larger one, which is the next
   float coc;
 };
 
@@ -168,9 +169,9 @@ struct Job {
   int behind_height = 0, behind_width = 0;
   int levels = 0;  // of the pyramid that fills hidden surfaces
 
-  // Highlight threshold: at every THRESHOLD_CELL-th pixel
+  // Highlight threshold of cells, the first of which begins before the image
   std::vector<float> threshold;
-  int threshold_rows = 0, threshold_columns = 0;
+  int threshold_rows = 0, threshold_columns = 0, threshold_top = 0, threshold_left = 0;
 
   Buffer<float> clean_light, clean_coc, validity;  // copies of what is given, where it may not be taken as it is
   std::vector<Buffer<float>> copies;
@@ -193,8 +194,8 @@ struct Job {
 
 // Least highlight threshold of a block.
 float least_threshold(const Job &job, int y0, int x0);
-// Highlight threshold of a row of pixels within one block: the first, and how it grows by pixel.
-void threshold_row(const Job &job, int y, int x, float &first, float &step);
+// Highlight threshold of a pixel.
+float threshold_at(const Job &job, int y, int x);
 
 // Light beyond the frame; border.cpp
 class Border {

@@ -7,8 +7,12 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float FACTOR = 8.0f;          // times the ordinary light around: a highlight
-constexpr int THRESHOLD_CELL = 32;      // pixels over which light is ordered to tell what is ordinary
-constexpr float NEARER_PX = 1.5f;       // difference in coc from which on a surface is another one, in front
+constexpr int STEP = 3;                 // every so many pixels one tells the threshold,
+constexpr int CELL_STEPS = 11;          // so many of them a cell's
+constexpr int THRESHOLD_CELL = STEP * CELL_STEPS;
+constexpr float LEAST_PX = 1.0f;        // blur from which on there are rays
+constexpr float NEARER_PX = 1.0f;       // difference in coc from which on a surface is another one, in front
+constexpr float WHOLE = 4.0f;           // times the share of a highlight that is splatted is what counts of its rays
 constexpr int TAPS_PER_PIXEL = 16;      // of the frame: rays beyond this number are left to the layers
 constexpr int STEPS_PER_PX = 32;        // of radius: kernels of rays
 constexpr int CLASSES = 62;             // of coc, a bit each
@@ -19,79 +23,62 @@ struct Candidate {
   float peak, coc, limit;
 };
 
-// Least of the values around each, so many to each side.
-void least_around(std::vector<float> &values, int rows, int columns, int reach) {
-  std::vector<float> line(values.size());
-  auto slide = [&](const std::vector<float> &from, std::vector<float> &to, int lines, int count, size_t line_step, size_t step) {
-    for (int l = 0; l < lines; l++)
-      for (int i = 0; i < count; i++) {
-        float least = from[l * line_step + i * step];
-        for (int j = std::max(0, i - reach); j <= std::min(count - 1, i + reach); j++)
-          least = std::min(least, from[l * line_step + j * step]);
-        to[l * line_step + i * step] = least;
-      }
-  };
-  slide(values, line, rows, columns, columns, 1);
-  slide(line, values, columns, rows, 1, columns);
+// Cells along an axis, and pixels of the first before the image: as many as there are behind the last.
+int cells_of(int size, int &before) {
+  int count = (size + 2 * THRESHOLD_CELL - 1) / THRESHOLD_CELL;
+  count += (count + size) % 2;
+  before = (count * THRESHOLD_CELL - size) / 2;
+  return count;
+}
+
+// The pixel of an axis at a place; beyond its ends it is mirrored.
+int mirrored(int at, int size) {
+  at = (at % (2 * size) + 2 * size) % (2 * size);
+  return std::min(at, 2 * size - 1 - at);
 }
 
 }  // namespace
 
-void threshold_row(const Job &job, int y, int x, float &first, float &step) {
-  const float at_y = std::max((y + 0.5f) / THRESHOLD_CELL - 0.5f, 0.0f), at_x = (x + 0.5f) / THRESHOLD_CELL - 0.5f;
-  const int top = std::min((int)at_y, job.threshold_rows - 1), bottom = std::min(top + 1, job.threshold_rows - 1);
-  const int left = (int)std::max(at_x, 0.0f), right = std::min(left + 1, job.threshold_columns - 1);
-  const float down = at_y - top;
-  auto level = [&](int column) {
-    const float a = job.threshold[top * job.threshold_columns + column], b = job.threshold[bottom * job.threshold_columns + column];
-    return a + down * (b - a);
-  };
-  const float a = level(left), slope = at_x < 0 ? 0.0f : level(right) - a;
-  step = slope / THRESHOLD_CELL;
-  first = a + slope * (at_x < 0 ? 0.0f : at_x - left);
+float threshold_at(const Job &job, int y, int x) {
+  const int rows = job.threshold_rows, columns = job.threshold_columns;
+  const float at_y = clamp((y + job.threshold_top + 0.5f) / THRESHOLD_CELL - 0.5f, 0.0f, rows - 1.0f);
+  const float at_x = clamp((x + job.threshold_left + 0.5f) / THRESHOLD_CELL - 0.5f, 0.0f, columns - 1.0f);
+  const int top = std::min((int)at_y, rows - 2), left = std::min((int)at_x, columns - 2);
+  const float down = at_y - top, across = at_x - left;
+  const float *upper = &job.threshold[(size_t)top * columns + left], *lower = upper + columns;
+  const float a = upper[0] + across * (upper[1] - upper[0]), b = lower[0] + across * (lower[1] - lower[0]);
+  return a + down * (b - a);
 }
 
 float least_threshold(const Job &job, int y0, int x0) {
-  float least = INFINITY;  // it is linear in between
-  for (int y : {y0, y0 + BLOCK - 1}) {
-    float first, step;
-    threshold_row(job, y, x0, first, step);
-    least = std::min(least, std::min(first, first + step * (BLOCK - 1)));
-  }
+  auto cell = [](int at, int before, int count) { return std::clamp((at + before - THRESHOLD_CELL / 2) / THRESHOLD_CELL, 0, count - 1); };
+  const int rows = job.threshold_rows, columns = job.threshold_columns, top = job.threshold_top, left = job.threshold_left;
+  float least = INFINITY;  // none too large
+  for (int row = cell(y0, top, rows); row <= std::min(cell(y0 + BLOCK, top, rows) + 1, rows - 1); row++)
+    for (int column = cell(x0, left, columns); column <= std::min(cell(x0 + BLOCK, left, columns) + 1, columns - 1); column++)
+      least = std::min(least, job.threshold[(size_t)row * columns + column]);
   return least;
 }
 
 void Job::find_threshold() {
-  constexpr int HALF = THRESHOLD_CELL / 2, COUNT = HALF * HALF;
-  const int rows = (height + 1) / 2, columns = (width + 1) / 2;  // every second pixel
-  threshold_rows = (rows + 2 * HALF - 1) / HALF;
-  threshold_columns = (columns + 2 * HALF - 1) / HALF;
+  constexpr int COUNT = CELL_STEPS * CELL_STEPS;
+  threshold_rows = cells_of(height, threshold_top);
+  threshold_columns = cells_of(width, threshold_left);
   threshold.resize((size_t)threshold_rows * threshold_columns);
   const float *light = surfaces.light, *valid = surfaces.valid;
   const size_t area = surfaces.area();
   parallel(threshold_rows, [&](int row, int) {
     float brightest[COUNT];
     for (int column = 0; column < threshold_columns; column++) {
-      const bool inside = (row + 1) * THRESHOLD_CELL <= height && (column + 1) * THRESHOLD_CELL <= width;
-      for (int i = 0; i < HALF; i++) {
-        const size_t line = (size_t)2 * std::min(row * HALF + i, rows - 1) * width;
-        float peaks[THRESHOLD_CELL];
-        if (inside) {  // all pixels of the row, for they lie side by side
-          const float *from = light + line + column * THRESHOLD_CELL;
-          memcpy(peaks, from, sizeof peaks);
-          for (int c = 1; c < channels; c++)
-            for (int x = 0; x < THRESHOLD_CELL; x++) peaks[x] = std::max(peaks[x], from[c * area + x]);
-          if (valid)
-            for (int x = 0; x < THRESHOLD_CELL; x++) peaks[x] = valid[line + column * THRESHOLD_CELL + x] > 0 ? peaks[x] : INFINITY;
-        } else {
-          for (int j = 0; j < HALF; j++) {
-            const size_t at = line + 2 * std::min(column * HALF + j, columns - 1);
-            peaks[2 * j] = light[at];
-            for (int c = 1; c < channels; c++) peaks[2 * j] = std::max(peaks[2 * j], light[c * area + at]);
-            if (valid && !(valid[at] > 0)) peaks[2 * j] = INFINITY;
-          }
+      for (int i = 0; i < CELL_STEPS; i++) {
+        const int y = mirrored(row * THRESHOLD_CELL + i * STEP + STEP / 2 - threshold_top, height);
+        for (int j = 0; j < CELL_STEPS; j++) {
+          const int x = mirrored(column * THRESHOLD_CELL + j * STEP + STEP / 2 - threshold_left, width);
+          const size_t at = (size_t)y * width + x;
+          float most = light[at];
+          for (int c = 1; c < channels; c++) most = std::max(most, light[c * area + at]);
+          brightest[i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : most;
         }
-        for (int j = 0; j < HALF; j++) brightest[i * HALF + j] = peaks[2 * j];
       }
       std::nth_element(brightest, brightest + COUNT / 5 - 1, brightest + COUNT, std::greater<float>());
       const float largest = 3.4028234663852886e38f;
@@ -102,17 +89,7 @@ void Job::find_threshold() {
 
 void Job::extract_highlights() {
   const size_t area = surfaces.area();
-  const bool occlusion = scene.occlusion;
-  const int blocks = surfaces.block_rows * surfaces.block_columns;
-  const float *nearest = surfaces.coc;
-  // the nearest surface in windows of cells, each twice as wide as the one before
-  const int rows = ceil_div(height, CELL), columns = ceil_div(width, CELL);
-  std::vector<std::vector<float>> nearest_around;
-  float farthest = -NEVER, first_nearest = NEVER;
-  for (int i = 0; i < blocks; i++) {
-    farthest = std::max(farthest, block_high[i]);
-    first_nearest = std::min(first_nearest, block_low[i]);
-  }
+  const float from_px = scene.occlusion ? LEAST_PX : std::max(scene.crisp_px - 1.0f, LEAST_PX);
   // bright pixels of each surface
   const int count = surfaces.count;
   std::vector<std::vector<Candidate>> bands((size_t)surfaces.block_rows * count);
@@ -121,10 +98,9 @@ void Job::extract_highlights() {
     const float *coc, *weight;
     for (int bx = 0; bx < surfaces.block_columns; bx++) {
       const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
-      if (!surfaces.whole() && !surfaces.has_block(block) && !(block_peak[block] > least_threshold(*this, by * BLOCK, x0))) continue;
+      const float least_limit = least_threshold(*this, by * BLOCK, x0);
+      if (!surfaces.whole() && !surfaces.has_block(block) && !(block_peak[block] > least_limit)) continue;
       for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
-        float first, step;
-        threshold_row(*this, y, x0, first, step);
         for (int i = 0; i < count; i++) {
           if (!surfaces.row(i, y, x0, light.data(), coc, weight)) continue;
           float most[BLOCK];
@@ -132,11 +108,12 @@ void Job::extract_highlights() {
           for (int c = 1; c < channels; c++)
             for (int x = 0; x < n; x++) most[x] = std::max(most[x], light[c][x]);
           bool any = false;
-          for (int x = 0; x < n; x++) any |= most[x] > first + step * x;
+          for (int x = 0; x < n; x++) any |= most[x] > least_limit;
           if (!any) continue;
           for (int x = 0; x < n; x++) {
-            const float limit = first + step * x;
-            if (!(most[x] > limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > 1.0f)) continue;
+            if (!(most[x] > least_limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > from_px)) continue;
+            const float limit = threshold_at(*this, y, x0 + x);
+            if (!(most[x] > limit)) continue;
             bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, most[x], coc[x], limit});
           }
         }
@@ -150,57 +127,30 @@ void Job::extract_highlights() {
       all.insert(all.end(), band.begin(), band.end());
     }
     if (all.empty()) continue;
-    if (occlusion && nearest_around.empty()) {
-      std::vector<float> cells((size_t)rows * columns, NEVER);
-      for (int y = 0; y < height; y++)
-        for (int x = 0; x < width; x++) {
-          float &cell = cells[(size_t)(y / CELL) * columns + x / CELL];
-          cell = std::min(cell, nearest[(size_t)y * width + x]);
-        }
-      int radius = 1, reached = 0;
-      const float largest = std::max(std::fabs(farthest), std::fabs(first_nearest));
-      for (float inner = NEARER_PX; inner < std::max(largest - first_nearest, 2.0f * largest);) {
-        least_around(cells, rows, columns, radius - reached);
-        reached = radius;
-        nearest_around.push_back(cells);
-        inner = std::max(NEARER_PX, (float)(radius * CELL));
-        radius *= 2;
-      }
-    }
-    // of these the ones that layers would not do for
-    auto needs_rays = [&](const Candidate &p) {
-      const float blur = std::fabs(p.coc);
-      if (blur >= scene.crisp_px) return true;
-      if (!occlusion) return false;
-      float inner = NEARER_PX;
-      int radius = 1;
-      for (const auto &cells : nearest_around) {
-        const float near = cells[(size_t)(p.row / CELL) * columns + p.column / CELL];
-        if (near < p.coc - inner || (near < p.coc - NEARER_PX && 2.0f * blur > inner)) return true;
-        inner = std::max(NEARER_PX, (float)(radius * CELL));
-        radius *= 2;
-      }
-      return false;
+    auto fades = [&](const Candidate &p) { return std::min(std::fabs(p.coc) - from_px, 1.0f); };
+    auto taps = [&](const Candidate &p) {
+      const double side = 2.0 * std::fabs(p.coc) + 1;
+      return side * side * std::min(WHOLE * (1.0f - p.limit / p.peak) * fades(p), 1.0f);
     };
-    all.erase(std::remove_if(all.begin(), all.end(), [&](const Candidate &p) { return !needs_rays(p); }), all.end());
-    if (all.empty()) continue;
-    // few: the brightest of them, and only what they are brighter by
-    double taps = 0;
-    for (const Candidate &p : all) taps += (2.0 * std::fabs(p.coc) + 1) * (2.0 * std::fabs(p.coc) + 1);
-    if (taps > (double)TAPS_PER_PIXEL * area) {
-      std::stable_sort(all.begin(), all.end(), [](const Candidate &a, const Candidate &b) { return a.peak > b.peak; });
-      size_t few = 0;
-      for (double sum = 0; few < all.size(); few++) {
-        sum += (2.0 * std::fabs(all[few].coc) + 1) * (2.0 * std::fabs(all[few].coc) + 1);
-        if (sum > (double)TAPS_PER_PIXEL * area) break;
+    const double budget = (double)TAPS_PER_PIXEL * area;
+    double taps_of_all = 0;
+    for (const Candidate &p : all) taps_of_all += taps(p);
+    if (taps_of_all > budget) {  // too many: the brightest of them, and only what they are brighter by
+      std::vector<Candidate> sorted(all);
+      std::sort(sorted.begin(), sorted.end(), [](const Candidate &a, const Candidate &b) { return a.peak > b.peak; });
+      double least = 0, sum = 0, slope = 0;
+      for (size_t k = 0; k < sorted.size(); k++) {
+        sum += taps(sorted[k]);
+        slope += 0.5 * taps(sorted[k]) / sorted[k].peak;
+        if (sum - (k + 1 < sorted.size() ? sorted[k + 1].peak : 0.0) * slope < budget) continue;
+        least = std::min((sum - budget) / slope, (double)sorted[k].peak);
+        break;
       }
-      const float next = all[few].peak;
-      all.resize(few);
-      for (Candidate &p : all) p.limit = std::max(p.limit, next);
-      std::sort(all.begin(), all.end(), [](const Candidate &a, const Candidate &b) { return a.row != b.row ? a.row < b.row : a.column < b.column; });
+      all.erase(std::remove_if(all.begin(), all.end(), [&](const Candidate &p) { return !(p.peak > least); }), all.end());
+      for (Candidate &p : all) p.limit = std::max(p.limit, (float)least);
     }
     for (const Candidate &p : all) {
-      const float share = (1.0f - p.limit / p.peak) * std::min(std::fabs(p.coc) - 1.0f, 1.0f);
+      const float share = (1.0f - p.limit / p.peak) * fades(p);
       const size_t at = (size_t)p.row * width + p.column;
       float weight = 1.0f, *light;
       size_t step;
@@ -215,8 +165,8 @@ void Job::extract_highlights() {
         step = BLOCK_PIXELS;
         weight = (i ? b.weight : b.seen)[within];
       }
-      const int radius = (int)std::nearbyint((double)p.coc * STEPS_PER_PX);
-      rays.push_back({p.row, p.column, radius, p.coc});
+      const double steps = (double)p.coc * STEPS_PER_PX, below = std::floor(steps);
+      rays.push_back({p.row, p.column, (int)below, (float)(steps - below), p.coc});
       for (int c = 0; c < channels; c++) {
         const float excess = light[c * step] * share;
         light[c * step] -= excess;
@@ -224,7 +174,7 @@ void Job::extract_highlights() {
       }
     }
   }
-  for (const Ray &ray : rays) radii.push_back(ray.radius);
+  for (const Ray &ray : rays) radii.insert(radii.end(), {ray.radius, ray.radius + 1});
   std::sort(radii.begin(), radii.end());
   radii.erase(std::unique(radii.begin(), radii.end()), radii.end());
   for (Ray &ray : rays) ray.radius = (int)(std::lower_bound(radii.begin(), radii.end(), ray.radius) - radii.begin());
@@ -294,7 +244,7 @@ static void cover_row(const Job &job, int y, int first, int last, float place, c
 }
 
 // Adds how much of the rays of a row that land n pixels from column x on is taken by surfaces at a place.
-static void add_blocked(const Job &job, const Ray &ray, float place, int y, int x, int n, const float **light, float *blocked) {
+static void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y, int x, int n, const float **light, float *blocked) {
   constexpr int LONGEST = 256;
   const int H = job.height, W = job.width;
   const float along = 1.0f - place / ray.coc;
@@ -317,7 +267,7 @@ static void add_blocked(const Job &job, const Ray &ray, float place, int y, int 
       const float at_x = column_of(i);
       const int column = (int)at_x;
       const float across = at_x - column, a = upper[column - first], b = upper[column - first + 1];
-      blocked[i] += a + across * (b - a);
+      blocked[i] += fades * (a + across * (b - a));
     }
   }
 }
@@ -330,8 +280,15 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
-    const int half = halves[ray.radius], side = 2 * half + 1;
-    const float *kernel = kernels[ray.radius];
+    const int half = std::max(halves[ray.radius], halves[ray.radius + 1]);
+    // adds a row of one of its two kernels
+    auto add_taps = [&](int which, float part, int c, int y, int x, int n, float *taps) {
+      const int h = halves[which], first = std::max(x, ray.column - h), last = std::min(x + n - 1, ray.column + h);
+      if (std::abs(y - ray.row) > h) return;
+      const size_t side = 2 * h + 1;
+      const float *from = kernels[which] + (E > 1 ? c * side * side : 0) + (y - ray.row + h) * side + h - ray.column;
+      for (int i = first; i <= last; i++) taps[i - x] += part * from[i];
+    };
     // the part of the tile in which its rays land
     const int top = std::max(y0, ray.row - half), bottom = std::min(std::min(y0 + TILE, H), ray.row + half + 1);
     const int left = std::max(x0, ray.column - half), right = std::min(std::min(x0 + TILE, W), ray.column + half + 1);
@@ -341,7 +298,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
         int m = 0;
         if (job.scene.occlusion)
           for (int k : v.bins) {
-            if (!(ray.coc - NEARER_PX >= v.low + k)) break;
+            if (!(ray.coc - NEARER_PX > v.low + k)) break;
             // a ray that lands so many pixels away met the surface at this share of them
             const float along = 1.0f - (v.low + k) / ray.coc;
             const float ya = ray.row + (py - ray.row) * along, yb = ray.row + (py + ny - 1 - ray.row) * along;
@@ -357,11 +314,17 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             if (classes & ((2ull << last) - (1ull << first))) nearer[m++] = k;
           }
         for (int y = py; y < py + ny; y++) {
-          const size_t tap = (size_t)(y - ray.row + half) * side + (px - ray.column + half);
-          float blocked[PATCH] = {};
-          for (int i = 0; i < m; i++) add_blocked(job, ray, v.low + nearer[i], y, px, nx, surface_light.data(), blocked);
+          float blocked[PATCH] = {}, taps[PATCH];
+          for (int i = 0; i < m; i++) {
+            const float place = v.low + nearer[i];
+            add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), y, px, nx, surface_light.data(), blocked);
+          }
           for (int c = 0; c < C; c++) {
-            const float *taps = kernel + (E > 1 ? (size_t)c * side * side : 0) + tap;
+            if (!c || E > 1) {
+              std::fill(taps, taps + nx, 0.0f);
+              add_taps(ray.radius, 1.0f - ray.part, c, y, px, nx, taps);
+              add_taps(ray.radius + 1, ray.part, c, y, px, nx, taps);
+            }
             float *to = tile + (size_t)c * TILE * TILE + (y - y0) * TILE + (px - x0);
             for (int x = 0; x < nx; x++) to[x] += taps[x] * (1.0f - std::min(blocked[x], 1.0f)) * light[c];
           }

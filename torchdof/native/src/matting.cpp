@@ -212,7 +212,7 @@ void split_block(Job &job, int by, int bx, Window &w, const f4 *falloff) {
 }
 
 // Gives the light of a highlight's pixel to the farther surface on which the emitter lies.
-void find_emitter(Job &job, int y, int x, float limit, const float *falloff) {
+void find_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
   constexpr int COUNT = (2 * EMITTER_REACH + 1) * (2 * EMITTER_REACH + 1);
   Surfaces &s = job.surfaces;
   const int channels = job.channels;
@@ -223,7 +223,9 @@ void find_emitter(Job &job, int y, int x, float limit, const float *falloff) {
     return peak;
   };
   const float own_light = peak_at(at), own_coc = s.coc[at];
-  if (!(own_light > limit) || (s.valid && !(s.valid[at] > 0))) return;
+  if (!(own_light > least_limit) || (s.valid && !(s.valid[at] > 0))) return;
+  const float limit = threshold_at(job, y, x);
+  if (!(own_light > limit)) return;
   float farther_by[COUNT], peaks[COUNT], scale = 0;
   size_t around[COUNT];
   bool any = false;
@@ -351,12 +353,9 @@ void Job::split_mixed() {
       const int y0 = by * BLOCK, x0 = bx * BLOCK;
       if (find_edges(*this, y0, x0, w)) split_block(*this, by, bx, w, falloff);
       if (!emitters || !(high - low > 1) || !(block_peak[by * columns + bx] > least_threshold(*this, y0, x0))) continue;
-      for (int y = y0; y < std::min(height, y0 + BLOCK); y++) {
-        float limit, step;
-        threshold_row(*this, y, x0, limit, step);
-        for (int x = x0; x < std::min(width, x0 + BLOCK); x++)
-          find_emitter(*this, y, x, limit + step * (x - x0), around_emitter.data());
-      }
+      const float least_limit = least_threshold(*this, y0, x0);
+      for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
+        for (int x = x0; x < std::min(width, x0 + BLOCK); x++) find_emitter(*this, y, x, least_limit, around_emitter.data());
     }
   });
 }
