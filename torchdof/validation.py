@@ -9,6 +9,7 @@ from torch import Tensor
 __all__ = [
     "background",
     "both_or_none",
+    "depth_edges",
     "image_and_coc",
     "image_and_depth",
     "image_and_map",
@@ -104,6 +105,16 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     if value.device.type == "meta":
         raise ValueError(f"{name} must be a tensor {what} that holds data, got one on the meta device")
     return value
+
+
+def depth_edges(value: Any) -> None:
+    """Refuse what names no treatment of depth edges.
+
+    Raises:
+        ValueError: If it is none of "auto", "repair" and "as given".
+    """
+    if not isinstance(value, str) or value not in ("auto", "repair", "as given"):
+        raise ValueError(f"depth_edges must be 'auto', 'repair' or 'as given', got {show(value)}")
 
 
 def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:

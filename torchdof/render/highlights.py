@@ -19,8 +19,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .. import pixels
 from ..optics.blur_table import BlurTable
-from . import pixels
 from .plan import kernels_for
 from .surfaces import Surface
 

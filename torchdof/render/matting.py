@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from . import pixels
+from .. import pixels
 
 __all__ = ["NEVER_PX", "matte"]
 
