@@ -23,7 +23,7 @@ from .. import pixels, validation
 __all__ = ["DepthEdges", "repair", "repair_edges"]
 
 DepthEdges = Literal["auto", "repair", "as given"]
-"""What is done to depth edges before rendering: repaired where the map has proved inexact, or everywhere, or nothing."""
+"""What is done to depth edges before rendering: repaired where the map proves inexact, or all of them, or nothing."""
 
 _STEP = 0.05  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
 _RINGS = 3  # pixels beside a step that may be on its wrong side
@@ -42,7 +42,7 @@ _BLUR_REACH = 9
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
 _EXACT = 0.05  # share of wrong pixels up to which a map's steps count as exact
 _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
-_SAMPLED = 2**18  # pixels of a frame among which a map is calibrated
+_SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
 _BLOCK = 16
 _CHUNK = 40_000
 _NEVER = 1e30
@@ -57,7 +57,7 @@ class _Edges(NamedTuple):
     ring: Tensor  # how many pixels from a step: 1 is beside it; one more than there are: none is near
     is_edge: Tensor
     direction: Tensor  # towards the near surface: left, right, up or down
-    slope: Tensor  # change of nearness by pixel, where it is a slope on both sides
+    steepness: Tensor  # change of nearness by pixel on a ramp
 
 
 def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> Tensor:
@@ -92,30 +92,42 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     if edges == "as given":
         return depth
     depth = depth.expand(image.shape[0], -1, -1, -1)
-    nearness = torch.where(depth > 0, 1.0 / depth, torch.nan)
-    high = _highest(torch.where(depth > 0, nearness, 0.0), _REACH)
-    mended = repair(image, nearness.detach(), _STEP * high.detach(), edges == "auto")
+    nearness = torch.where(depth > 0, 1.0 / depth.detach(), torch.nan)
+    high = _highest(torch.where(depth > 0, nearness, 0.0).float(), _REACH)
+    mended = repair(image, nearness, _STEP * high, edges == "auto")
     changed = (mended != nearness) & (depth > 0)
     return torch.where(changed, 1.0 / mended.clamp_min(0.0), depth)
 
 
-@torch.no_grad()
 def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) -> Tensor:
-    """Repairs a map of nearness, of any scale and offset, ``[B, 1, H, W]``; NaN stays and touches nothing.
+    """Repairs a map of nearness, of any scale and offset; what is not finite stays and touches nothing.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        nearness: Linear in 1 / depth, larger is nearer; the negative coc is one.
+        nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer; the negative coc is one.
         step: Difference in nearness from which on neighbours are two surfaces, ``[B, 1, H, W]`` or a number.
         auto: Whether edges that prove exact are left alone.
 
     Returns:
-        ``[B, 1, H, W]``; where nothing is repaired, the given values themselves.
+        ``[B, 1, H, W]``, constant to autograd; where nothing is repaired, the given values themselves.
     """
+    if not validation.is_traced():
+        known = nearness.detach()[torch.isfinite(nearness)]
+        if not len(known) or bool((known.max() - known.min() <= torch.as_tensor(step)).all()):
+            return nearness.detach()  # one surface
+    light, given = image.detach().float(), nearness.detach().float().expand(len(image), -1, -1, -1)
+    step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
+    compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
+    mended = (_operator if compiling else _repair)(light, given, step, auto)
+    return torch.where(mended != given, mended.to(nearness.dtype), nearness.detach())
+
+
+@torch.no_grad()
+def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     valid = torch.isfinite(nearness)
     given = torch.where(valid, nearness, 0.0)
     light = torch.where(torch.isfinite(image), image, 0.0).clamp_min(0.0)
-    edges = _find(given, valid, torch.as_tensor(step, dtype=given.dtype, device=given.device))
+    edges = _find(given, valid, step)
     is_near = 2.0 * given > edges.near + edges.far
     witness = given.new_tensor(_SURE)[edges.ring] * (valid & ~edges.is_ramp)
 
@@ -151,10 +163,21 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
     return torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma), nearness)
 
 
+# How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
+@torch.library.custom_op("torchdof::repair_edges", mutates_args=())
+def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+    return _repair(image, nearness, step, auto).clone()
+
+
+@_operator.register_fake
+def _(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+    return torch.empty_like(nearness, memory_format=torch.contiguous_format)
+
+
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     """Ramps and steps, and the two surfaces that meet there."""
     high, low = torch.where(valid, nearness, -_NEVER), torch.where(valid, -nearness, -_NEVER)
-    slope = torch.maximum(*(s.abs() for s in _slopes(nearness, valid)))
+    slope, steepness = _slopes(nearness, valid)
     span = _highest(high, _REACH) + _highest(low, _REACH)
     # a ramp ends, a slope goes on
     flattest = -_highest(-_mean(slope, 2), 8)
@@ -182,7 +205,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
     right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
     direction = torch.where(right.abs() > down.abs(), (right > 0).long(), 2 + (down > 0).long())
-    return _Edges(near, far, is_ramp, ring, is_edge, direction, torch.hypot(*_slopes(nearness, valid)))
+    return _Edges(near, far, is_ramp, ring, is_edge, direction, steepness)
 
 
 def _kind(nearness: Tensor, edges: _Edges) -> Tensor:
@@ -289,7 +312,7 @@ def _blur_of(nearness: Tensor, edges: _Edges) -> Tensor:
     """Standard deviation in pixels of the blur that made ramps of an item's steps, ``[B, 1, 1, 1]``."""
     gap = (edges.near - edges.far).clamp_min(1e-12)
     middle = edges.is_ramp & (((nearness - edges.far) / gap - 0.5).abs() < 0.12)
-    steepness = torch.where(middle, edges.slope / gap, 0.0).sum((1, 2, 3), keepdim=True)
+    steepness = torch.where(middle, edges.steepness / gap, 0.0).sum((1, 2, 3), keepdim=True)
     width = middle.sum((1, 2, 3), keepdim=True) / (math.sqrt(2 * math.pi) * steepness).clamp_min(1e-12)
     return (width**2 - 0.6).clamp(0.25, 9.0).sqrt()  # differences of pixels widen it
 
@@ -303,7 +326,7 @@ def _unmix(
     near: Tensor,
     far: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The surfaces at edge pixels where one is thin: as near and far as their blurred shape and the map say together."""
+    """The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best."""
     blurred = _blurred(label, sigma)
     gap = near - far
     for is_near in (True, False):
@@ -327,7 +350,7 @@ def _unmix(
 
 
 def _lift_lamps(
-    light: Tensor, nearness: Tensor, repaired: Tensor, step: Tensor | float, is_soft: Tensor, sigma: Tensor
+    light: Tensor, nearness: Tensor, repaired: Tensor, step: Tensor, is_soft: Tensor, sigma: Tensor
 ) -> Tensor:
     """Lamps of a few pixels, whose nearness a soft map spreads around them, as near as what is spread amounts to."""
     brightest = light.amax(1, keepdim=True)
@@ -359,17 +382,21 @@ def _regress(nearness: Tensor, cover: Tensor, chosen: Tensor) -> tuple[Tensor, T
     return mean_y - b * mean_x, b, fit
 
 
-def _slopes(nearness: Tensor, valid: Tensor) -> list[Tensor]:
-    """Change by pixel, rightwards and downwards: the lesser of both sides; 0 where it turns, or a side is unknown."""
-    slopes = []
+def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Steepness by pixel where it goes on from one side to the other, 0 elsewhere and beside what is unknown.
+
+    The lesser of both sides, in the steeper of the two axes; and the mean of both, of both axes together.
+    """
+    least, mean = [], []
     for dim in (-1, -2):
         known = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
         change = torch.where(known, nearness.diff(dim=dim), 0.0)
         none = torch.zeros_like(nearness.narrow(dim, 0, 1))
         before, after = torch.cat([none, change], dim), torch.cat([change, none], dim)
-        least = torch.where(before.abs() < after.abs(), before, after)
-        slopes.append(torch.where(before * after > 0, least, 0.0))
-    return slopes
+        goes_on = before * after > 0
+        least.append(torch.where(goes_on, torch.minimum(before.abs(), after.abs()), 0.0))
+        mean.append(torch.where(goes_on, 0.5 * (before + after), 0.0))
+    return torch.maximum(*least), torch.hypot(*mean)
 
 
 def _highest(values: Tensor, reach: int) -> Tensor:
