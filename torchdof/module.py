@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from . import validation
 from .depth.edges import repair
+from .depth.size import at_size_of
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
@@ -75,7 +76,9 @@ class DepthOfField(nn.Module):
 
         Args:
             image: ``[B, C, H, W]``, linear light, floating point.
-            depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed.
+            depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed. A map of
+                another size with the same aspect ratio is resampled, guided by the image
+                (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes the image's size only.
             focus_m: Focus distance in metres for this call, float or ``[B]``; None takes the camera's.
             f_number: F-number for this call, float or ``[B]``; None takes the camera's.
             plan: Layers to render with, from :meth:`plan`; None plans for this image.
@@ -154,6 +157,8 @@ class DepthOfField(nn.Module):
     ) -> Tensor:
         """The same of the depth as it is given."""
         check = self.options.check
+        if not validation.is_traced() and validation.differs_in_size(image, depth):
+            depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})

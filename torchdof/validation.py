@@ -10,6 +10,7 @@ __all__ = [
     "background",
     "both_or_none",
     "depth_edges",
+    "differs_in_size",
     "image_and_coc",
     "image_and_depth",
     "image_and_map",
@@ -17,6 +18,7 @@ __all__ = [
     "number",
     "pixels_wide",
     "real_tensor",
+    "same_aspect",
     "show",
     "stack",
     "whole",
@@ -131,6 +133,26 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
                 f"depth must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or negative; "
                 "fill the holes, or pass check=False to let these pixels through sharp"
             )
+
+
+def differs_in_size(image: Any, value: Any) -> bool:
+    """Whether a map has another height or width than an image, both being maps of something."""
+    maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() for t in (image, value))
+    return maps and image.shape[-2:] != value.shape[-2:] and 0 not in image.shape and 0 not in value.shape
+
+
+def same_aspect(image: tuple[int, int], depth: tuple[int, int]) -> None:
+    """Refuse a depth map (height, width) that cannot show what an image of another size shows.
+
+    Raises:
+        ValueError: If the aspect ratios differ by a pixel or more of the smaller of the two.
+    """
+    (height, width), (rows, columns) = image, depth
+    if 0 in depth or abs(rows * width - height * columns) >= max(width, columns):
+        raise ValueError(
+            f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
+            "but must have the same aspect ratio; crop one of the two, so that both show the same"
+        )
 
 
 def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:

@@ -314,7 +314,7 @@ def _blur_of(nearness: Tensor, edges: _Edges) -> Tensor:
     middle = edges.is_ramp & (((nearness - edges.far) / gap - 0.5).abs() < 0.12)
     steepness = torch.where(middle, edges.steepness / gap, 0.0).sum((1, 2, 3), keepdim=True)
     width = middle.sum((1, 2, 3), keepdim=True) / (math.sqrt(2 * math.pi) * steepness).clamp_min(1e-12)
-    return (width**2 - 0.6).clamp(0.25, 9.0).sqrt()  # differences of pixels widen it
+    return (width**2 - 0.75).clamp(0.25, 9.0).sqrt()  # differences of pixels widen it
 
 
 def _unmix(
