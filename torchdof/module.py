@@ -157,7 +157,7 @@ class DepthOfField(nn.Module):
     ) -> Tensor:
         """The same of the depth as it is given."""
         check = self.options.check
-        if not validation.is_traced() and validation.differs_in_size(image, depth):
+        if not validation.is_traced() and validation.is_resizable(image, depth):
             depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check)
         changes = {"focus_m": focus_m, "f_number": f_number}

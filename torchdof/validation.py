@@ -10,7 +10,7 @@ __all__ = [
     "background",
     "both_or_none",
     "depth_edges",
-    "differs_in_size",
+    "is_resizable",
     "image_and_coc",
     "image_and_depth",
     "image_and_map",
@@ -135,20 +135,28 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
             )
 
 
-def differs_in_size(image: Any, value: Any) -> bool:
-    """Whether a map has another height or width than an image, both being maps of something."""
-    maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() for t in (image, value))
-    return maps and image.shape[-2:] != value.shape[-2:] and 0 not in image.shape and 0 not in value.shape
+def is_resizable(image: Any, depth: Any) -> bool:
+    """Whether a depth map has another size than an image and may show the same."""
+    maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
+    if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
+        return False
+    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and _is_same_aspect(image, depth)
 
 
-def same_aspect(image: tuple[int, int], depth: tuple[int, int]) -> None:
-    """Refuse a depth map (height, width) that cannot show what an image of another size shows.
+def _is_same_aspect(image: Tensor, depth: Tensor) -> bool:
+    """Whether two aspect ratios differ by less than a pixel of the smaller of the two."""
+    (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
+    return abs(rows * width - height * columns) < max(width, columns)
+
+
+def same_aspect(image: Tensor, depth: Tensor) -> None:
+    """Refuse a depth map that cannot show what an image ``[..., H, W]`` of another size shows.
 
     Raises:
         ValueError: If the aspect ratios differ by a pixel or more of the smaller of the two.
     """
-    (height, width), (rows, columns) = image, depth
-    if 0 in depth or abs(rows * width - height * columns) >= max(width, columns):
+    if 0 in depth.shape or not _is_same_aspect(image, depth):
+        (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
         raise ValueError(
             f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
             "but must have the same aspect ratio; crop one of the two, so that both show the same"

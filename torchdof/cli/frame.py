@@ -147,7 +147,7 @@ def _depth(
     if settings.depth_kind == "coc" and (h, w) != (ih, iw):
         raise ValueError(f"{name}: coc is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
     try:
-        same_aspect((ih, iw), (h, w))
+        same_aspect(picture.pixels, values)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
     fov_x_deg = settings.fov_x_deg

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .. import pixels, validation
+from .. import native, pixels, validation
 
 __all__ = ["DepthEdges", "repair", "repair_edges"]
 
@@ -42,6 +42,7 @@ _BLUR_REACH = 9
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
 _EXACT = 0.05  # share of wrong pixels up to which a map's steps count as exact
 _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
+_RELATED = 0.75  # share of clear cases in which colours must agree with a map to be heard on it
 _SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
 _BLOCK = 16
 _CHUNK = 40_000
@@ -117,8 +118,14 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
             return nearness.detach()  # one surface
     light, given = image.detach().float(), nearness.detach().float().expand(len(image), -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
-    compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
-    mended = (_operator if compiling else _repair)(light, given, step, auto)
+    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        mended = _operator(light, given, step, auto)
+    elif not validation.is_traced() and all(map(native.can_read, (image, nearness))) and native.chosen():
+        steps = step.expand(len(light), 1, *given.shape[-2:]) if step.ndim else step.expand(len(light), 1)
+        items = zip(light, given, steps, strict=True)
+        mended = torch.stack([native.repair_edges(a, b[0], c[0], auto)[None] for a, b, c in items])
+    else:
+        mended = _repair(light, given, step, auto)
     return torch.where(mended != given, mended.to(nearness.dtype), nearness.detach())
 
 
@@ -137,15 +144,22 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     rows, columns = (torch.arange(n, device=given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + 3 * columns) % every == 0))
     kind = _kind(given, edges)
-    shares = _calibrate(kind, sampled, _judge(light, given, witness, edges, sampled)[0], len(given))
-    prior = shares[kind]
+    sampled_score = _judge(light, given, witness, edges, sampled)[0]
+    prior = _calibrate(kind, sampled, sampled_score, len(given))[kind]
     softness = edges.is_ramp.sum((1, 2, 3), keepdim=True) / edges.is_edge.sum((1, 2, 3), keepdim=True).clamp_min(1)
     is_soft = softness > _SOFT
+    if auto:
+        is_related = _is_related(given, edges, sampled, sampled_score)
+        is_soft = is_soft & is_related
 
     # which surface the doubtful pixels show
     doubtful = edges.is_edge
     if auto:
-        doubtful = doubtful & torch.where(edges.is_ramp, is_soft, torch.where(is_near, 1.0 - prior, prior) > _EXACT)
+        doubtful = (
+            doubtful
+            & is_related
+            & torch.where(edges.is_ramp, is_soft, torch.where(is_near, 1.0 - prior, prior) > _EXACT)
+        )
     edge_pixels = pixels.indices(doubtful)
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0]) > 0
@@ -282,6 +296,21 @@ def _judge(
     return score, evidence, near, far
 
 
+def _is_related(nearness: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:
+    """Whether what an item's colours say agrees with its map where that is hardly in doubt, ``[B, 1, 1, 1]``.
+
+    That is some pixels from steps, and at the ends of ramps. An image that knows nothing of the depth agrees by half.
+    """
+    level = pixels.pick((nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12), sampled)[0]
+    is_ramp, ring = pixels.pick(edges.is_ramp, sampled)[0], pixels.pick(edges.ring, sampled)[0]
+    clear = torch.where(is_ramp, (level - 0.5).abs() > 0.3, ring > 1)
+    weight = (0.5 * score.abs()).clamp(max=1.0) * clear
+    agrees = ((score > 0) == (level > 0.5)).to(score.dtype)
+    item = sampled // nearness[0].numel()
+    sums = [score.new_zeros(len(nearness)).index_add(0, item, w) for w in (weight, weight * agrees)]
+    return ((sums[1] + 0.5 * _PRIOR_COUNT) / (sums[0] + _PRIOR_COUNT) > _RELATED).view(-1, 1, 1, 1)
+
+
 def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tensor:
     """Share of pixels that show the near surface, by kind: that which explains the scores best, from a wary start."""
     device, dtype = score.device, score.dtype
@@ -400,11 +429,15 @@ def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _highest(values: Tensor, reach: int) -> Tensor:
-    return functional.max_pool2d(values, 2 * reach + 1, stride=1, padding=reach)
+    side = 2 * reach + 1
+    rows = functional.max_pool2d(values, (1, side), stride=1, padding=(0, reach))
+    return functional.max_pool2d(rows, (side, 1), stride=1, padding=(reach, 0))
 
 
 def _mean(values: Tensor, reach: int) -> Tensor:
-    return functional.avg_pool2d(functional.pad(values, (reach,) * 4, mode="replicate"), 2 * reach + 1, stride=1)
+    side = 2 * reach + 1
+    rows = functional.avg_pool2d(functional.pad(values, (reach,) * 4, mode="replicate"), (1, side), stride=1)
+    return functional.avg_pool2d(rows, (side, 1), stride=1)
 
 
 def _blurred(values: Tensor, sigma: Tensor) -> Tensor:

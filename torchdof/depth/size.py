@@ -33,7 +33,7 @@ def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
     size, given = (image.shape[-2], image.shape[-1]), (depth.shape[-2], depth.shape[-1])
     if size == given:
         return depth
-    validation.same_aspect(size, given)
+    validation.same_aspect(image, depth)
     known = (depth > 0).to(depth.dtype)
     inverse = torch.where(depth > 0, 1.0 / depth, 0.0)
 
