@@ -155,11 +155,8 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     # which surface the doubtful pixels show
     doubtful = edges.is_edge
     if auto:
-        doubtful = (
-            doubtful
-            & is_related
-            & torch.where(edges.is_ramp, is_soft, torch.where(is_near, 1.0 - prior, prior) > _EXACT)
-        )
+        is_wrong = torch.where(is_near, 1.0 - prior, prior) > _EXACT
+        doubtful = doubtful & is_related & torch.where(edges.is_ramp, is_soft, is_wrong)
     edge_pixels = pixels.indices(doubtful)
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0]) > 0
@@ -269,6 +266,7 @@ def _judge(
         spread = 0.5 * (spreads[0] + spreads[1]) + noise + 1e-12
         contrast = (means[0] - means[1]).square().sum(0)
         tells = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
+        tells = torch.where(known, tells, 1.0)  # in the middle of a wide ramp the neighbours do
 
         # likelihood: how many witnesses look alike, and a little how close their mean is
         alike = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).pow(-2)

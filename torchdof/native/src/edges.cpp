@@ -354,7 +354,7 @@ class Repair {
       }
     }
     const bool known = sums[0] > 1e-3f && sums[1] > 1e-3f;
-    if (!known) return {0.0f, 0.0f, near, far};
+    if (!known) return {0.0f, 1.0f, near, far};  // the neighbours tell
     float spread = 0, contrast = 0, noise = 0, apart[2] = {0, 0};
     for (int c = 0; c < C; c++) {
       const float own = colour_[(size_t)i * C + c];
