@@ -7,6 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from . import validation
+from .depth.edges import repair
+from .depth.size import at_size_of
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
@@ -15,6 +17,8 @@ from .render.attention import Attention
 from .render.plan import Plan
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
+
+_EDGE_PX = 1.0  # difference in coc from which on the edge between two surfaces is worth repair
 
 
 @spells_options
@@ -72,7 +76,9 @@ class DepthOfField(nn.Module):
 
         Args:
             image: ``[B, C, H, W]``, linear light, floating point.
-            depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed.
+            depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed. A map of
+                another size with the same aspect ratio is resampled, guided by the image
+                (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes the image's size only.
             focus_m: Focus distance in metres for this call, float or ``[B]``; None takes the camera's.
             f_number: F-number for this call, float or ``[B]``; None takes the camera's.
             plan: Layers to render with, from :meth:`plan`; None plans for this image.
@@ -92,10 +98,10 @@ class DepthOfField(nn.Module):
             ValueError: If shapes, types or values are not as described.
         """
         options = self.options
-        coc = self.coc_px(image, depth, focus_m, f_number)
+        coc = self._given_coc_px(image, depth, focus_m, f_number)
         behind = None
         if background is not None and background_depth is not None:
-            behind = self.coc_px(background, background_depth, focus_m, f_number)
+            behind = self._given_coc_px(background, background_depth, focus_m, f_number)
         validation.both_or_none(background, background_depth)  # here it is the depth that is missing
         return _blur(image, coc, options, plan, background, behind, attention)
 
@@ -133,7 +139,7 @@ class DepthOfField(nn.Module):
         maps = depth.expand(batch, -1, 1, height, width).transpose(1, 2).flatten(2, 3)  # [B, 1, N * H, W]
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
-        coc = self.coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number)
+        coc = self._given_coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number)
         return pipeline.blur_stack(rgba, coc.unflatten(2, (count, height)).transpose(1, 2), options)
 
     def coc_px(
@@ -144,7 +150,15 @@ class DepthOfField(nn.Module):
         f_number: float | Tensor | None = None,
     ) -> Tensor:
         """Signed circle of confusion of the call :meth:`forward` with the same arguments: ``[B, 1, H, W]``, pixels."""
+        return _with_edges(image, self._given_coc_px(image, depth, focus_m, f_number), self.options)
+
+    def _given_coc_px(
+        self, image: Tensor, depth: Tensor, focus_m: float | Tensor | None, f_number: float | Tensor | None
+    ) -> Tensor:
+        """The same of the depth as it is given."""
         check = self.options.check
+        if not validation.is_traced() and validation.is_resizable(image, depth):
+            depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
@@ -293,10 +307,19 @@ def _blur(
     if hidden is not None and not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
     _check_attention(attention, plan)
+    coc_px = _with_edges(image, coc_px, options)
     if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
         with torch.autocast(image.device.type, enabled=False):
             return pipeline.blur_attended(image, coc_px, plan, options, hidden, attention)
     return pipeline.blur_attended(image, coc_px, plan, options, hidden, attention)
+
+
+def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
+    """A map of the coc with its edges where the image has them, as far as the options ask for that."""
+    if options.depth_edges == "as given":
+        return coc_px
+    mended = -repair(image, -coc_px.detach(), _EDGE_PX, auto=options.depth_edges == "auto")
+    return torch.where((mended != coc_px) & torch.isfinite(coc_px), mended, coc_px)
 
 
 def _check_plan(plan: Plan | None) -> None:

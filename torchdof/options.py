@@ -6,8 +6,10 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
+from .depth.edges import DepthEdges
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
+from .validation import depth_edges as check_depth_edges
 from .validation import show
 
 __all__ = [
@@ -50,6 +52,9 @@ class Options:
         max_coc_px: Largest radius that a static plan (compiled, exported) covers; larger ones are rendered with it.
         check: Look for NaN and non-positive depths and non-finite light before rendering, and refuse them. False skips
             that (and its cost); a pixel with a bad depth then passes through sharp and touches nothing else.
+        depth_edges: ``"auto"`` moves and sharpens the edges of the depth to where the image has them, unless they prove
+            exact in this frame; ``"repair"`` asks each edge; ``"as given"`` takes the map as it is. See
+            :func:`torchdof.depth.repair_edges`.
 
     Raises:
         ValueError: Naming the option that makes no sense.
@@ -66,6 +71,7 @@ class Options:
     method: Method = "layered"
     max_coc_px: float = 64.0
     check: bool = True
+    depth_edges: DepthEdges = "auto"
 
     def __post_init__(self) -> None:
         if not isinstance(self.table, BlurTable):
@@ -82,6 +88,7 @@ class Options:
         reach = self.max_coc_px
         if isinstance(reach, bool) or not isinstance(reach, int | float) or not 0.5 < reach < 1e300:
             raise ValueError(f"max_coc_px must be a radius above 0.5 pixels, got {show(reach)}")
+        check_depth_edges(self.depth_edges)
 
     @classmethod
     def of(cls, table: BlurTable | None = None, **arguments: Unpack["OptionArguments"]) -> "Options":
@@ -120,6 +127,7 @@ class OptionArguments(TypedDict, total=False):
     method: Method
     max_coc_px: float
     check: bool
+    depth_edges: DepthEdges
 
 
 def spells_options(function: _Spelled) -> _Spelled:

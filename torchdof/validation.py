@@ -9,6 +9,8 @@ from torch import Tensor
 __all__ = [
     "background",
     "both_or_none",
+    "depth_edges",
+    "is_resizable",
     "image_and_coc",
     "image_and_depth",
     "image_and_map",
@@ -16,6 +18,7 @@ __all__ = [
     "number",
     "pixels_wide",
     "real_tensor",
+    "same_aspect",
     "show",
     "stack",
     "whole",
@@ -106,6 +109,16 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     return value
 
 
+def depth_edges(value: Any) -> None:
+    """Refuse what names no treatment of depth edges.
+
+    Raises:
+        ValueError: If it is none of "auto", "repair" and "as given".
+    """
+    if not isinstance(value, str) or value not in ("auto", "repair", "as given"):
+        raise ValueError(f"depth_edges must be 'auto', 'repair' or 'as given', got {show(value)}")
+
+
 def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
     """Refuse an image and a depth map that do not belong together.
 
@@ -120,6 +133,34 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
                 f"depth must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or negative; "
                 "fill the holes, or pass check=False to let these pixels through sharp"
             )
+
+
+def is_resizable(image: Any, depth: Any) -> bool:
+    """Whether a depth map has another size than an image and may show the same."""
+    maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
+    if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
+        return False
+    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and _is_same_aspect(image, depth)
+
+
+def _is_same_aspect(image: Tensor, depth: Tensor) -> bool:
+    """Whether two aspect ratios differ by less than a pixel of the smaller of the two."""
+    (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
+    return abs(rows * width - height * columns) < max(width, columns)
+
+
+def same_aspect(image: Tensor, depth: Tensor) -> None:
+    """Refuse a depth map that cannot show what an image ``[..., H, W]`` of another size shows.
+
+    Raises:
+        ValueError: If the aspect ratios differ by a pixel or more of the smaller of the two.
+    """
+    if 0 in depth.shape or not _is_same_aspect(image, depth):
+        (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
+        raise ValueError(
+            f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
+            "but must have the same aspect ratio; crop one of the two, so that both show the same"
+        )
 
 
 def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) -> None:

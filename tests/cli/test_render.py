@@ -323,14 +323,14 @@ def test_missing_depth_frame_is_found_before_anything_is_rendered(scene: Path) -
         ),
         (("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "coc"), "--depth-kind coc is the blur itself"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--layer", "b"), "image.exr: has no layer 'b'"),
-        (("image.exr", "small.npy", "--focus-m", "2"), "small.npy: depth is 4 x 3 pixels but the image is 24 x 16"),
+        (("image.exr", "small.npy", "--focus-m", "2"), "small.npy: depth is 3 x 4 pixels and the image 24 x 16"),
         (("image.exr", "depth.####.npy", "--focus-m", "2"), "image.exr: is a single image"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--frames", "1-2"), "image.exr: is a single image"),
         (("shot.####.exr", "depth.npy", "--focus-m", "2"), "out.exr: expected one place for the frame number"),
     ],
 )
 def test_wrong_input_is_one_sentence_and_exit_code_2(scene: Path, arguments: tuple[str, ...], says: str) -> None:
-    np.save("small.npy", np.ones((3, 4)))
+    np.save("small.npy", np.ones((4, 3)))
     message = run(*arguments, "-o", "out.exr", code=2)
     assert message.startswith("error: ") and says in message
     assert message.count("\n") == 1

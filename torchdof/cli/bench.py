@@ -12,6 +12,7 @@ from rich.console import Console
 
 from ..bench import scaling, speed
 from ..bench.accuracy import compare_with_truth
+from ..bench.degraded import compare_degraded
 from ..bench.inputs import BenchScene, shipped
 from ..bench.report import existing_folder
 from ..depth.holes import resolve_holes
@@ -93,6 +94,21 @@ def bench(
             rich_help_panel=_ACCURACY,
         ),
     ] = False,
+    degrade: Annotated[
+        bool,
+        typer.Option(
+            "--degrade",
+            help="Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.",
+            rich_help_panel=_ACCURACY,
+        ),
+    ] = False,
+    peer: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="With --degrade, a Python file with another renderer, blur(image, coc_px); may be repeated.",
+            rich_help_panel=_ACCURACY,
+        ),
+    ] = None,
 ) -> None:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
@@ -105,8 +121,12 @@ def bench(
 
         torchdof bench --truth scenes --out results
 
-    The picture of the latter shows, for each scene, the place where torchdof is farthest from the truth: sharp, truth,
-    each renderer with its error below it, four times enlarged.
+    The same with depth as bad as real depth is, and with GEGL on the same maps:
+
+        torchdof bench --truth scenes --degrade --peer examples/benchmarks/tools/gegl.py --out results
+
+    The picture that --truth alone writes shows, for each scene, the place where torchdof is farthest from the truth:
+    sharp, truth, each renderer with its error below it, four times enlarged.
     """
     existing_folder(out)
     if truth is not None:
@@ -116,10 +136,17 @@ def bench(
             )
         if out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
-        compare_with_truth(truth, out, views, inner)
+        if not degrade and peer:
+            raise ValueError("--peer goes with --degrade")
+        if degrade and (views or inner):
+            raise ValueError("--degrade compares whole frames without the reference; leave --views and --inner out")
+        if degrade:
+            compare_degraded(truth, out, peer or [])
+        else:
+            compare_with_truth(truth, out, views, inner)
         return
-    if views or inner:
-        raise ValueError("--views and --inner compare with a truth; name its folder with --truth")
+    if views or inner or degrade or peer:
+        raise ValueError("--views, --inner, --degrade and --peer compare with a truth; name its folder with --truth")
     how = RenderSettings(
         focus=None if focus_m is None else [(0, focus_m)],
         f_number=f_number,

@@ -11,12 +11,13 @@ from torch import Tensor
 
 from ..depth.holes import resolve_holes
 from ..depth.kinds import depth_from_values
+from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
 from ..optics.blur_table import BlurTable
 from ..options import Options
-from ..validation import image_and_map
+from ..validation import image_and_map, same_aspect
 from .settings import RenderSettings
 
 __all__ = ["render_frame", "tint_focus"]
@@ -78,7 +79,9 @@ def render_frame(
         if picture.has_alpha and table.channels > 1:  # alpha is blurred as green is
             params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
             table = BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
-        options = Options(table, settings.tolerance, settings.occlusion, method=settings.method).arguments()
+        options = Options(
+            table, settings.tolerance, settings.occlusion, method=settings.method, depth_edges=settings.depth_edges
+        ).arguments()
         with torch.no_grad():
             if camera is None:
                 pixels = blur_by_coc(pixels, coc_px, **options)
@@ -140,12 +143,16 @@ def _depth(
             f"{image}: has no depth channel; name a depth file after it: torchdof render IMAGE DEPTH -o OUT"
         )
     name = str(depth if depth is not None else image)
-    if values.shape[-2:] != picture.pixels.shape[-2:]:
-        (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
-        raise ValueError(f"{name}: depth is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
+    (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
+    if settings.depth_kind == "coc" and (h, w) != (ih, iw):
+        raise ValueError(f"{name}: coc is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
+    try:
+        same_aspect(picture.pixels, values)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
     fov_x_deg = settings.fov_x_deg
     if settings.depth_kind == "distance" and fov_x_deg is None:
-        facts = camera_facts(picture.metadata, values.shape[-1])
+        facts = camera_facts(picture.metadata, iw)
         focal_mm = settings.focal_length_mm or facts.get("focal_length_mm")
         sensor_mm = settings.sensor_width_mm or facts.get("sensor_width_mm")
         if focal_mm is None or sensor_mm is None:
@@ -159,4 +166,5 @@ def _depth(
         unknown=settings.depth_unknown,
         fov_x_deg=fov_x_deg,
     )
-    return resolve_holes(result, name, settings.fill)
+    result, holes = resolve_holes(result, name, settings.fill)
+    return result if settings.depth_kind == "coc" else at_size_of(picture.pixels, result), holes

@@ -98,6 +98,14 @@ def render(
     depth_channel: Annotated[
         str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=_DEPTH)
     ] = None,
+    depth_edges: Annotated[
+        Literal["auto", "repair", "as-given"],
+        typer.Option(
+            help="Move and sharpen the edges of the depth to where IMAGE has them: unless they prove exact, each one, "
+            "or not at all.",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = "auto",
     table: Annotated[
         str,
         typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=_BLUR),
@@ -184,6 +192,7 @@ def render(
         depth_unknown=depth_unknown,
         depth_channel=depth_channel,
         fill=None if fill_depth is None else _fill(fill_depth),
+        depth_edges="as given" if depth_edges == "as-given" else depth_edges,
         table=load_table(table),
         tolerance=tolerance_of_text(tolerance),
         occlusion=not no_occlusion,

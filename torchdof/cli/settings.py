@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from ..depth.edges import DepthEdges
 from ..depth.holes import Fill
 from ..depth.kinds import DepthKind
 from ..io.decode import PixelType
@@ -41,6 +42,7 @@ class RenderSettings:
         depth_unknown: Value that means "not measured".
         depth_channel: Channel or array that holds depth.
         fill: How to fill holes in the depth; None refuses them.
+        depth_edges: What is done to depth edges, as in :class:`torchdof.DepthOfField`.
         table: Blur table.
         tolerance: Accepted RMS error, as in :class:`torchdof.DepthOfField`.
         occlusion: False for the paper's single pass without occlusion.
@@ -69,6 +71,7 @@ class RenderSettings:
     depth_unknown: float | None = None
     depth_channel: str | None = None
     fill: Fill | None = None
+    depth_edges: DepthEdges = "auto"
     table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
     tolerance: float = 1 / 255
     occlusion: bool = True

@@ -16,8 +16,19 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
-__all__ = ["HALF_LARGEST", "Kind", "chosen", "convolve", "describe", "render", "use_instructions"]
+__all__ = [
+    "HALF_LARGEST",
+    "Kind",
+    "can_read",
+    "chosen",
+    "convolve",
+    "describe",
+    "render",
+    "repair_edges",
+    "use_instructions",
+]
 
 Kind = Literal["image", "background", "stack"]
 """What surfaces are: one image; an image and what lies behind it; any number that cover each other, near to far."""
@@ -60,6 +71,24 @@ class _Scene(ctypes.Structure):
     ]
 
 
+class _Map(ctypes.Structure):
+    """``torchdof_map`` of ``src/api.h``."""
+
+    _fields_ = [  # noqa: RUF012
+        ("height", ctypes.c_int32),
+        ("width", ctypes.c_int32),
+        ("channels", ctypes.c_int32),
+        ("light", ctypes.c_void_p),
+        ("nearness", ctypes.c_void_p),
+        ("steps", ctypes.c_void_p),
+        ("step", ctypes.c_float),
+        ("automatic", ctypes.c_int32),
+        ("threads", ctypes.c_int32),
+        ("cancelled", ctypes.POINTER(ctypes.c_int32)),
+        ("out", ctypes.c_void_p),
+    ]
+
+
 def chosen() -> bool:
     """Whether the compiled engine serves.
 
@@ -94,6 +123,12 @@ def describe() -> str:
 def use_instructions(name: Literal["avx2", "baseline"]) -> bool:
     """Choose the processor's instructions, for tests; False if it lacks them."""
     return bool(_engine().torchdof_use(name.encode()))
+
+
+def can_read(values: Tensor) -> bool:
+    """Whether numbers alone are asked for, in memory of the CPU: no gradients, no device."""
+    followed = torch.is_grad_enabled() and values.requires_grad
+    return values.device.type == "cpu" and not followed and forward_ad.unpack_dual(values).tangent is None
 
 
 def render(
@@ -179,6 +214,42 @@ def render(
     return out
 
 
+def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+    """What :func:`torchdof.depth.edges.repair` computes, of one item, on as many threads as PyTorch uses.
+
+    Args:
+        light: ``[C, H, W]``, float32.
+        nearness: ``[H, W]``, float32.
+        step: ``[H, W]`` or ``[]``, float32.
+        auto: As there.
+
+    Returns:
+        ``[H, W]``, float32; the same bits for any number of threads.
+
+    Raises:
+        MemoryError: If there is too little.
+    """
+    light, nearness, step = light.contiguous(), nearness.contiguous(), step.contiguous()
+    out, cancelled = torch.empty_like(nearness), ctypes.c_int32(0)
+    same = step.ndim == 0
+    height, width = nearness.shape
+    scene = _Map(
+        height,
+        width,
+        light.shape[0],
+        light.data_ptr(),
+        nearness.data_ptr(),
+        None if same else step.data_ptr(),
+        float(step) if same else 0.0,
+        auto,
+        torch.get_num_threads(),
+        ctypes.pointer(cancelled),
+        out.data_ptr(),
+    )
+    _interruptible(lambda: _check(_engine().torchdof_repair_edges(ctypes.byref(scene))), cancelled)
+    return out
+
+
 def convolve(values: Tensor, kernel: Tensor) -> Tensor:
     """Values ``[H, W]`` spread with a kernel ``[k, k]``, float32; what falls outside is lost."""
     out, values, kernel = torch.empty_like(values), values.contiguous(), kernel.contiguous()
@@ -259,6 +330,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_free.restype = None
     library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]
     library.torchdof_convolve.restype = None
+    library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map)]
     library.torchdof_instructions.restype = ctypes.c_char_p
     library.torchdof_use.argtypes = [ctypes.c_char_p]
     return library, ""

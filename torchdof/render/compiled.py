@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from .. import native
 from ..optics.blur_table import BlurTable
@@ -60,10 +59,7 @@ def picture(
 
 def _is_plain(values: Tensor) -> bool:
     """Whether numbers alone are asked for, in memory that the compiled engine can read: no gradients, no device."""
-    if values.device.type != "cpu" or values.dtype != torch.float32:
-        return False
-    followed = torch.is_grad_enabled() and values.requires_grad
-    return not followed and forward_ad.unpack_dual(values).tangent is None
+    return values.dtype == torch.float32 and native.can_read(values)
 
 
 def _render(

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from . import pixels
+from .. import pixels
 from .downsampling import downsampled
 from .matting import NEVER_PX
 

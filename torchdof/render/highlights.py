@@ -19,8 +19,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .. import pixels
 from ..optics.blur_table import BlurTable
-from . import pixels
 from .disocclusion import HIDDEN_WEIGHT
 from .plan import kernels_for
 from .surfaces import Surface
@@ -41,7 +41,7 @@ _TAPS = 2**21  # rays splatted together
 
 
 class Highlights(NamedTuple):
-    """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.render.pixels`), and their coc."""
+    """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.pixels`), and their coc."""
 
     pixels: Tensor
     light: Tensor

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from . import pixels
+from .. import pixels
 
 __all__ = ["NEVER_PX", "Matted", "emitters_behind", "matte"]
 

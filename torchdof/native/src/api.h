@@ -62,6 +62,22 @@ TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kern
 
 TORCHDOF_API void torchdof_free(torchdof_job *job);
 
+// A map of nearness (linear in 1 / depth, larger is nearer; what is not finite stays) whose edges are to be where the
+// image has them.
+typedef struct {
+  int32_t height, width, channels;
+  const float *light;     // [channels, height, width]
+  const float *nearness;  // [height, width]
+  const float *steps;     // difference from which on neighbours are two surfaces, [height, width]; or null, then it is
+  float step;             // this one everywhere
+  int32_t automatic;      // 1: edges that prove exact are left alone
+  int32_t threads;
+  const volatile int32_t *cancelled;
+  float *out;  // [height, width]
+} torchdof_map;
+
+TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map);
+
 // out[y, x] = sum of kernel[v, u] in[y - v, x - u]: what spreads a layer. For tests and benchmarks.
 TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half,
                                     float *out);

@@ -198,6 +198,6 @@ static void convolve_all(const float *in, int height, int width, const float *va
   for (int y = 0; y < height; y++) memcpy(out + (size_t)y * width, &spread[(size_t)y * columns], width * sizeof(float));
 }
 extern const Variant variant;
-const Variant variant = {begin, convolve_all};
+const Variant variant = {begin, repair_edges, convolve_all};
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -260,6 +260,9 @@ Kernel make_kernel(const float *values, int half);
 void convolve(const float *in, int pitch, const uint32_t *rows, const Kernel &kernel, int height, int width, float *out,
               int out_pitch);
 
+// Depth edges; edges.cpp
+void repair_edges(const torchdof_map &map);
+
 void composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out);
 
 }  // namespace TORCHDOF_SIMD

@@ -1,0 +1,448 @@
+"""Edges of a depth map where the image has them.
+
+Depth that is measured or estimated has its edges beside those of the image, or ramps where they should be steps. Both
+draw outlines around everything that is blurred. Here each pixel near an edge is asked which of the two surfaces that
+meet there it shows: by its colour, against the colours that surely belong to one of them; and by the map, trusted as
+far as it has proved right in the rest of the frame. So the map's own habits (a foreground a pixel too thin, edges
+displaced to the right, ramps four pixels wide) are learnt from the frame, and a map whose edges are exact proves so and
+stays as it is.
+
+Everything is computed in a measure of nearness that is linear in 1 / depth: there planes are straight, and what
+resampling and estimators do to an edge is an average.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .. import native, pixels, validation
+
+__all__ = ["DepthEdges", "repair", "repair_edges"]
+
+DepthEdges = Literal["auto", "repair", "as given"]
+"""What is done to depth edges before rendering: repaired where the map proves inexact, or all of them, or nothing."""
+
+_STEP = 0.05  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
+_RINGS = 3  # pixels beside a step that may be on its wrong side
+_REACH = 5  # pixels around one that tell what the two surfaces look like
+_FALLOFF_PX = 2.5
+_SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a pixel as witness, by ring; beside an edge it may be wrong itself
+_RAMP_REACH = 6  # half the width of the widest ramp that is one, not a slope
+_SHALLOW = 0.03  # slope, of what lies between the surfaces around, from which on it belongs to a ramp
+_LEVELS = 6  # places on a ramp that are calibrated apart
+_PLACES = 2 * _RINGS + _LEVELS
+_TRUSTED = 0.05  # share of wrong pixels that a map is assumed to have
+_ROUNDS = 10
+_SHARPNESS = 1.6  # how much surer colours are than their likelihoods say, which count witnesses on the wrong side
+_MOST = 4.0  # times its own step, a thin structure stands out at most
+_BLUR_REACH = 9
+_PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
+_EXACT = 0.05  # share of wrong pixels up to which a map's steps count as exact
+_SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
+_RELATED = 0.75  # share of clear cases in which colours must agree with a map to be heard on it
+_SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
+_BLOCK = 16
+_CHUNK = 40_000
+_NEVER = 1e30
+
+
+class _Edges(NamedTuple):
+    """What a map of nearness shows; all ``[B, 1, H, W]``."""
+
+    near: Tensor  # of the two surfaces that meet around the pixel
+    far: Tensor
+    is_ramp: Tensor  # the map passes from one to the other here
+    ring: Tensor  # how many pixels from a step: 1 is beside it; one more than there are: none is near
+    is_edge: Tensor
+    direction: Tensor  # towards the near surface: left, right, up or down
+    steepness: Tensor  # change of nearness by pixel on a ramp
+
+
+def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> Tensor:
+    """Moves and sharpens the edges of a depth map to where the image has them.
+
+    Ramps become steps between their two surfaces; pixels that show one surface and have the depth of the other get
+    theirs; structures so thin that a ramp has swallowed part of their depth get it back. Slopes stay slopes, and where
+    the image shows no difference between two surfaces the map is left as it is.
+
+    Args:
+        image: ``[B, C, H, W]``, linear light, floating point; its scale does not matter.
+        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres, > 0, ``inf`` allowed; NaN, zero and negative values stay.
+        edges: "repair" asks each edge; "auto" leaves a map alone whose edges prove exact, bit for bit; "as given" does
+            nothing.
+
+    Returns:
+        ``[B, 1, H, W]``, metres. Gradients flow to the depth where it is unchanged; what was repaired is constant.
+
+    Raises:
+        ValueError: If shapes or types are not as described.
+
+    Example:
+        >>> image = torch.zeros(1, 3, 24, 24)
+        >>> image[..., 12:] = 1.0
+        >>> depth = torch.full((1, 1, 24, 24), 2.0)
+        >>> depth[..., 13:] = 1.0  # a pixel too far to the right
+        >>> bool((repair_edges(image, depth)[..., 12:] == 1.0).all())
+        True
+    """
+    validation.image_and_depth(image, depth, values=False)
+    validation.depth_edges(edges)
+    if edges == "as given":
+        return depth
+    depth = depth.expand(image.shape[0], -1, -1, -1)
+    nearness = torch.where(depth > 0, 1.0 / depth.detach(), torch.nan)
+    high = _highest(torch.where(depth > 0, nearness, 0.0).float(), _REACH)
+    mended = repair(image, nearness, _STEP * high, edges == "auto")
+    changed = (mended != nearness) & (depth > 0)
+    return torch.where(changed, 1.0 / mended.clamp_min(0.0), depth)
+
+
+def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) -> Tensor:
+    """Repairs a map of nearness, of any scale and offset; what is not finite stays and touches nothing.
+
+    Args:
+        image: ``[B, C, H, W]``, linear light.
+        nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer; the negative coc is one.
+        step: Difference in nearness from which on neighbours are two surfaces, ``[B, 1, H, W]`` or a number.
+        auto: Whether edges that prove exact are left alone.
+
+    Returns:
+        ``[B, 1, H, W]``, constant to autograd; where nothing is repaired, the given values themselves.
+    """
+    if not validation.is_traced():
+        known = nearness.detach()[torch.isfinite(nearness)]
+        if not len(known) or bool((known.max() - known.min() <= torch.as_tensor(step)).all()):
+            return nearness.detach()  # one surface
+    light, given = image.detach().float(), nearness.detach().float().expand(len(image), -1, -1, -1)
+    step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
+    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+        mended = _operator(light, given, step, auto)
+    elif not validation.is_traced() and all(map(native.can_read, (image, nearness))) and native.chosen():
+        steps = step.expand(len(light), 1, *given.shape[-2:]) if step.ndim else step.expand(len(light), 1)
+        items = zip(light, given, steps, strict=True)
+        mended = torch.stack([native.repair_edges(a, b[0], c[0], auto)[None] for a, b, c in items])
+    else:
+        mended = _repair(light, given, step, auto)
+    return torch.where(mended != given, mended.to(nearness.dtype), nearness.detach())
+
+
+@torch.no_grad()
+def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+    valid = torch.isfinite(nearness)
+    given = torch.where(valid, nearness, 0.0)
+    light = torch.where(torch.isfinite(image), image, 0.0).clamp_min(0.0)
+    edges = _find(given, valid, step)
+    is_near = 2.0 * given > edges.near + edges.far
+    witness = given.new_tensor(_SURE)[edges.ring] * (valid & ~edges.is_ramp)
+
+    # how far the map can be trusted, at each kind of place on an edge: from part of the frame
+    height, width = given.shape[-2:]
+    every = -(-height * width // _SAMPLED)
+    rows, columns = (torch.arange(n, device=given.device) // _BLOCK for n in (height, width))
+    sampled = pixels.indices(edges.is_edge & ((rows[:, None] + 3 * columns) % every == 0))
+    kind = _kind(given, edges)
+    sampled_score = _judge(light, given, witness, edges, sampled)[0]
+    prior = _calibrate(kind, sampled, sampled_score, len(given))[kind]
+    softness = edges.is_ramp.sum((1, 2, 3), keepdim=True) / edges.is_edge.sum((1, 2, 3), keepdim=True).clamp_min(1)
+    is_soft = softness > _SOFT
+    if auto:
+        is_related = _is_related(given, edges, sampled, sampled_score)
+        is_soft = is_soft & is_related
+
+    # which surface the doubtful pixels show
+    doubtful = edges.is_edge
+    if auto:
+        is_wrong = torch.where(is_near, 1.0 - prior, prior) > _EXACT
+        doubtful = doubtful & is_related & torch.where(edges.is_ramp, is_soft, is_wrong)
+    edge_pixels = pixels.indices(doubtful)
+    score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels)
+    shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0]) > 0
+
+    # and what is so thin that a ramp swallowed part of its depth
+    sigma = _blur_of(given, edges)
+    label = torch.where(edges.is_edge, is_near, 2.0 * given > _highest(given, 6) - _highest(-given, 6))
+    label = pixels.put(label.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
+    near, far = _unmix(given, edges, label, sigma, edge_pixels, near, far)
+
+    own = pixels.pick(given, edge_pixels)[0]
+    is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
+    moved = torch.where(is_ramp, evidence, (shows_near != pixels.pick(is_near, edge_pixels)[0]).to(given.dtype))
+    out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))
+    return torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma), nearness)
+
+
+# How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
+@torch.library.custom_op("torchdof::repair_edges", mutates_args=())
+def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+    return _repair(image, nearness, step, auto).clone()
+
+
+@_operator.register_fake
+def _(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+    return torch.empty_like(nearness, memory_format=torch.contiguous_format)
+
+
+def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
+    """Ramps and steps, and the two surfaces that meet there."""
+    high, low = torch.where(valid, nearness, -_NEVER), torch.where(valid, -nearness, -_NEVER)
+    slope, steepness = _slopes(nearness, valid)
+    span = _highest(high, _REACH) + _highest(low, _REACH)
+    # a ramp ends, a slope goes on
+    flattest = -_highest(-_mean(slope, 2), 8)
+    is_ramp = (slope > 0.1 * step) & (slope > _SHALLOW * span) & (span > step) & (flattest < 0.3 * slope) & valid
+
+    # the surfaces at both ends of a ramp
+    near, far = high, low
+    for _ in range(_RAMP_REACH):
+        near, far = (torch.where(is_ramp, _highest(end, 1), end) for end in (near, far))
+    is_ramp = is_ramp & (near + far > step)
+    near, far = torch.where(is_ramp, near, high), torch.where(is_ramp, far, low)
+
+    # those at both sides of a step
+    nears, fars = ([_highest(end, ring) for ring in range(1, _RINGS + 1)] for end in (near, far))
+    least = torch.maximum(0.6 * (nears[-1] + fars[-1]), step)
+    ring = torch.full_like(nearness, _RINGS + 1, dtype=torch.long)
+    beside, behind = nears[-1], fars[-1]
+    for k in reversed(range(_RINGS)):
+        is_step = nears[k] + fars[k] > least
+        ring = torch.where(is_step, k + 1, ring)
+        beside, behind = torch.where(is_step, nears[k], beside), torch.where(is_step, fars[k], behind)
+    near, far = torch.where(is_ramp, near, beside), -torch.where(is_ramp, far, behind)
+    is_edge = (is_ramp | (ring <= _RINGS)) & (near - far > step) & valid
+
+    mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
+    right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
+    direction = torch.where(right.abs() > down.abs(), (right > 0).long(), 2 + (down > 0).long())
+    return _Edges(near, far, is_ramp, ring, is_edge, direction, steepness)
+
+
+def _kind(nearness: Tensor, edges: _Edges) -> Tensor:
+    """Which pixels are calibrated together: those of one ring and side of a step, or one level of a ramp, by direction.
+
+    Numbers ``[B, 1, H, W]``: of items, then of places, then of directions.
+    """
+    level = (nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12)
+    side = (level > 0.5).long() * _RINGS + edges.ring.clamp(max=_RINGS) - 1
+    place = torch.where(edges.is_ramp, 2 * _RINGS + (level * _LEVELS).long().clamp(0, _LEVELS - 1), side)
+    item = torch.arange(len(nearness), device=nearness.device).view(-1, 1, 1, 1)
+    return (item * _PLACES + place) * 4 + edges.direction
+
+
+def _judge(
+    light: Tensor, nearness: Tensor, witness: Tensor, edges: _Edges, edge_pixels: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Which of two surfaces pixels ``[P]`` show, by their colour.
+
+    Returns:
+        ``[P]`` each: the logarithm of how much likelier the near one is; how surely the colours of the two tell, 0 to
+        1; and the nearness of the near and of the far surface there.
+    """
+    colour = light.sqrt()
+    offsets = torch.arange(-_REACH, _REACH + 1, device=light.device, dtype=light.dtype)
+    falloff = torch.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * _FALLOFF_PX**2)).flatten()[:, None]
+    parts = [edge_pixels] if validation.is_traced() else edge_pixels.split(_CHUNK)
+    judged = []
+    for part in parts:
+        window = pixels.around(part, nearness, _REACH)
+        near, far = pixels.pick(edges.near, part)[0], pixels.pick(edges.far, part)[0]
+        values, own, others = pixels.pick(nearness, window)[0], pixels.pick(colour, part), pixels.pick(colour, window)
+        level = (values - far) / (near - far).clamp_min(1e-12)
+        weight = falloff * pixels.pick(witness, window)[0]
+        sides = [weight * ((level > 0.75) & (level < 1.25)), weight * ((level < 0.25) & (level > -0.25))]
+
+        # what the surfaces look like: mean colours, and how far colours stray from these
+        sums = [side.sum(0) for side in sides]
+        known = (sums[0] > 1e-3) & (sums[1] > 1e-3)
+        totals = [total + 1e-9 for total in sums]
+        means = [(others * side).sum(1) / total for side, total in zip(sides, totals, strict=True)]
+        spreads = [
+            ((others - mean[:, None]) ** 2 * side).sum((0, 1)) / total
+            for mean, side, total in zip(means, sides, totals, strict=True)
+        ]
+        noise = 2.25e-4 * (means[0] + means[1]).square().sum(0)
+        spread = 0.5 * (spreads[0] + spreads[1]) + noise + 1e-12
+        contrast = (means[0] - means[1]).square().sum(0)
+        tells = (contrast / (contrast + 0.5 * spread) - 0.1).clamp_min(0.0) / 0.9
+        tells = torch.where(known, tells, 1.0)  # in the middle of a wide ramp the neighbours do
+
+        # likelihood: how many witnesses look alike, and a little how close their mean is
+        alike = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).pow(-2)
+        likelihoods = [
+            (side * alike).sum(0) / total + 0.02 * (1.0 + (own - mean).square().sum(0) / (0.3 * spread)).pow(-2) + 1e-9
+            for side, total, mean in zip(sides, totals, means, strict=True)
+        ]
+        score = torch.where(known, torch.log(likelihoods[0] / likelihoods[1]), 0.0)
+        surfaces = []
+        for side, end in zip(sides, (near, far), strict=True):
+            share = side * (alike + 1e-3)
+            surfaces.append(torch.where(known, (share * values).sum(0) / share.sum(0).clamp_min(1e-12), end))
+        judged.append(torch.stack([score.clamp(-8.0, 8.0), tells, *surfaces]))
+    score, tells, near, far = torch.cat(judged, 1) if judged else light.new_zeros(4, 0)
+
+    # neighbours of like colour decide together
+    scores = pixels.put(torch.full_like(nearness, torch.nan), edge_pixels, score)
+    window = pixels.around(edge_pixels, nearness, 1)
+    own, others, said = pixels.pick(colour, edge_pixels), pixels.pick(colour, window), pixels.pick(scores, window)[0]
+    alike = 1.0 / (1.0 + (others - own[:, None]).square().sum(0) / (0.0225 * own.square().sum(0) + 1e-12))
+    alike = torch.where(said.isnan(), 0.0, alike)
+    said = torch.where(said.isnan(), 0.0, said)
+    score = (_SHARPNESS * tells * (alike * said).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
+    evidence = (2.0 * tells * said.abs().amax(0) - 1.0).clamp(0.0, 1.0)
+    return score, evidence, near, far
+
+
+def _is_related(nearness: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:
+    """Whether what an item's colours say agrees with its map where that is hardly in doubt, ``[B, 1, 1, 1]``.
+
+    That is some pixels from steps, and at the ends of ramps. An image that knows nothing of the depth agrees by half.
+    """
+    level = pixels.pick((nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12), sampled)[0]
+    is_ramp, ring = pixels.pick(edges.is_ramp, sampled)[0], pixels.pick(edges.ring, sampled)[0]
+    clear = torch.where(is_ramp, (level - 0.5).abs() > 0.3, ring > 1)
+    weight = (0.5 * score.abs()).clamp(max=1.0) * clear
+    agrees = ((score > 0) == (level > 0.5)).to(score.dtype)
+    item = sampled // nearness[0].numel()
+    sums = [score.new_zeros(len(nearness)).index_add(0, item, w) for w in (weight, weight * agrees)]
+    return ((sums[1] + 0.5 * _PRIOR_COUNT) / (sums[0] + _PRIOR_COUNT) > _RELATED).view(-1, 1, 1, 1)
+
+
+def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tensor:
+    """Share of pixels that show the near surface, by kind: that which explains the scores best, from a wary start."""
+    device, dtype = score.device, score.dtype
+    steps = torch.tensor([_TRUSTED] * _RINGS + [1.0 - _TRUSTED] * _RINGS, device=device, dtype=dtype)
+    ramps = (torch.arange(_LEVELS, device=device, dtype=dtype) + 0.5) / _LEVELS
+    assumed = torch.cat([steps, ramps]).repeat(items)
+    kinds = pixels.pick(kind, sampled)[0]
+    places = kinds // 4  # all directions together first
+    weight = (0.5 * score.abs()).clamp(max=1.0)
+
+    def fit(groups: Tensor, count: int, start: Tensor, assumed: Tensor) -> Tensor:
+        share, total = start, start.new_zeros(count).index_add(0, groups, weight)
+        for _ in range(_ROUNDS):
+            near = torch.sigmoid(score + torch.logit(share)[groups])
+            found = start.new_zeros(count).index_add(0, groups, weight * near)
+            share = ((found + _PRIOR_COUNT * assumed) / (total + _PRIOR_COUNT)).clamp(0.005, 0.995)
+        return share
+
+    is_step = (torch.arange(_PLACES, device=device) < 2 * _RINGS).repeat(items)
+    together = fit(places, items * _PLACES, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(4)
+    shares = fit(kinds, items * _PLACES * 4, torch.full_like(together, 0.5), together).view(items, _PLACES, 4)
+    # where the pixels beside a step are right those farther away are too
+    far, near, ramp = shares.split([_RINGS, _RINGS, _LEVELS], 1)
+    return torch.cat([far.cummin(1).values, near.cummax(1).values, ramp], 1).flatten()
+
+
+def _blur_of(nearness: Tensor, edges: _Edges) -> Tensor:
+    """Standard deviation in pixels of the blur that made ramps of an item's steps, ``[B, 1, 1, 1]``."""
+    gap = (edges.near - edges.far).clamp_min(1e-12)
+    middle = edges.is_ramp & (((nearness - edges.far) / gap - 0.5).abs() < 0.12)
+    steepness = torch.where(middle, edges.steepness / gap, 0.0).sum((1, 2, 3), keepdim=True)
+    width = middle.sum((1, 2, 3), keepdim=True) / (math.sqrt(2 * math.pi) * steepness).clamp_min(1e-12)
+    return (width**2 - 0.75).clamp(0.25, 9.0).sqrt()  # differences of pixels widen it
+
+
+def _unmix(
+    nearness: Tensor,
+    edges: _Edges,
+    label: Tensor,
+    sigma: Tensor,
+    edge_pixels: Tensor,
+    near: Tensor,
+    far: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best."""
+    blurred = _blurred(label, sigma)
+    gap = near - far
+    for is_near in (True, False):
+        shape = label if is_near else 1.0 - label
+        whole = torch.where(edges.is_edge, shape, 1.0)
+        thick = _highest(-_highest(-whole, 2), 2) > 0
+        thin = pixels.pick(edges.is_edge & (shape > 0) & ~thick, edge_pixels)[0]
+        chosen = thin.nonzero()[:, 0]
+        at = edge_pixels[chosen]
+        least, difference, fit = _regress(nearness, blurred, at)
+        if is_near:
+            most = far[chosen] + _MOST * gap[chosen]
+            gain = fit * (torch.minimum(least + difference, most) - near[chosen]).clamp_min(0.0)
+            near = near.index_add(0, chosen, gain)
+        else:
+            lowest = pixels.pick(-_highest(-nearness, 12), at)[0]
+            bound = torch.maximum(near[chosen] - _MOST * gap[chosen], lowest)
+            gain = fit * (torch.maximum(least, bound) - far[chosen]).clamp_max(0.0)
+            far = far.index_add(0, chosen, gain)
+    return near, far
+
+
+def _lift_lamps(
+    light: Tensor, nearness: Tensor, repaired: Tensor, step: Tensor, is_soft: Tensor, sigma: Tensor
+) -> Tensor:
+    """Lamps of a few pixels, whose nearness a soft map spreads around them, as near as what is spread amounts to."""
+    brightest = light.amax(1, keepdim=True)
+    usual = _mean(brightest.sqrt(), _REACH + 2) ** 2
+    span = _highest(nearness, _REACH) + _highest(-nearness, _REACH)
+    around = _highest(brightest, 2)
+    is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & is_soft
+    cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
+    lamp_pixels = pixels.indices(is_lamp)
+    behind, difference, fit = _regress(nearness, _blurred(cover, sigma), lamp_pixels)
+    own = pixels.pick(repaired, lamp_pixels)[0]
+    gain = fit * (behind + difference.clamp_min(0.0) - own).clamp_min(0.0)
+    return pixels.put(repaired, lamp_pixels, own + gain)
+
+
+def _regress(nearness: Tensor, cover: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Nearness around pixels ``[P]`` as ``a + b cover``: a, b, and how well that fits, 0 to 1."""
+    window = pixels.around(chosen, nearness, _REACH)
+    offsets = torch.arange(-_REACH, _REACH + 1, device=nearness.device, dtype=nearness.dtype)
+    weight = torch.exp(-(offsets[:, None] ** 2 + offsets**2) / 18.0).flatten()[:, None]
+    weight = weight / weight.sum()
+    y, x = pixels.pick(nearness, window)[0], pixels.pick(cover, window)[0]
+    mean_x, mean_y = (weight * x).sum(0), (weight * y).sum(0)
+    xx, yy = (weight * (x - mean_x) ** 2).sum(0), (weight * (y - mean_y) ** 2).sum(0)
+    xy = (weight * (x - mean_x) * (y - mean_y)).sum(0).clamp_min(0.0)
+    b = xy / xx.clamp_min(1e-9)
+    explained = xy**2 / (xx * yy).clamp_min(1e-12)
+    fit = torch.where(xx > 0.004, ((explained - 0.5) / 0.3).clamp(0.0, 1.0), 0.0)
+    return mean_y - b * mean_x, b, fit
+
+
+def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Steepness by pixel where it goes on from one side to the other, 0 elsewhere and beside what is unknown.
+
+    The lesser of both sides, in the steeper of the two axes; and the mean of both, of both axes together.
+    """
+    least, mean = [], []
+    for dim in (-1, -2):
+        known = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
+        change = torch.where(known, nearness.diff(dim=dim), 0.0)
+        none = torch.zeros_like(nearness.narrow(dim, 0, 1))
+        before, after = torch.cat([none, change], dim), torch.cat([change, none], dim)
+        goes_on = before * after > 0
+        least.append(torch.where(goes_on, torch.minimum(before.abs(), after.abs()), 0.0))
+        mean.append(torch.where(goes_on, 0.5 * (before + after), 0.0))
+    return torch.maximum(*least), torch.hypot(*mean)
+
+
+def _highest(values: Tensor, reach: int) -> Tensor:
+    side = 2 * reach + 1
+    rows = functional.max_pool2d(values, (1, side), stride=1, padding=(0, reach))
+    return functional.max_pool2d(rows, (side, 1), stride=1, padding=(reach, 0))
+
+
+def _mean(values: Tensor, reach: int) -> Tensor:
+    side = 2 * reach + 1
+    rows = functional.avg_pool2d(functional.pad(values, (reach,) * 4, mode="replicate"), (1, side), stride=1)
+    return functional.avg_pool2d(rows, (side, 1), stride=1)
+
+
+def _blurred(values: Tensor, sigma: Tensor) -> Tensor:
+    """Items ``[B, 1, H, W]``, each under a Gaussian of its own sigma ``[B, 1, 1, 1]``."""
+    offsets = torch.arange(-_BLUR_REACH, _BLUR_REACH + 1, device=values.device, dtype=values.dtype)
+    kernel = torch.exp(-(offsets**2) / (2.0 * sigma**2))  # [B, 1, 1, k]
+    kernel = kernel / kernel.sum(-1, keepdim=True)
+    padded = functional.pad(values, (_BLUR_REACH,) * 4, mode="replicate").transpose(0, 1)
+    rows = functional.conv2d(padded, kernel, groups=len(sigma))
+    return functional.conv2d(rows, kernel.transpose(-1, -2), groups=len(sigma)).transpose(0, 1)

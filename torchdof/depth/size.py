@@ -1,0 +1,47 @@
+"""A depth map of another size than its image, at the image's."""
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .. import validation
+from .edges import repair_edges
+
+__all__ = ["at_size_of"]
+
+
+def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
+    """A depth map at the size of its image: resampled as 1 / depth, its edges then moved to where the image has them.
+
+    Args:
+        image: ``[B, C, H, W]``, linear light.
+        depth: ``[B, 1, h, w]`` or ``[1, 1, h, w]``, metres, ``inf`` allowed, of the image's field of view. Pixels
+            without depth (NaN, zero or negative) stay without it and touch no other.
+
+    Returns:
+        ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; a map that has the image's size as it is. Gradients flow to the
+        depth but where an edge was repaired.
+
+    Raises:
+        ValueError: If the shapes are not as described, or the aspect ratios differ by a pixel or more of the smaller of
+            the two.
+
+    Example:
+        >>> at_size_of(torch.rand(1, 3, 8, 12), torch.full((1, 1, 4, 6), 2.0)).shape
+        torch.Size([1, 1, 8, 12])
+    """
+    size, given = (image.shape[-2], image.shape[-1]), (depth.shape[-2], depth.shape[-1])
+    if size == given:
+        return depth
+    validation.same_aspect(image, depth)
+    known = (depth > 0).to(depth.dtype)
+    inverse = torch.where(depth > 0, 1.0 / depth, 0.0)
+
+    def resized(values: Tensor) -> Tensor:
+        if given[0] > size[0]:
+            return functional.interpolate(values, size, mode="area")
+        return functional.interpolate(values, size, mode="bilinear", align_corners=False)
+
+    share = resized(known)
+    mean = resized(inverse) / share.clamp_min(torch.finfo(depth.dtype).tiny)
+    return repair_edges(image, torch.where(share >= 0.5, 1.0 / mean, torch.nan))

@@ -1,0 +1,90 @@
+"""Exact depth made as bad as measured and estimated depth is.
+
+Estimators and upsampling smooth 1 / depth across edges; stereo puts edges some pixels off; files quantise. The truth of
+a scene stays what it is, so the distance from it says what the bad depth costs.
+"""
+
+from collections.abc import Callable, Mapping
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+__all__ = ["KINDS", "degrade"]
+
+
+def degrade(depth: Tensor, kind: str) -> Tensor:
+    """Depth of a kind.
+
+    Args:
+        depth: ``[1, 1, H, W]``, metres, exact.
+        kind: One of :data:`KINDS`.
+
+    Returns:
+        ``[1, 1, H, W]``, metres.
+
+    Example:
+        >>> degrade(torch.tensor([[[[2.0, 2.0, 1.0, 1.0]]]]), "shift 1px")
+        tensor([[[[1., 2., 2., 1.]]]])
+    """
+    return KINDS[kind](depth)
+
+
+def _resampled(depth: Tensor, factor: int) -> Tensor:
+    size = (int(depth.shape[-2]), int(depth.shape[-1]))
+    small = functional.interpolate(1 / depth, size=(size[0] // factor, size[1] // factor), mode="area")
+    return 1 / functional.interpolate(small, size=size, mode="bilinear", align_corners=False)
+
+
+def _blurred(depth: Tensor, sigma: float) -> Tensor:
+    reach = int(3 * sigma + 0.5)
+    kernel = torch.exp(-(torch.arange(-reach, reach + 1, dtype=depth.dtype) ** 2) / (2 * sigma**2))
+    kernel = kernel / kernel.sum()
+    inverse = functional.pad(1 / depth, (reach,) * 4, mode="replicate")
+    rows = functional.conv2d(inverse, kernel.view(1, 1, 1, -1))
+    return 1 / functional.conv2d(rows, kernel.view(1, 1, -1, 1))
+
+
+def _quantised(depth: Tensor, levels: int) -> Tensor:
+    inverse = 1 / depth
+    low, high = inverse.min(), inverse.max()
+    steps = ((inverse - low) / (high - low).clamp_min(1e-12) * levels).round()
+    return 1 / (steps / levels * (high - low) + low).clamp_min(1e-6)
+
+
+def _grown(depth: Tensor, reach: int) -> Tensor:
+    """The nearest depth of a square around each pixel; with a negative reach the farthest."""
+    side = 2 * abs(reach) + 1
+    sign = -1.0 if reach > 0 else 1.0
+    return sign * functional.max_pool2d(sign * depth, side, 1, abs(reach))
+
+
+def _displaced(depth: Tensor, sigma: float) -> Tensor:
+    """Edges off by some pixels, now to one side and now to the other."""
+    height, width = depth.shape[-2:]
+    dice = torch.Generator().manual_seed(0)
+    coarse = torch.randn(1, 2, height // 12 + 1, width // 12 + 1, generator=dice)
+    offset = sigma * functional.interpolate(coarse, size=(height, width), mode="bicubic")[0]
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    places = torch.stack([(x + offset[0]) / width * 2 - 1, (y + offset[1]) / height * 2 - 1], -1)[None]
+    return functional.grid_sample(depth, places.to(depth), mode="nearest", padding_mode="border", align_corners=False)
+
+
+def _noisy(depth: Tensor, share: float) -> Tensor:
+    return depth * (1 + share * torch.randn(depth.shape, generator=torch.Generator().manual_seed(0)))
+
+
+KINDS: Mapping[str, Callable[[Tensor], Tensor]] = {
+    "exact": lambda z: z,
+    "half-res": lambda z: _resampled(z, 2),
+    "quarter-res": lambda z: _resampled(z, 4),
+    "shift 1px": lambda z: torch.roll(z, 1, -1),
+    "near -1px": lambda z: _grown(z, -1),  # foreground colour on background depth
+    "near -2px": lambda z: _grown(z, -2),
+    "near +1px": lambda z: _grown(z, 1),
+    "displaced": lambda z: _displaced(z, 1.5),
+    "blur 1.5": lambda z: _blurred(z, 1.5),  # as estimators leave it
+    "8 bit": lambda z: _quantised(z, 255),
+    "noise 1%": lambda z: _noisy(z, 0.01),
+}
+"""What is done to exact depth, by name."""
