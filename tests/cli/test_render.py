@@ -161,6 +161,53 @@ def test_ready_circles_of_confusion_need_no_camera(scene: Path) -> None:
     assert "focus" not in line and "blur radius up to 3.0 px" in line
 
 
+def test_relative_depth_lies_between_near_and_far(scene: Path) -> None:
+    relative = np.where(depth()[0, 0].numpy() == 2.0, 200, 10).astype(np.uint8)
+    store("relative.png", relative[..., None], "uint8", ("Y",))
+    options = ("--depth-kind", "relative", "--near-m", "2", "--far-m", "6", "--focus-m", "2", *LENS)
+    run("image.exr", "relative.png", "-o", "a.exr", *options)
+    run("image.exr", "depth.npy", "-o", "b.exr", "--focus-m", "2", *LENS)
+    torch.testing.assert_close(pixels("a.exr"), pixels("b.exr"), rtol=0, atol=1e-5)
+    run("image.exr", "relative.png", "-o", "c.exr", *options, "--relative-kind", "depth")
+    assert not torch.equal(pixels("c.exr"), pixels("a.exr"))
+    run("image.exr", "relative.png", "-o", "d.exr", *options, "--value-range", "10,200")
+    assert torch.equal(pixels("d.exr"), pixels("a.exr"))
+
+
+def test_frames_of_relative_depth_without_a_range_are_warned_of_once(scene: Path) -> None:
+    sequence()
+    options = ("--depth-kind", "relative", "--near-m", "2", "--far-m", "6", "--focus-m", "2", *LENS)
+    arguments = ["render", "shot.####.exr", "depth.####.npy", "-o", "o.####.exr", *options, "--relative-kind", "depth"]
+    told = CliRunner().invoke(app, arguments)
+    assert told.exit_code == 0 and told.stderr.count("warning: ") == 1 and "--value-range LOW,HIGH" in told.stderr
+    assert CliRunner().invoke(app, [*arguments, "--value-range", "2,6"]).stderr == ""
+
+
+def test_unit_mistake_is_one_warning_a_sequence_and_an_error_where_strict(scene: Path) -> None:
+    sequence()
+    for n in range(1, 4):
+        np.save(f"depth.{n:04d}.npy", depth().numpy() * 1000)
+    arguments = ["render", "shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "3", *LENS]
+    told = CliRunner().invoke(app, arguments)
+    assert told.exit_code == 0 and len(list(scene.glob("out.*"))) == 3
+    assert told.stderr.startswith("warning: shot.0001.exr: nothing is in focus") and told.stderr.count("\n") == 1
+    assert "is it millimetres (--depth-scale 0.001)" in told.stderr
+    for path in scene.glob("out.*"):
+        path.unlink()
+    message = run(*arguments[1:], "--strict", code=2)
+    assert message.startswith("error: shot.0001.exr: nothing is in focus") and list(scene.glob("out.*")) == []
+    assert CliRunner().invoke(app, [*arguments, "--depth-scale", "0.001", "--focus-m", "2"]).stderr == ""
+
+
+def test_warnings_of_depth_can_be_silenced(scene: Path) -> None:
+    np.save("depth.npy", depth().numpy() * 1000)
+    arguments = ["render", "image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "3", *LENS]
+    told = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "torchdof", *arguments], capture_output=True, text=True
+    )
+    assert told.returncode == 0 and told.stderr == ""
+
+
 @pytest.mark.parametrize(
     ("options", "arguments"),
     [
@@ -322,6 +369,16 @@ def test_missing_depth_frame_is_found_before_anything_is_rendered(scene: Path) -
             "--depth-kind distance needs --fov-deg",
         ),
         (("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "coc"), "--depth-kind coc is the blur itself"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "relative", "--near-m", "1"),
+            "--depth-kind relative needs --near-m and --far-m",
+        ),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--near-m", "1"), "add --depth-kind relative"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "relative", "--near-m", "5", "--far-m", "1"),
+            "depth.npy: near_m must be nearer than far_m",
+        ),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--value-range", "3"), "--value-range expects LOW,HIGH"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--layer", "b"), "image.exr: has no layer 'b'"),
         (("image.exr", "small.npy", "--focus-m", "2"), "small.npy: depth is 4 x 3 pixels but the image is 24 x 16"),
         (("image.exr", "depth.####.npy", "--focus-m", "2"), "image.exr: is a single image"),

@@ -11,12 +11,15 @@ from torch import Tensor
 
 from ..depth.holes import resolve_holes
 from ..depth.kinds import depth_from_values
+from ..depth.relative import from_relative
+from ..depth.sanity import coc_doubts, depth_doubts
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
 from ..optics.blur_table import BlurTable
 from ..options import Options
 from ..validation import image_and_map
+from .doubts import Said
 from .settings import RenderSettings
 
 __all__ = ["render_frame", "tint_focus"]
@@ -30,6 +33,7 @@ def render_frame(
     out: str | os.PathLike[str],
     settings: RenderSettings,
     frame: int = 0,
+    said: Said | None = None,
 ) -> str:
     """Reads an image and its depth, blurs, and writes the result whole or not at all.
 
@@ -39,14 +43,16 @@ def render_frame(
         out: File to write.
         settings: What the user said.
         frame: Number of the frame, for focus that moves.
+        said: What was warned of in frames before; None warns of everything.
 
     Returns:
         One line that says what was done, with what, and how long it took.
 
     Raises:
-        ValueError: If input is wrong or missing.
+        ValueError: If input is wrong or missing, or looks like a mistake and the settings are strict.
         OSError: If a file cannot be read or written.
     """
+    said = Said(settings.strict) if said is None else said
     if any(Path(source).resolve() == Path(out).resolve() for source in (image, depth) if source is not None):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
     start = time.perf_counter()
@@ -58,11 +64,13 @@ def render_frame(
     remarks: list[str] = []
     if settings.depth_kind == "coc":
         camera, coc_px = None, values
+        said.say(image, coc_doubts(coc_px))
     else:
         camera, remarks = settings.camera(picture.metadata, width, frame)
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
+        said.say(image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
         parts.append(
             f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
             f"{camera.sensor_width_mm:.4g} mm"
@@ -143,6 +151,19 @@ def _depth(
     if values.shape[-2:] != picture.pixels.shape[-2:]:
         (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
         raise ValueError(f"{name}: depth is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
+    if settings.depth_kind == "relative" and settings.near_m is not None and settings.far_m is not None:
+        try:
+            result = from_relative(
+                values,
+                settings.near_m,
+                settings.far_m,
+                settings.relative_kind or "disparity",
+                value_range=settings.value_range,
+                unknown=settings.depth_unknown,
+            )
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        return resolve_holes(result, name, settings.fill)
     fov_x_deg = settings.fov_x_deg
     if settings.depth_kind == "distance" and fov_x_deg is None:
         facts = camera_facts(picture.metadata, values.shape[-1])

@@ -19,13 +19,20 @@ from rich.progress import (
 )
 
 from ..depth.holes import Fill
+from ..depth.sanity import Doubt
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
+from .doubts import Said
 from .frame import render_frame
 from .settings import RenderSettings, load_table, pick_device
 
-__all__ = ["render"]
+__all__ = ["parse_fill", "parse_point", "parse_range", "render"]
 
+_EACH_ITS_OWN = Doubt(
+    "range",
+    "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
+    "far have in all frames: --value-range LOW,HIGH",
+)
 _LENS, _DEPTH, _BLUR, _FILES = "Focus and lens", "Depth map", "Blur", "Files and frames"
 
 
@@ -70,11 +77,12 @@ def render(
         float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=_LENS)
     ] = None,
     depth_kind: Annotated[
-        Literal["z", "distance", "disparity", "inverse", "coc"],
+        Literal["z", "distance", "disparity", "inverse", "relative", "coc"],
         typer.Option(
             help="What the numbers are: z along the optical axis or distance along the ray, in metres after scale * "
-            "(value + offset); disparity or inverse depth, in metres after scale / (value + offset); or coc, the "
-            "signed blur radius in pixels (negative is near).",
+            "(value + offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as "
+            "estimators give it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is "
+            "near).",
             rich_help_panel=_DEPTH,
         ),
     ] = "z",
@@ -82,6 +90,34 @@ def render(
         float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_DEPTH)
     ] = None,
     depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_DEPTH)] = 0.0,
+    near_m: Annotated[
+        float | None, typer.Option(help="Distance of the nearest value of relative depth.", rich_help_panel=_DEPTH)
+    ] = None,
+    far_m: Annotated[
+        float | None, typer.Option(help="Distance of its farthest value (inf allowed).", rich_help_panel=_DEPTH)
+    ] = None,
+    relative_kind: Annotated[
+        Literal["disparity", "inverse", "depth"] | None,
+        typer.Option(
+            help="What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the "
+            "default), or depth, larger is farther (Marigold).",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = None,
+    value_range: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW,HIGH",
+            help="Smallest and largest value of relative depth; default: those of each frame.",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="Refuse what looks like a wrong unit or scale, instead of warning.", rich_help_panel=_DEPTH
+        ),
+    ] = False,
     depth_unknown: Annotated[
         float | None,
         typer.Option(help="A value that means 'not measured', such as 0, -1 or inf.", rich_help_panel=_DEPTH),
@@ -167,12 +203,17 @@ def render(
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
 
+    Depth from an estimator, which knows near from far but no metres:
+
+        torchdof render photo.jpg depth.png -o out.jpg --depth-kind relative --near-m 1.2 --far-m 8 --focus-m 1.5
+
     The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
-    that is printed says which. Alpha and metadata are kept. A file is written whole or not at all.
+    that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
+    like a wrong unit is said on standard error; with --strict it is refused.
     """
     settings = RenderSettings(
         focus=None if focus_m is None else parse_focus(focus_m),
-        focus_at=None if focus_at is None else _point(focus_at),
+        focus_at=None if focus_at is None else parse_point(focus_at),
         f_number=f_number,
         focal_length_mm=focal_length_mm,
         sensor_width_mm=sensor_width_mm,
@@ -183,7 +224,11 @@ def render(
         depth_offset=depth_offset,
         depth_unknown=depth_unknown,
         depth_channel=depth_channel,
-        fill=None if fill_depth is None else _fill(fill_depth),
+        near_m=near_m,
+        far_m=far_m,
+        relative_kind=relative_kind,
+        value_range=None if value_range is None else parse_range(value_range),
+        fill=None if fill_depth is None else parse_fill(fill_depth),
         table=load_table(table),
         tolerance=tolerance_of_text(tolerance),
         occlusion=not no_occlusion,
@@ -194,6 +239,7 @@ def render(
         sample=bits,
         layer=layer,
         show_focus=show_focus,
+        strict=strict,
     )
     if FramePattern.matches(image):
         _render_sequence(image, depth, out, settings, frames, resume)
@@ -238,10 +284,14 @@ def _render_sequence(
     todo = [n for n in numbers if not (resume and target.name(n).is_file())]
     if len(todo) < len(numbers):
         typer.echo(f"{len(numbers) - len(todo)} of {len(numbers)} frames are there already")
+    said = Said(settings.strict)
+    if settings.depth_kind == "relative" and settings.value_range is None and len(numbers) > 1:
+        said.say(depth or image, [_EACH_ITS_OWN])
     with _progress() as progress:
         task = progress.add_task("rendering", total=len(todo))
         for n in todo:
-            line = render_frame(source.name(n), depths.name(n) if depths else depth, target.name(n), settings, n)
+            depth_n = depths.name(n) if depths else depth
+            line = render_frame(source.name(n), depth_n, target.name(n), settings, n, said)
             typer.echo(line)
             progress.advance(task)
 
@@ -256,7 +306,12 @@ def _progress() -> Iterator[Progress]:
         yield progress
 
 
-def _point(text: str) -> tuple[float, float]:
+def parse_point(text: str) -> tuple[float, float]:
+    """Reads a pixel ``X,Y``.
+
+    Raises:
+        ValueError: If it is none.
+    """
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
@@ -264,7 +319,25 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def _fill(text: str) -> Fill:
+def parse_range(text: str) -> tuple[float, float]:
+    """Reads ``LOW,HIGH``.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--value-range expects LOW,HIGH such as 0,255, got {text!r}") from None
+    return low, high
+
+
+def parse_fill(text: str) -> Fill:
+    """Reads what holes are filled with: a word or metres.
+
+    Raises:
+        ValueError: If it is neither.
+    """
     if text == "nearest" or text == "far":
         return "nearest" if text == "nearest" else "far"
     try:
