@@ -322,6 +322,38 @@ def test_resume_renders_only_what_is_missing(scene: Path) -> None:
     assert os.stat("out.0001.exr").st_mtime == 1
 
 
+def flickering(count: int) -> None:
+    generator = torch.Generator().manual_seed(2)
+    for n in range(1, count + 1):
+        write_image(f"shot.{n:04d}.exr", Picture(image(), sample="float"))
+        edge = torch.roll(depth(), n % 3 - 1, -1)
+        np.save(f"depth.{n:04d}.npy", (edge * (1 + 0.01 * torch.randn(edge.shape, generator=generator))).numpy())
+
+
+def test_steady_depth_flickers_less_and_parts_are_those_of_the_whole(scene: Path) -> None:
+    flickering(12)
+    arguments = ("shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "2", *LENS)
+    run(*arguments)
+    given = torch.cat([pixels(f"out.{n:04d}.exr") for n in range(1, 13)])
+    run(*arguments, "--steady")
+    steady = torch.cat([pixels(f"out.{n:04d}.exr") for n in range(1, 13)])
+    assert (steady[6:] - steady[5:-1]).square().mean() < (given[6:] - given[5:-1]).square().mean() / 9
+    run("shot.####.exr", "depth.####.npy", "-o", "part.####.exr", *arguments[4:], "--steady", "--frames", "7-9")
+    for n in (3, 8, 12):
+        (scene / f"out.{n:04d}.exr").unlink()
+    run(*arguments, "--steady", "--resume")
+    assert torch.equal(torch.cat([pixels(f"out.{n:04d}.exr") for n in range(1, 13)]), steady)
+    assert torch.equal(torch.cat([pixels(f"part.{n:04d}.exr") for n in range(7, 10)]), steady[6:9])
+
+
+def test_steady_needs_a_sequence_and_metres(scene: Path) -> None:
+    sequence()
+    message = run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", "--steady", code=2)
+    assert "image.exr: is a single image" in message
+    coc = ("shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--depth-kind", "coc", "--steady")
+    assert "--steady filters depth in metres" in run(*coc, code=2)
+
+
 def test_frames_choose_a_part_of_a_sequence(scene: Path) -> None:
     sequence()
     run("shot.####.exr", "depth.npy", "-o", "out.####.exr", "--focus-m", "2", "--frames", "2-3")

@@ -22,9 +22,40 @@ from ..validation import image_and_map
 from .doubts import Said
 from .settings import RenderSettings
 
-__all__ = ["render_frame", "tint_focus"]
+__all__ = ["Frame", "read_frame", "render_frame", "tint_focus"]
 
 _NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """An image and its depth, as read.
+
+    Args:
+        picture: The image.
+        values: ``[1, 1, H, W]``, depth in metres (signed pixels for coc) without holes.
+        holes: How many holes were filled.
+    """
+
+    picture: Picture
+    values: Tensor
+    holes: int
+
+
+def read_frame(image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, settings: RenderSettings) -> Frame:
+    """Reads an image and its depth.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        settings: What the user said.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read.
+    """
+    picture = read_image(image, settings.transfer, settings.layer)
+    return Frame(picture, *_depth(image, depth, picture, settings))
 
 
 def render_frame(
@@ -34,6 +65,7 @@ def render_frame(
     settings: RenderSettings,
     frame: int = 0,
     said: Said | None = None,
+    source: Frame | None = None,
 ) -> str:
     """Reads an image and its depth, blurs, and writes the result whole or not at all.
 
@@ -44,6 +76,7 @@ def render_frame(
         settings: What the user said.
         frame: Number of the frame, for focus that moves.
         said: What was warned of in frames before; None warns of everything.
+        source: What is in ``image`` and ``depth`` where it was read already.
 
     Returns:
         One line that says what was done, with what, and how long it took.
@@ -56,10 +89,10 @@ def render_frame(
     if any(Path(source).resolve() == Path(out).resolve() for source in (image, depth) if source is not None):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
     start = time.perf_counter()
-    picture = read_image(image, settings.transfer, settings.layer)
+    source = read_frame(image, depth, settings) if source is None else source
+    picture, holes = source.picture, source.holes
     height, width = picture.pixels.shape[-2:]
-    values, holes = _depth(image, depth, picture, settings)
-    values = values.to(settings.device)
+    values = source.values.to(settings.device)
     parts: list[str] = []
     remarks: list[str] = []
     if settings.depth_kind == "coc":

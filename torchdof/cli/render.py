@@ -1,8 +1,9 @@
 """``torchdof render``: its options, and the frames it goes through."""
 
 import contextlib
+import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,13 +18,15 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from torch import Tensor
 
 from ..depth.holes import Fill
 from ..depth.sanity import Doubt
+from ..depth.steady import SteadyFrames
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
 from .doubts import Said
-from .frame import render_frame
+from .frame import Frame, read_frame, render_frame
 from .settings import RenderSettings, load_table, pick_device
 
 __all__ = ["parse_fill", "parse_point", "parse_range", "render"]
@@ -181,6 +184,14 @@ def render(
     frames: Annotated[
         str | None, typer.Option(metavar="FIRST-LAST", help="Part of a sequence.", rich_help_panel=_FILES)
     ] = None,
+    steady: Annotated[
+        bool,
+        typer.Option(
+            "--steady",
+            help="Filter the depth of a sequence along time, where neither image nor depth moved.",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Render only the frames that OUT lacks.", rich_help_panel=_FILES)
     ] = False,
@@ -198,6 +209,9 @@ def render(
     A sequence, its focus pulled from 2 m to 5.5 m; --resume goes on after an interruption:
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
+
+    --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
+    rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
 
     A stereo disparity map with holes (scale: baseline in metres * focal length in pixels):
 
@@ -242,9 +256,9 @@ def render(
         strict=strict,
     )
     if FramePattern.matches(image):
-        _render_sequence(image, depth, out, settings, frames, resume)
+        _render_sequence(image, depth, out, settings, frames, resume, steady)
         return
-    if FramePattern.matches(out) or (depth is not None and FramePattern.matches(depth)) or frames is not None:
+    if FramePattern.matches(out) or (depth is not None and FramePattern.matches(depth)) or frames is not None or steady:
         raise ValueError(f"{image}: is a single image; for a sequence write it as shot.####.exr")
     if len(settings.focus or []) > 1:
         raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
@@ -258,7 +272,13 @@ def render(
 
 
 def _render_sequence(
-    image: Path, depth: Path | None, out: Path, settings: RenderSettings, frames: str | None, resume: bool
+    image: Path,
+    depth: Path | None,
+    out: Path,
+    settings: RenderSettings,
+    frames: str | None,
+    resume: bool,
+    steady: bool,
 ) -> None:
     """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
     source, target = FramePattern(image), FramePattern(out)
@@ -287,13 +307,38 @@ def _render_sequence(
     said = Said(settings.strict)
     if settings.depth_kind == "relative" and settings.value_range is None and len(numbers) > 1:
         said.say(depth or image, [_EACH_ITS_OWN])
+    steadied = _steadied(source, depths, depth, settings) if steady else None
     with _progress() as progress:
         task = progress.add_task("rendering", total=len(todo))
         for n in todo:
             depth_n = depths.name(n) if depths else depth
-            line = render_frame(source.name(n), depth_n, target.name(n), settings, n, said)
+            read = steadied(n) if steadied else None
+            line = render_frame(source.name(n), depth_n, target.name(n), settings, n, said, read)
             typer.echo(line)
             progress.advance(task)
+
+
+def _steadied(
+    source: FramePattern, depths: FramePattern | None, depth: Path | None, settings: RenderSettings
+) -> Callable[[int], Frame]:
+    """Reads frames by their number, with the depth that frames before them steadied, whichever are asked for."""
+    if settings.depth_kind == "coc":
+        raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
+    numbers = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
+    latest: list[Frame] = []
+
+    def read(place: int) -> tuple[Tensor, Tensor]:
+        n = numbers[place]
+        latest[:] = [read_frame(source.name(n), depths.name(n) if depths else depth, settings)]
+        return latest[0].picture.pixels, latest[0].values
+
+    frames = SteadyFrames(read)
+
+    def steadied(number: int) -> Frame:
+        values = frames.depth(numbers.index(number))
+        return dataclasses.replace(latest[0], values=values)
+
+    return steadied
 
 
 @contextlib.contextmanager

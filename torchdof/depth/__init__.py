@@ -1,14 +1,17 @@
-"""Whatever depth people have, as metres along the optical axis: kinds of numbers, holes, files, sanity."""
+"""Whatever depth people have, as metres along the optical axis: kinds of numbers, holes, files, sanity, shots."""
 
 from .holes import fill_holes
 from .kinds import depth_from_values
 from .reading import read_depth
 from .relative import Scale, from_relative, solve_scale
 from .sanity import DepthWarning, check
+from .steady import Steady, SteadyFrames
 
 __all__ = [
     "DepthWarning",
     "Scale",
+    "Steady",
+    "SteadyFrames",
     "check",
     "depth_from_values",
     "fill_holes",

@@ -8,7 +8,7 @@ __all__ = ["motion_between", "sample", "shifted"]
 
 _COARSEST_PX, _LEVELS = 24, 5
 _BLOCK = 7
-_GAIN = 0.3  # share of the difference that a fraction must explain: what stands still, stands still
+_GAIN = 0.05  # share of the difference that a fraction must explain: what stands still, stands still
 _NOISE = 1e-4  # squared difference that tells nothing
 _STILL = 1e-3  # share of pixels that may change before motion is looked for
 
