@@ -22,7 +22,7 @@ from ..validation import image_and_map
 from .doubts import Said
 from .settings import RenderSettings
 
-__all__ = ["Frame", "read_frame", "render_frame", "tint_focus"]
+__all__ = ["Frame", "read_frame", "read_metres", "render_frame", "tint_focus"]
 
 _NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
 
@@ -55,7 +55,8 @@ def read_frame(image: str | os.PathLike[str], depth: str | os.PathLike[str] | No
         OSError: If a file cannot be read.
     """
     picture = read_image(image, settings.transfer, settings.layer)
-    return Frame(picture, *_depth(image, depth, picture, settings))
+    values = read_metres(image, depth, picture, settings)
+    return Frame(picture, *resolve_holes(values, str(image if depth is None else depth), settings.fill))
 
 
 def render_frame(
@@ -166,10 +167,21 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
     return torch.cat([tinted, alpha], dim=1)
 
 
-def _depth(
+def read_metres(
     image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, picture: Picture, settings: RenderSettings
-) -> tuple[Tensor, int]:
-    """Depth in metres (or coc) without holes, ``[1, 1, H, W]``, and how many holes there were."""
+) -> Tensor:
+    """Depth in metres (signed pixels for coc) as the file has it, ``[1, 1, H, W]``, NaN in holes.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        picture: What is in the image file.
+        settings: What the user said.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read.
+    """
     if depth is not None:
         values = read_values(depth, settings.depth_channel)
     elif settings.depth_channel is not None:
@@ -186,7 +198,7 @@ def _depth(
         raise ValueError(f"{name}: depth is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
     if settings.depth_kind == "relative" and settings.near_m is not None and settings.far_m is not None:
         try:
-            result = from_relative(
+            return from_relative(
                 values,
                 settings.near_m,
                 settings.far_m,
@@ -196,7 +208,6 @@ def _depth(
             )
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
-        return resolve_holes(result, name, settings.fill)
     fov_x_deg = settings.fov_x_deg
     if settings.depth_kind == "distance" and fov_x_deg is None:
         facts = camera_facts(picture.metadata, values.shape[-1])
@@ -205,7 +216,7 @@ def _depth(
         if focal_mm is None or sensor_mm is None:
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
         fov_x_deg = 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
-    result = depth_from_values(
+    return depth_from_values(
         values,
         settings.depth_kind,
         scale=settings.depth_scale,
@@ -213,4 +224,3 @@ def _depth(
         unknown=settings.depth_unknown,
         fov_x_deg=fov_x_deg,
     )
-    return resolve_holes(result, name, settings.fill)

@@ -1,6 +1,7 @@
 """Whatever depth people have, as metres along the optical axis: kinds of numbers, holes, files, sanity, shots."""
 
 from .holes import fill_holes
+from .inspect import DepthReport, inspect_depth
 from .kinds import depth_from_values
 from .reading import read_depth
 from .relative import Scale, from_relative, solve_scale
@@ -8,6 +9,7 @@ from .sanity import DepthWarning, check
 from .steady import Steady, SteadyFrames
 
 __all__ = [
+    "DepthReport",
     "DepthWarning",
     "Scale",
     "Steady",
@@ -16,6 +18,7 @@ __all__ = [
     "depth_from_values",
     "fill_holes",
     "from_relative",
+    "inspect_depth",
     "read_depth",
     "solve_scale",
 ]
