@@ -11,14 +11,14 @@ import dataclasses
 import time
 from pathlib import Path
 
-import OpenImageIO as oiio
 import torch
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from torch import Tensor
 
 import torchdof
+from torchdof.depth.inspect import coc_colours
 from torchdof.depth.reading import read_depth
-from torchdof.io.images import Picture, read_image, write_image
+from torchdof.io.images import read_image, write_image
+from torchdof.io.sheet import write_sheet
 
 FOCUS_M = {"near": 2.3, "middle": 3.1, "far": 4.6}
 FOCAL_PX, BASELINE_M, DISPARITY_OFFSET_PX = 994.978, 0.193001, 31.086
@@ -72,29 +72,6 @@ def main() -> None:
                 f"field of view {fov_x_deg:.1f} degrees, blur radius up to {float(coc_px.abs().max()):.1f} px, disc, "
                 f"{width} x {height}: {seconds:.2f} s -> {arguments.out / name}.png, {name}_sheet.png"
             )
-
-
-def coc_colours(coc_px: Tensor) -> Tensor:
-    """A signed map ``[1, 1, H, W]`` in colour: orange in front, black in focus, blue behind; linear light."""
-    size = (coc_px / coc_px.abs().max().clamp(min=1e-6)).clamp(-1, 1)
-    near, far = torch.tensor([1.0, 0.35, 0.02]), torch.tensor([0.05, 0.3, 1.0])
-    return size.clamp(max=0).neg() * near[:, None, None] + size.clamp(min=0) * far[:, None, None]
-
-
-def write_sheet(path: Path, panels: dict[str, Tensor], margin: int = 8, caption: int = 34) -> None:
-    """Panels ``[1, 3, H, W]`` in linear light side by side, each with its caption above."""
-    height, width = next(iter(panels.values())).shape[-2:]
-    sheet = torch.full((1, 3, height + caption + margin, len(panels) * (width + margin) + margin), 0.8)
-    for k, panel in enumerate(panels.values()):
-        left = margin + k * (width + margin)
-        sheet[:, :, caption : caption + height, left : left + width] = panel
-    buffer = oiio.ImageBuf(sheet[0].permute(1, 2, 0).contiguous().numpy())  # [3, H, W] -> [H, W, 3]
-    for k, text in enumerate(panels):
-        oiio.ImageBufAlgo.render_text(
-            buffer, margin + k * (width + margin), caption - 11, text, 20, "", (0.0, 0.0, 0.0)
-        )
-    pixels = torch.from_numpy(buffer.get_pixels(oiio.FLOAT)).permute(2, 0, 1)[None]
-    write_image(path, Picture(pixels, sample="8", transfer="srgb"))
 
 
 if __name__ == "__main__":

@@ -161,6 +161,53 @@ def test_ready_circles_of_confusion_need_no_camera(scene: Path) -> None:
     assert "focus" not in line and "blur radius up to 3.0 px" in line
 
 
+def test_relative_depth_lies_between_near_and_far(scene: Path) -> None:
+    relative = np.where(depth()[0, 0].numpy() == 2.0, 200, 10).astype(np.uint8)
+    store("relative.png", relative[..., None], "uint8", ("Y",))
+    options = ("--depth-kind", "relative", "--near-m", "2", "--far-m", "6", "--focus-m", "2", *LENS)
+    run("image.exr", "relative.png", "-o", "a.exr", *options)
+    run("image.exr", "depth.npy", "-o", "b.exr", "--focus-m", "2", *LENS)
+    torch.testing.assert_close(pixels("a.exr"), pixels("b.exr"), rtol=0, atol=1e-5)
+    run("image.exr", "relative.png", "-o", "c.exr", *options, "--relative-kind", "depth")
+    assert not torch.equal(pixels("c.exr"), pixels("a.exr"))
+    run("image.exr", "relative.png", "-o", "d.exr", *options, "--value-range", "10,200")
+    assert torch.equal(pixels("d.exr"), pixels("a.exr"))
+
+
+def test_frames_of_relative_depth_without_a_range_are_warned_of_once(scene: Path) -> None:
+    sequence()
+    options = ("--depth-kind", "relative", "--near-m", "2", "--far-m", "6", "--focus-m", "2", *LENS)
+    arguments = ["render", "shot.####.exr", "depth.####.npy", "-o", "o.####.exr", *options, "--relative-kind", "depth"]
+    told = CliRunner().invoke(app, arguments)
+    assert told.exit_code == 0 and told.stderr.count("warning: ") == 1 and "--value-range LOW,HIGH" in told.stderr
+    assert CliRunner().invoke(app, [*arguments, "--value-range", "2,6"]).stderr == ""
+
+
+def test_unit_mistake_is_one_warning_a_sequence_and_an_error_where_strict(scene: Path) -> None:
+    sequence()
+    for n in range(1, 4):
+        np.save(f"depth.{n:04d}.npy", depth().numpy() * 1000)
+    arguments = ["render", "shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "3", *LENS]
+    told = CliRunner().invoke(app, arguments)
+    assert told.exit_code == 0 and len(list(scene.glob("out.*"))) == 3
+    assert told.stderr.startswith("warning: shot.0001.exr: nothing is in focus") and told.stderr.count("\n") == 1
+    assert "is it millimetres (--depth-scale 0.001)" in told.stderr
+    for path in scene.glob("out.*"):
+        path.unlink()
+    message = run(*arguments[1:], "--strict", code=2)
+    assert message.startswith("error: shot.0001.exr: nothing is in focus") and list(scene.glob("out.*")) == []
+    assert CliRunner().invoke(app, [*arguments, "--depth-scale", "0.001", "--focus-m", "2"]).stderr == ""
+
+
+def test_warnings_of_depth_can_be_silenced(scene: Path) -> None:
+    np.save("depth.npy", depth().numpy() * 1000)
+    arguments = ["render", "image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "3", *LENS]
+    told = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "torchdof", *arguments], capture_output=True, text=True
+    )
+    assert told.returncode == 0 and told.stderr == ""
+
+
 @pytest.mark.parametrize(
     ("options", "arguments"),
     [
@@ -275,6 +322,38 @@ def test_resume_renders_only_what_is_missing(scene: Path) -> None:
     assert os.stat("out.0001.exr").st_mtime == 1
 
 
+def flickering(count: int) -> None:
+    generator = torch.Generator().manual_seed(2)
+    for n in range(1, count + 1):
+        write_image(f"shot.{n:04d}.exr", Picture(image(), sample="float"))
+        edge = torch.roll(depth(), n % 3 - 1, -1)
+        np.save(f"depth.{n:04d}.npy", (edge * (1 + 0.01 * torch.randn(edge.shape, generator=generator))).numpy())
+
+
+def test_steady_depth_flickers_less_and_parts_are_those_of_the_whole(scene: Path) -> None:
+    flickering(12)
+    arguments = ("shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "2", *LENS)
+    run(*arguments)
+    given = torch.cat([pixels(f"out.{n:04d}.exr") for n in range(1, 13)])
+    run(*arguments, "--steady")
+    steady = torch.cat([pixels(f"out.{n:04d}.exr") for n in range(1, 13)])
+    assert (steady[6:] - steady[5:-1]).square().mean() < (given[6:] - given[5:-1]).square().mean() / 9
+    run("shot.####.exr", "depth.####.npy", "-o", "part.####.exr", *arguments[4:], "--steady", "--frames", "7-9")
+    for n in (3, 8, 12):
+        (scene / f"out.{n:04d}.exr").unlink()
+    run(*arguments, "--steady", "--resume")
+    assert torch.equal(torch.cat([pixels(f"out.{n:04d}.exr") for n in range(1, 13)]), steady)
+    assert torch.equal(torch.cat([pixels(f"part.{n:04d}.exr") for n in range(7, 10)]), steady[6:9])
+
+
+def test_steady_needs_a_sequence_and_metres(scene: Path) -> None:
+    sequence()
+    message = run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "2", "--steady", code=2)
+    assert "image.exr: is a single image" in message
+    coc = ("shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--depth-kind", "coc", "--steady")
+    assert "--steady filters depth in metres" in run(*coc, code=2)
+
+
 def test_frames_choose_a_part_of_a_sequence(scene: Path) -> None:
     sequence()
     run("shot.####.exr", "depth.npy", "-o", "out.####.exr", "--focus-m", "2", "--frames", "2-3")
@@ -322,6 +401,16 @@ def test_missing_depth_frame_is_found_before_anything_is_rendered(scene: Path) -
             "--depth-kind distance needs --fov-deg",
         ),
         (("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "coc"), "--depth-kind coc is the blur itself"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "relative", "--near-m", "1"),
+            "--depth-kind relative needs --near-m and --far-m",
+        ),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--near-m", "1"), "add --depth-kind relative"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "relative", "--near-m", "5", "--far-m", "1"),
+            "depth.npy: near_m must be nearer than far_m",
+        ),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--value-range", "3"), "--value-range expects LOW,HIGH"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--layer", "b"), "image.exr: has no layer 'b'"),
         (("image.exr", "small.npy", "--focus-m", "2"), "small.npy: depth is 3 x 4 pixels and the image 24 x 16"),
         (("image.exr", "depth.####.npy", "--focus-m", "2"), "image.exr: is a single image"),

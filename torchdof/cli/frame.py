@@ -11,6 +11,8 @@ from torch import Tensor
 
 from ..depth.holes import resolve_holes
 from ..depth.kinds import depth_from_values
+from ..depth.relative import from_relative
+from ..depth.sanity import coc_doubts, depth_doubts
 from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
@@ -18,11 +20,44 @@ from ..module import blur_by_coc, depth_of_field
 from ..optics.blur_table import BlurTable
 from ..options import Options
 from ..validation import image_and_map, same_aspect
+from .doubts import Said
 from .settings import RenderSettings
 
-__all__ = ["render_frame", "tint_focus"]
+__all__ = ["Frame", "read_frame", "read_metres", "render_frame", "tint_focus"]
 
 _NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """An image and its depth, as read.
+
+    Args:
+        picture: The image.
+        values: ``[1, 1, H, W]``, depth in metres (signed pixels for coc) without holes.
+        holes: How many holes were filled.
+    """
+
+    picture: Picture
+    values: Tensor
+    holes: int
+
+
+def read_frame(image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, settings: RenderSettings) -> Frame:
+    """Reads an image and its depth.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        settings: What the user said.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read.
+    """
+    picture = read_image(image, settings.transfer, settings.layer)
+    values = read_metres(image, depth, picture, settings)
+    return Frame(picture, *resolve_holes(values, str(image if depth is None else depth), settings.fill))
 
 
 def render_frame(
@@ -31,6 +66,8 @@ def render_frame(
     out: str | os.PathLike[str],
     settings: RenderSettings,
     frame: int = 0,
+    said: Said | None = None,
+    source: Frame | None = None,
 ) -> str:
     """Reads an image and its depth, blurs, and writes the result whole or not at all.
 
@@ -40,30 +77,35 @@ def render_frame(
         out: File to write.
         settings: What the user said.
         frame: Number of the frame, for focus that moves.
+        said: What was warned of in frames before; None warns of everything.
+        source: What is in ``image`` and ``depth`` where it was read already.
 
     Returns:
         One line that says what was done, with what, and how long it took.
 
     Raises:
-        ValueError: If input is wrong or missing.
+        ValueError: If input is wrong or missing, or looks like a mistake and the settings are strict.
         OSError: If a file cannot be read or written.
     """
+    said = Said(settings.strict) if said is None else said
     if any(Path(source).resolve() == Path(out).resolve() for source in (image, depth) if source is not None):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
     start = time.perf_counter()
-    picture = read_image(image, settings.transfer, settings.layer)
+    source = read_frame(image, depth, settings) if source is None else source
+    picture, holes = source.picture, source.holes
     height, width = picture.pixels.shape[-2:]
-    values, holes = _depth(image, depth, picture, settings)
-    values = values.to(settings.device)
+    values = source.values.to(settings.device)
     parts: list[str] = []
     remarks: list[str] = []
     if settings.depth_kind == "coc":
         camera, coc_px = None, values
+        said.say(image, coc_doubts(coc_px))
     else:
         camera, remarks = settings.camera(picture.metadata, width, frame)
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
+        said.say(image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
         parts.append(
             f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
             f"{camera.sensor_width_mm:.4g} mm"
@@ -128,10 +170,21 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
     return torch.cat([tinted, alpha], dim=1)
 
 
-def _depth(
+def read_metres(
     image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, picture: Picture, settings: RenderSettings
-) -> tuple[Tensor, int]:
-    """Depth in metres (or coc) without holes, ``[1, 1, H, W]``, and how many holes there were."""
+) -> Tensor:
+    """Depth in metres (signed pixels for coc) as the file has it, ``[1, 1, H, W]``, NaN in holes.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        picture: What is in the image file.
+        settings: What the user said.
+
+    Raises:
+        ValueError: If input is wrong or missing.
+        OSError: If a file cannot be read.
+    """
     if depth is not None:
         values = read_values(depth, settings.depth_channel)
     elif settings.depth_channel is not None:
@@ -148,6 +201,16 @@ def _depth(
         raise ValueError(f"{name}: coc is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
     try:
         same_aspect(picture.pixels, values)
+        if settings.depth_kind == "relative" and settings.near_m is not None and settings.far_m is not None:
+            metres = from_relative(
+                values,
+                settings.near_m,
+                settings.far_m,
+                settings.relative_kind or "disparity",
+                value_range=settings.value_range,
+                unknown=settings.depth_unknown,
+            )
+            return at_size_of(picture.pixels, metres)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
     fov_x_deg = settings.fov_x_deg
@@ -158,7 +221,7 @@ def _depth(
         if focal_mm is None or sensor_mm is None:
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
         fov_x_deg = 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
-    result = depth_from_values(
+    metres = depth_from_values(
         values,
         settings.depth_kind,
         scale=settings.depth_scale,
@@ -166,5 +229,4 @@ def _depth(
         unknown=settings.depth_unknown,
         fov_x_deg=fov_x_deg,
     )
-    result, holes = resolve_holes(result, name, settings.fill)
-    return result if settings.depth_kind == "coc" else at_size_of(picture.pixels, result), holes
+    return metres if settings.depth_kind == "coc" else at_size_of(picture.pixels, metres)

@@ -20,6 +20,7 @@ _MODULES = {
     "fit": "torchdof.cli.fit",
     "export": "torchdof.cli.export",
     "bench": "torchdof.cli.bench",
+    "inspect": "torchdof.cli.inspect",
 }
 
 
@@ -89,7 +90,7 @@ def _imported(name: str) -> Any:
 
         single.command(name, help=message)(function)
     else:
-        single.command(name, no_args_is_help=name == "render")(function)
+        single.command(name, no_args_is_help=name in ("render", "inspect"))(function)
     return typer.main.get_command(single)
 
 

@@ -1,8 +1,9 @@
 """``torchdof render``: its options, and the frames it goes through."""
 
 import contextlib
+import dataclasses
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,15 +18,24 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from torch import Tensor
 
 from ..depth.holes import Fill
+from ..depth.sanity import Doubt
+from ..depth.steady import SteadyFrames
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
-from .frame import render_frame
+from .doubts import Said
+from .frame import Frame, read_frame, render_frame
 from .settings import RenderSettings, load_table, pick_device
 
-__all__ = ["render"]
+__all__ = ["parse_fill", "parse_point", "parse_range", "render"]
 
+_EACH_ITS_OWN = Doubt(
+    "range",
+    "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
+    "far have in all frames: --value-range LOW,HIGH",
+)
 _LENS, _DEPTH, _BLUR, _FILES = "Focus and lens", "Depth map", "Blur", "Files and frames"
 
 
@@ -70,11 +80,12 @@ def render(
         float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=_LENS)
     ] = None,
     depth_kind: Annotated[
-        Literal["z", "distance", "disparity", "inverse", "coc"],
+        Literal["z", "distance", "disparity", "inverse", "relative", "coc"],
         typer.Option(
             help="What the numbers are: z along the optical axis or distance along the ray, in metres after scale * "
-            "(value + offset); disparity or inverse depth, in metres after scale / (value + offset); or coc, the "
-            "signed blur radius in pixels (negative is near).",
+            "(value + offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as "
+            "estimators give it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is "
+            "near).",
             rich_help_panel=_DEPTH,
         ),
     ] = "z",
@@ -82,6 +93,34 @@ def render(
         float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_DEPTH)
     ] = None,
     depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_DEPTH)] = 0.0,
+    near_m: Annotated[
+        float | None, typer.Option(help="Distance of the nearest value of relative depth.", rich_help_panel=_DEPTH)
+    ] = None,
+    far_m: Annotated[
+        float | None, typer.Option(help="Distance of its farthest value (inf allowed).", rich_help_panel=_DEPTH)
+    ] = None,
+    relative_kind: Annotated[
+        Literal["disparity", "inverse", "depth"] | None,
+        typer.Option(
+            help="What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the "
+            "default), or depth, larger is farther (Marigold).",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = None,
+    value_range: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOW,HIGH",
+            help="Smallest and largest value of relative depth; default: those of each frame.",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="Refuse what looks like a wrong unit or scale, instead of warning.", rich_help_panel=_DEPTH
+        ),
+    ] = False,
     depth_unknown: Annotated[
         float | None,
         typer.Option(help="A value that means 'not measured', such as 0, -1 or inf.", rich_help_panel=_DEPTH),
@@ -153,6 +192,14 @@ def render(
     frames: Annotated[
         str | None, typer.Option(metavar="FIRST-LAST", help="Part of a sequence.", rich_help_panel=_FILES)
     ] = None,
+    steady: Annotated[
+        bool,
+        typer.Option(
+            "--steady",
+            help="Filter the depth of a sequence along time, where neither image nor depth moved.",
+            rich_help_panel=_DEPTH,
+        ),
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Render only the frames that OUT lacks.", rich_help_panel=_FILES)
     ] = False,
@@ -171,16 +218,24 @@ def render(
 
         torchdof render shot.####.exr -o out.####.exr --focus-m 1:2,48:5.5 --f-number 2 --resume
 
+    --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
+    rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
+
     A stereo disparity map with holes (scale: baseline in metres * focal length in pixels):
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
 
+    Depth from an estimator, which knows near from far but no metres:
+
+        torchdof render photo.jpg depth.png -o out.jpg --depth-kind relative --near-m 1.2 --far-m 8 --focus-m 1.5
+
     The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
-    that is printed says which. Alpha and metadata are kept. A file is written whole or not at all.
+    that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
+    like a wrong unit is said on standard error; with --strict it is refused.
     """
     settings = RenderSettings(
         focus=None if focus_m is None else parse_focus(focus_m),
-        focus_at=None if focus_at is None else _point(focus_at),
+        focus_at=None if focus_at is None else parse_point(focus_at),
         f_number=f_number,
         focal_length_mm=focal_length_mm,
         sensor_width_mm=sensor_width_mm,
@@ -191,7 +246,11 @@ def render(
         depth_offset=depth_offset,
         depth_unknown=depth_unknown,
         depth_channel=depth_channel,
-        fill=None if fill_depth is None else _fill(fill_depth),
+        near_m=near_m,
+        far_m=far_m,
+        relative_kind=relative_kind,
+        value_range=None if value_range is None else parse_range(value_range),
+        fill=None if fill_depth is None else parse_fill(fill_depth),
         depth_edges="as given" if depth_edges == "as-given" else depth_edges,
         table=load_table(table),
         tolerance=tolerance_of_text(tolerance),
@@ -203,11 +262,12 @@ def render(
         sample=bits,
         layer=layer,
         show_focus=show_focus,
+        strict=strict,
     )
     if FramePattern.matches(image):
-        _render_sequence(image, depth, out, settings, frames, resume)
+        _render_sequence(image, depth, out, settings, frames, resume, steady)
         return
-    if FramePattern.matches(out) or (depth is not None and FramePattern.matches(depth)) or frames is not None:
+    if FramePattern.matches(out) or (depth is not None and FramePattern.matches(depth)) or frames is not None or steady:
         raise ValueError(f"{image}: is a single image; for a sequence write it as shot.####.exr")
     if len(settings.focus or []) > 1:
         raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
@@ -221,7 +281,13 @@ def render(
 
 
 def _render_sequence(
-    image: Path, depth: Path | None, out: Path, settings: RenderSettings, frames: str | None, resume: bool
+    image: Path,
+    depth: Path | None,
+    out: Path,
+    settings: RenderSettings,
+    frames: str | None,
+    resume: bool,
+    steady: bool,
 ) -> None:
     """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
     source, target = FramePattern(image), FramePattern(out)
@@ -247,12 +313,41 @@ def _render_sequence(
     todo = [n for n in numbers if not (resume and target.name(n).is_file())]
     if len(todo) < len(numbers):
         typer.echo(f"{len(numbers) - len(todo)} of {len(numbers)} frames are there already")
+    said = Said(settings.strict)
+    if settings.depth_kind == "relative" and settings.value_range is None and len(numbers) > 1:
+        said.say(depth or image, [_EACH_ITS_OWN])
+    steadied = _steadied(source, depths, depth, settings) if steady else None
     with _progress() as progress:
         task = progress.add_task("rendering", total=len(todo))
         for n in todo:
-            line = render_frame(source.name(n), depths.name(n) if depths else depth, target.name(n), settings, n)
+            depth_n = depths.name(n) if depths else depth
+            read = steadied(n) if steadied else None
+            line = render_frame(source.name(n), depth_n, target.name(n), settings, n, said, read)
             typer.echo(line)
             progress.advance(task)
+
+
+def _steadied(
+    source: FramePattern, depths: FramePattern | None, depth: Path | None, settings: RenderSettings
+) -> Callable[[int], Frame]:
+    """Reads frames by their number, with the depth that frames before them steadied, whichever are asked for."""
+    if settings.depth_kind == "coc":
+        raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
+    numbers = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
+    latest: list[Frame] = []
+
+    def read(place: int) -> tuple[Tensor, Tensor]:
+        n = numbers[place]
+        latest[:] = [read_frame(source.name(n), depths.name(n) if depths else depth, settings)]
+        return latest[0].picture.pixels, latest[0].values
+
+    frames = SteadyFrames(read)
+
+    def steadied(number: int) -> Frame:
+        values = frames.depth(numbers.index(number))
+        return dataclasses.replace(latest[0], values=values)
+
+    return steadied
 
 
 @contextlib.contextmanager
@@ -265,7 +360,12 @@ def _progress() -> Iterator[Progress]:
         yield progress
 
 
-def _point(text: str) -> tuple[float, float]:
+def parse_point(text: str) -> tuple[float, float]:
+    """Reads a pixel ``X,Y``.
+
+    Raises:
+        ValueError: If it is none.
+    """
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
@@ -273,7 +373,25 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def _fill(text: str) -> Fill:
+def parse_range(text: str) -> tuple[float, float]:
+    """Reads ``LOW,HIGH``.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--value-range expects LOW,HIGH such as 0,255, got {text!r}") from None
+    return low, high
+
+
+def parse_fill(text: str) -> Fill:
+    """Reads what holes are filled with: a word or metres.
+
+    Raises:
+        ValueError: If it is neither.
+    """
     if text == "nearest" or text == "far":
         return "nearest" if text == "nearest" else "far"
     try:

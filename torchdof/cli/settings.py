@@ -3,13 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from ..depth.edges import DepthEdges
 from ..depth.holes import Fill
 from ..depth.kinds import DepthKind
+from ..depth.relative import RelativeKind
 from ..io.decode import PixelType
 from ..io.metadata import camera_facts
 from ..io.sequence import focus_at_frame
@@ -36,11 +37,17 @@ class RenderSettings:
         sensor_width_mm: Width of the sensor in millimetres.
         fov_x_deg: Horizontal field of view in degrees, of a rendered image.
         aperture_radius_m: Radius of the aperture in metres, with ``fov_x_deg``.
-        depth_kind: What the numbers of the depth map are, see :func:`torchdof.depth.kinds.depth_from_values`.
+        depth_kind: What the numbers of the depth map are, see :func:`torchdof.depth.kinds.depth_from_values`, or
+            "relative".
         depth_scale: Factor of the depth values.
         depth_offset: Added to the depth values first.
         depth_unknown: Value that means "not measured".
         depth_channel: Channel or array that holds depth.
+        near_m: Distance of the nearest value of relative depth, in metres, see
+            :func:`torchdof.depth.relative.from_relative`.
+        far_m: Distance of the farthest.
+        relative_kind: What relative depth is, "disparity" if nothing is said.
+        value_range: The smallest and the largest value of relative depth.
         fill: How to fill holes in the depth; None refuses them.
         depth_edges: What is done to depth edges, as in :class:`torchdof.DepthOfField`.
         table: Blur table.
@@ -53,6 +60,7 @@ class RenderSettings:
         sample: What the result stores a pixel as.
         layer: Layer of an EXR file.
         show_focus: Tint the image by what is in focus instead of blurring it.
+        strict: Refuse what looks like a mistake instead of warning of it.
 
     Raises:
         ValueError: If two of these contradict each other.
@@ -65,11 +73,15 @@ class RenderSettings:
     sensor_width_mm: float | None = None
     fov_x_deg: float | None = None
     aperture_radius_m: float | None = None
-    depth_kind: DepthKind = "z"
+    depth_kind: DepthKind | Literal["relative"] = "z"
     depth_scale: float | None = None
     depth_offset: float = 0.0
     depth_unknown: float | None = None
     depth_channel: str | None = None
+    near_m: float | None = None
+    far_m: float | None = None
+    relative_kind: RelativeKind | None = None
+    value_range: tuple[float, float] | None = None
     fill: Fill | None = None
     depth_edges: DepthEdges = "auto"
     table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
@@ -82,6 +94,7 @@ class RenderSettings:
     sample: PixelType | None = None
     layer: str | None = None
     show_focus: bool = False
+    strict: bool = False
 
     def __post_init__(self) -> None:
         if self.focus is not None and self.focus_at is not None:
@@ -92,6 +105,7 @@ class RenderSettings:
                 raise ValueError(
                     "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
                 )
+        self._check_relative()
         if self.fov_x_deg is None:
             if self.aperture_radius_m is not None:
                 raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
@@ -101,6 +115,21 @@ class RenderSettings:
         number("--fov-deg", self.fov_x_deg, low=0, high=180, unit="degrees")
         if self.f_number is not None and self.aperture_radius_m is not None:
             raise ValueError("--f-number and --aperture-radius-m both say how wide the lens opens; give one of them")
+
+    def _check_relative(self) -> None:
+        """Refuse relative depth without its distances, and what belongs to another kind."""
+        if self.depth_kind == "relative":
+            if self.near_m is None or self.far_m is None:
+                raise ValueError(
+                    "--depth-kind relative needs --near-m and --far-m, the distances of the nearest and the farthest "
+                    "value in metres (--far-m inf for a sky)"
+                )
+            if self.depth_scale is not None or self.depth_offset != 0.0:
+                raise ValueError("--depth-kind relative has no --depth-scale and --depth-offset: near and far say it")
+        elif any(value is not None for value in (self.near_m, self.far_m, self.relative_kind, self.value_range)):
+            raise ValueError(
+                "--near-m, --far-m, --relative-kind and --value-range are for relative depth: add --depth-kind relative"
+            )
 
     def camera(self, metadata: Mapping[str, Any], width: int, frame: int) -> tuple[Camera, list[str]]:
         """The camera of one frame: what the user said, else the file's metadata, else 50 mm, f/2.8 and 36 mm.

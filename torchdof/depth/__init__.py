@@ -1,9 +1,28 @@
-"""Whatever depth people have, as metres along the optical axis: kinds of numbers, holes, files."""
+"""Whatever depth people have, as metres along the optical axis: kinds of numbers, holes, files, sanity, shots."""
 
 from .edges import repair_edges
 from .holes import fill_holes
+from .inspect import DepthReport, inspect_depth
 from .kinds import depth_from_values
 from .reading import read_depth
+from .relative import Scale, from_relative, solve_scale
+from .sanity import DepthWarning, check
 from .size import at_size_of
+from .steady import Steady, SteadyFrames
 
-__all__ = ["at_size_of", "depth_from_values", "fill_holes", "read_depth", "repair_edges"]
+__all__ = [
+    "DepthReport",
+    "DepthWarning",
+    "Scale",
+    "Steady",
+    "SteadyFrames",
+    "at_size_of",
+    "check",
+    "depth_from_values",
+    "fill_holes",
+    "from_relative",
+    "inspect_depth",
+    "read_depth",
+    "repair_edges",
+    "solve_scale",
+]

@@ -11,6 +11,10 @@ from ..validation import number, real_tensor, show
 __all__ = ["DepthKind", "depth_from_values", "number_map"]
 
 DepthKind = Literal["z", "distance", "disparity", "inverse", "coc"]
+_WHOLE = (
+    *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
+    *(torch.int8, torch.int16, torch.int32, torch.int64),
+)
 KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity", "inverse", "coc")
 
 
@@ -62,7 +66,8 @@ def depth_from_values(
         raise ValueError(f"depth values must be [B, 1, H, W], got {list(values.shape)}")
     if kind == "disparity" and scale is None:
         raise ValueError(
-            "disparity needs a scale (--depth-scale): the baseline in metres times the focal length in pixels"
+            "disparity needs a scale (--depth-scale): the baseline in metres times the focal length in pixels; "
+            "where nobody knows it, take it for relative depth: from_relative (--depth-kind relative)"
         )
     scale = 1.0 if scale is None else scale
     for factor in (scale, offset):
@@ -100,7 +105,7 @@ def number_map(name: str, values: Tensor) -> None:
         ValueError: If it is not a tensor of real numbers, or empty.
     """
     # integers are what files hold; of the rest only what arithmetic works on
-    if isinstance(values, Tensor) and values.dtype in (torch.uint8, torch.int16, torch.int32, torch.int64):
+    if isinstance(values, Tensor) and values.dtype in _WHOLE and values.layout == torch.strided:
         values = values.double()
     real_tensor(name, values, "[B, 1, H, W]")
     if not values.numel():

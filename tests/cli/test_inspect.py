@@ -1,0 +1,97 @@
+"""``torchdof inspect`` from the outside."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from torchdof.cli.main import app
+from torchdof.io.images import Picture, read_image, write_image
+
+HEIGHT, WIDTH = 24, 40
+
+
+@pytest.fixture
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with photo.png and depth.npy (2 m left, 6 m right); it is the working folder."""
+    monkeypatch.chdir(tmp_path)
+    image, depth = torch.full((1, 3, HEIGHT, WIDTH), 0.1), np.full((HEIGHT, WIDTH), 2.0)
+    image[..., WIDTH // 2 :], depth[:, WIDTH // 2 :] = 0.6, 6.0
+    write_image("photo.png", Picture(image, sample="8", transfer="srgb"))
+    np.save("depth.npy", depth)
+    return tmp_path
+
+
+def run(*arguments: str, code: int = 0) -> tuple[str, str]:
+    result = CliRunner().invoke(app, ["inspect", *arguments], catch_exceptions=False)
+    assert result.exit_code == code, result.output
+    return result.stdout, result.stderr
+
+
+def test_it_prints_ranges_blur_focus_holes_and_edges_and_writes_a_picture(scene: Path) -> None:
+    out, err = run("photo.png", "depth.npy", "--focus-m", "2", "--f-number", "1.4", "--sensor-width-mm", "4")
+    for words in (
+        "image         40 x 24 px, R, G, B",
+        "f/1.4, focus 2 m, sensor 4 mm",
+        "nearest 2 ",
+        "farthest 6",
+        "holes 0 (0.0 %)",
+        "blur radius   +0.0 to +",
+        "in focus      50.0 %",
+        "####",
+        "depth edges   24 steps between pixels: 100.0 % exact",
+        "picture       photo.inspect.png",
+    ):
+        assert words in out, words
+    assert err == ""
+    sheet = read_image("photo.inspect.png").pixels
+    assert sheet.shape[-1] > 3 * WIDTH and sheet.shape[-2] > HEIGHT
+
+
+def test_without_a_focus_it_is_at_the_median_and_that_is_said(scene: Path) -> None:
+    out, _ = run("photo.png", "depth.npy", "-o", "look.png")
+    assert "focus at the median depth" in out and (scene / "look.png").is_file()
+
+
+def test_holes_are_counted_not_refused(scene: Path) -> None:
+    depth = np.load("depth.npy")
+    depth[:, 18:22] = 0
+    np.save("holed.npy", depth)
+    out, _ = run("photo.png", "holed.npy", "--focus-m", "2")
+    assert "holes 96 (10.0 %)" in out
+    out, _ = run("photo.png", "holed.npy", "--focus-m", "2", "--fill-depth", "nearest")
+    assert "holes 0" in out and "filled        96 holes (10.0 %), nearest" in out
+
+
+def test_unit_mistakes_are_said_and_strictness_makes_them_errors(scene: Path) -> None:
+    np.save("mm.npy", np.load("depth.npy") * 1000)
+    out, err = run("photo.png", "mm.npy", "--focus-m", "3", "--f-number", "1.4", "--sensor-width-mm", "4")
+    assert "picture " in out and err.startswith("warning: mm.npy: nothing is in focus") and "--depth-scale 0.001" in err
+    camera = ("--focus-m", "3", "--f-number", "1.4", "--sensor-width-mm", "4")
+    _, err = run("photo.png", "mm.npy", *camera, "--strict", code=2)
+    assert err.startswith("error: mm.npy: nothing is in focus")
+
+
+def test_relative_depth_is_inspected_between_its_distances(scene: Path) -> None:
+    out, _ = run("photo.png", "depth.npy", "--depth-kind", "relative", "--relative-kind", "depth", "--near-m", "1",
+                 "--far-m", "3")  # fmt: skip
+    assert "nearest 1 " in out and "farthest 3" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("none.png", "depth.npy"), "none.png: there is no such file"),
+        (("photo.png",), "photo.png: has no depth channel"),
+        (("photo.png", "depth.npy", "-o", "photo.png"), "photo.png: is one of the inputs"),
+        (("photo.png", "zeros.npy"), "zeros.npy: no pixel has a depth"),
+        (("photo.png", "depth.npy", "--depth-kind", "disparity"), "disparity needs a scale (--depth-scale)"),
+        (("photo.png", "depth.npy", "--depth-kind", "relative"), "--depth-kind relative needs --near-m and --far-m"),
+    ],
+)
+def test_wrong_input_is_one_sentence_and_exit_code_2(scene: Path, arguments: tuple[str, ...], says: str) -> None:
+    np.save("zeros.npy", np.zeros((HEIGHT, WIDTH)))
+    _, err = run(*arguments, code=2)
+    assert err.startswith("error: ") and says in err and err.count("\n") == 1

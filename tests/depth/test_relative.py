@@ -1,0 +1,173 @@
+"""Relative depth: extremes land on near and far, the law between them holds, points give scale and offset."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchdof.depth import depth_from_values, from_relative, solve_scale
+from torchdof.depth.relative import RELATIVE_KINDS
+
+NAN, INF = math.nan, math.inf
+
+
+def row(*values: float) -> torch.Tensor:
+    return torch.tensor([[[list(values)]]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("disparity", [8.0, 1 / (0.25 / 2 + 0.75 / 8), 2.0]), ("inverse", [8.0, 1 / (0.25 / 2 + 0.75 / 8), 2.0]),
+     ("depth", [2.0, 3.5, 8.0])],
+)  # fmt: skip
+def test_extremes_lie_at_near_and_far_and_the_law_holds_between(kind: Any, expected: list[float]) -> None:
+    depth = from_relative(row(-3.0, -2.0, 1.0), 2.0, 8.0, kind)
+    torch.testing.assert_close(depth, row(*expected))
+
+
+@pytest.mark.parametrize("kind", RELATIVE_KINDS)
+@pytest.mark.parametrize("factor", [1e-6, 1.0, 3e7])
+def test_scale_and_shift_of_the_values_do_not_matter(kind: Any, factor: float) -> None:
+    values = torch.rand(1, 1, 5, 7, dtype=torch.float64)
+    expected = from_relative(values, 1.5, 9.0, kind)
+    torch.testing.assert_close(from_relative(factor * (values - 0.3), 1.5, 9.0, kind), expected)
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.uint8, torch.uint16, torch.int16, torch.int32, torch.int64, torch.uint32, torch.int8]
+)
+def test_whole_numbers_are_taken_as_they_come(dtype: torch.dtype) -> None:
+    values = torch.tensor([[[[0, 30, 127]]]])
+    depth = from_relative(values.to(dtype), 1.0, 4.0)
+    assert depth.dtype == torch.float32
+    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).float())
+
+
+def test_large_whole_numbers_that_lie_close_together_are_told_apart() -> None:
+    values = torch.tensor([[[[2**30, 2**30 + 1, 2**30 + 2]]]], dtype=torch.int32)
+    assert from_relative(values, 1.0, 3.0, "depth").flatten().tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_floating_types_are_kept(dtype: torch.dtype, tolerances: dict[torch.dtype, dict[str, float]]) -> None:
+    values = torch.rand(2, 1, 4, 5).to(dtype)
+    depth = from_relative(values, 1.0, 4.0)
+    assert depth.dtype == dtype
+    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).to(dtype), **tolerances[dtype])
+
+
+def test_holes_stay_holes_and_do_not_stretch_the_range() -> None:
+    depth = from_relative(row(1.0, NAN, 2.0, INF, -INF, 0.0), 1.0, 2.0, "depth", unknown=0.0)
+    torch.testing.assert_close(depth, row(1.0, NAN, 2.0, NAN, NAN, NAN), equal_nan=True)
+
+
+def test_each_item_of_a_batch_has_its_own_extremes() -> None:
+    values = torch.stack([row(0.0, 1.0)[0], row(50.0, 90.0)[0]])
+    assert from_relative(values, 1.0, 2.0).flatten().tolist() == [2.0, 1.0, 2.0, 1.0]
+
+
+def test_a_stated_range_scales_all_frames_alike_and_bounds_them() -> None:
+    depth = from_relative(row(-5.0, 0.0, 50.0, 100.0, 120.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0))
+    assert depth.flatten().tolist() == [1.0, 1.0, 2.0, 3.0, 3.0]
+    assert from_relative(row(50.0), 1.0, 3.0, "depth", value_range=(0.0, 100.0)).item() == 2.0
+
+
+def test_the_farthest_disparity_may_lie_at_infinity_and_passes_no_gradient() -> None:
+    values = row(0.0, 0.5, 1.0, NAN).requires_grad_()
+    depth = from_relative(values, 1.0, INF)
+    assert depth[..., :3].flatten().tolist() == [INF, 2.0, 1.0]
+    depth[depth.isfinite()].sum().backward()
+    assert values.grad is not None and bool(values.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("kind", RELATIVE_KINDS)
+def test_gradients_are_those_of_the_formula(kind: Any) -> None:
+    values = torch.rand(2, 1, 3, 4, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda v: from_relative(v, 1.0, 5.0, kind), values)
+
+
+def test_it_compiles_whole() -> None:
+    values = torch.rand(1, 1, 3, 4)
+    compiled = torch.compile(lambda v: from_relative(v, 1.0, 5.0), fullgraph=True, backend="eager")
+    torch.testing.assert_close(compiled(values), from_relative(values, 1.0, 5.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "arguments", "says"),
+    [
+        (row(1.0, 2.0), (5.0, 1.0), "near_m must be nearer than far_m, got near_m=5 and far_m=1"),
+        (row(1.0, 2.0), (1.0, 1.0), "near_m must be nearer than far_m"),
+        (row(1.0, 2.0), (0.0, 1.0), "near_m must be a number of metres > 0"),
+        (row(1.0, 2.0), (1.0, NAN), "far_m must be a number"),
+        (row(1.0, 2.0), (1.0, INF, "depth"), "far_m must be a number"),
+        (row(1.0, 2.0), (1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
+        (row(3.0, 3.0), (1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
+        (row(3.0), (1.0, 2.0), "two different values"),
+        (row(NAN, INF), (1.0, 2.0), "two different values to tell near from far, got no value"),
+        (torch.ones(3, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
+        (torch.ones(1, 3, 4, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[1, 3, 4, 4\]"),
+        (np.ones((3, 4)), (1.0, 2.0), "got ndarray; convert an array with torch.from_numpy"),
+        (torch.ones(1, 1, 3, 4, dtype=torch.bool), (1.0, 2.0), "got torch.bool"),
+        (torch.ones(1, 1, 0, 4), (1.0, 2.0), "at least one pixel"),
+    ],
+)
+def test_what_makes_no_depth_is_refused(values: Any, arguments: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        from_relative(values, *arguments)
+
+
+@pytest.mark.parametrize("value_range", [(1.0, 1.0), (2.0, 1.0), (0.0, NAN), (1.0,), "0,1"])
+def test_a_range_that_is_none_is_refused(value_range: Any) -> None:
+    with pytest.raises(ValueError, match="value_range"):
+        from_relative(row(1.0, 2.0), 1.0, 2.0, value_range=value_range)
+
+
+@pytest.mark.parametrize("kind", RELATIVE_KINDS)
+def test_two_points_give_scale_and_offset_exactly(kind: Any) -> None:
+    values = torch.rand(1, 1, 20, 30)
+    depth = 0.7 + 3.0 * values if kind == "depth" else 1 / (0.7 * values + 0.1)
+    points = [(x + 0.5, y + 0.5, float(depth[0, 0, y, x])) for x, y in ((3, 4), (25, 11))]
+    scale = solve_scale(values, points, kind, patch=1)
+    torch.testing.assert_close(scale.depth(values), depth, rtol=1e-4, atol=1e-4)
+    as_options = depth_from_values(values, scale.kind, scale=scale.scale, offset=scale.offset)
+    torch.testing.assert_close(as_options, depth, rtol=1e-4, atol=1e-4)
+    assert scale.residual < 1e-5
+
+
+def test_of_many_points_near_ones_do_not_outweigh_far_ones() -> None:
+    generator = torch.Generator().manual_seed(3)
+    values = torch.rand(1, 1, 40, 60, generator=generator)
+    depth = 1 / (0.98 * values + 0.02)  # 1 to 50 m
+    points = []
+    for k in range(40):
+        y, x = k, (7 * k) % 60
+        points.append((x + 0.5, y + 0.5, float(depth[0, 0, y, x]) * (1 + 0.02 * (-1) ** k)))
+    scale = solve_scale(values, points, patch=1)
+    assert scale.residual == pytest.approx(0.02, rel=0.1)
+    assert float((scale.depth(values) / depth - 1).abs().max()) < 0.03
+
+
+def test_a_point_at_infinity_fixes_the_offset() -> None:
+    scale = solve_scale(row(0.5, 1.0, 2.0), [(0.5, 0.5, INF), (2.5, 0.5, 2.0)], patch=1)
+    assert scale.offset == pytest.approx(-0.5) and scale.scale == pytest.approx(3.0)
+    assert scale.depth(row(0.25, NAN))[0, 0, 0, 0] == INF and bool(scale.depth(row(0.25, NAN))[0, 0, 0, 1].isnan())
+
+
+@pytest.mark.parametrize(
+    ("points", "kind", "says"),
+    [
+        ([(0.5, 0.5, 1.0)], "disparity", "at least two points of different values, got 1"),
+        ([(0.5, 0.5, 1.0), (0.6, 0.5, 2.0)], "disparity", "at least two points of different values, got 2"),
+        ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "disparity", "that is kind='depth', not 'disparity'"),
+        ([(0.5, 0.5, 4.0), (2.5, 0.5, 1.0)], "depth", "that is kind='disparity', not 'depth'"),
+        ([(0.5, 0.5, 1.0), (9.5, 0.5, 4.0)], "disparity", "must lie in the map of 3 x 1 pixels"),
+        ([(0.5, 0.5, 0.0), (2.5, 0.5, 4.0)], "disparity", "the distance of a point must be a number of metres > 0"),
+        ([(0.5, 0.5), (2.5, 0.5, 4.0)], "disparity", r"a point must be \(x, y, metres\)"),
+        ([(0.5, 0.5, 1.0), (2.5, 0.5, 4.0)], "z", "must be one of disparity, inverse, depth"),
+    ],
+)
+def test_points_that_give_no_scale_are_refused(points: Any, kind: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        solve_scale(row(1.0, 2.0, 4.0), points, kind, patch=1)

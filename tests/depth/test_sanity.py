@@ -1,0 +1,157 @@
+"""Unit mistakes are said, with the likely cause and the option that mends it; sensible extremes pass in silence."""
+
+import math
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchdof import Camera
+from torchdof.depth import DepthWarning, check, from_relative
+from torchdof.depth.reading import read_depth
+from torchdof.depth.sanity import coc_doubts, depth_doubts
+from torchdof.reference.scenes import read_scenes
+
+SCENES = Path(__file__).parents[1] / "data" / "scenes"
+MOTORCYCLE = Path(__file__).parents[2] / "examples" / "data" / "motorcycle" / "motorcycle_disp.npz"
+INF = math.inf
+
+
+@pytest.fixture(scope="module")
+def metres() -> torch.Tensor:
+    """A real depth map, 2.1 to 5 m."""
+    return read_depth(MOTORCYCLE, "disparity", scale=0.193001 * 994.978, offset=31.086, fill="far")
+
+
+def field(near_m: float, far_m: float) -> torch.Tensor:
+    return from_relative(torch.rand(1, 1, 120, 160, generator=torch.Generator().manual_seed(1)), near_m, far_m)
+
+
+def object_before(depth: torch.Tensor, background_m: float) -> torch.Tensor:
+    depth = depth.clone()
+    depth[..., 60:] = background_m
+    return depth
+
+
+@pytest.mark.parametrize("scene", list(read_scenes(SCENES)), ids=lambda scene: scene.name)
+def test_scenes_with_truth_raise_no_doubt(scene: object) -> None:
+    check(scene.depth, scene.camera, strict=True)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("focus_m", [2.3, 3.1, 4.6])
+def test_the_demo_raises_no_doubt(metres: torch.Tensor, focus_m: float) -> None:
+    check(metres, Camera.from_fov(40.8, 0.04, focus_m), strict=True)
+    check(metres, Camera(focus_m=focus_m), strict=True)
+
+
+@pytest.mark.parametrize(
+    ("depth", "camera"),
+    [
+        pytest.param(field(0.05, 0.3), Camera(50.0, 2.8, 0.1), id="macro"),
+        pytest.param(field(0.03, 0.08), Camera(20.0, 2.8, 0.05), id="within a hand's breadth"),
+        pytest.param(object_before(field(0.199, 0.201), INF), Camera(100.0, 2.8, 0.2), id="life size before infinity"),
+        pytest.param(object_before(field(9.8, 10.2), 200.0), Camera(600.0, 4.0, 10.0), id="a bird"),
+        pytest.param(torch.full((1, 1, 8, 8), INF), Camera(2000.0, 8.0, INF), id="stars"),
+        pytest.param(object_before(field(3.84e8, 3.85e8), INF), Camera(2000.0, 8.0, INF), id="the moon before stars"),
+        pytest.param(field(800.0, 2e4), Camera(35.0, 8.0, INF), id="a landscape"),
+        pytest.param(field(2.0, 50.0), Camera(24.0, 8.0, 5.0), id="all in focus"),
+        pytest.param(field(2.0, 50.0), Camera(24.0, 16.0, 300.0), id="all in focus, focus behind"),
+        pytest.param(torch.full((1, 1, 8, 8), 3.0), Camera(focus_m=3.0), id="a wall"),
+        pytest.param(torch.full((1, 1, 1, 1), 3.0), Camera(focus_m=3.0), id="one pixel"),
+        pytest.param(torch.full((1, 1, 8, 8), math.nan), Camera(focus_m=3.0), id="holes alone"),
+    ],
+)
+def test_sensible_extremes_raise_no_doubt(depth: torch.Tensor, camera: Camera) -> None:
+    check(depth, camera, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("factor", "focus_m", "says"),
+    [
+        (1000.0, 3.0, r"nearer than all depth \(2110 to 5017 m\); is it millimetres \(--depth-scale 0.001\)"),
+        (100.0, 3.0, r"is it centimetres \(--depth-scale 0.01\)"),
+        (0.001, 3.0, r"1000 times too small for metres \(--depth-scale 1000\).*within a hand's breadth"),
+        (1000.0, 3000.0, r"all depth is far .*nothing is blurred; is it millimetres \(--depth-scale 0.001\)"),
+        (1.0, 20.0, r"the focus at 20 m is farther than all depth \(2.11 to 5.017 m\).*--focus-at"),
+        (1.0, 0.5, r"the focus at 0.5 m is nearer than all depth.*disparity \(--depth-kind disparity\)"),
+        (1.0, INF, "the focus at inf m is farther than all depth"),
+        (0.199, 3.0, r"relative depth from 0 to 1, --depth-kind relative --near-m METRES --far-m METRES"),
+    ],
+)
+def test_unit_mistakes_are_named_with_what_mends_them(
+    metres: torch.Tensor, factor: float, focus_m: float, says: str
+) -> None:
+    with pytest.warns(DepthWarning, match=says):
+        check(metres * factor, Camera(focus_m=focus_m))
+    with pytest.raises(ValueError, match=says):
+        check(metres * factor, Camera(focus_m=focus_m), strict=True)
+
+
+def test_whole_millimetres_are_told_whatever_the_focus(metres: torch.Tensor) -> None:
+    with pytest.warns(DepthWarning, match="millimetres"):
+        check((metres * 1000).round(), Camera(focus_m=INF))
+
+
+def test_eight_bits_are_no_metres(metres: torch.Tensor) -> None:
+    relative = (255 * (1 / metres - 1 / metres.max()) / (1 / metres.min() - 1 / metres.max())).round().clamp(min=1)
+    with pytest.warns(DepthWarning, match="files of 8 bits hold.*--depth-kind relative"):
+        check(relative, Camera(focus_m=3.0))
+    with pytest.warns(DepthWarning, match="nothing is in focus.*8 bits.*--depth-kind relative"):
+        check(relative, Camera(focus_m=0.4))
+
+
+def test_disparity_without_its_scale_is_told(metres: torch.Tensor) -> None:
+    (doubt,) = depth_doubts(metres / 192.03, Camera(focus_m=3.0), "inverse")
+    assert "the baseline in metres times the focal length in pixels (--depth-scale, not given)" in doubt.message
+    assert "--depth-kind relative" in doubt.message
+
+
+def test_a_scale_that_was_given_in_vain_is_to_be_left_out(metres: torch.Tensor) -> None:
+    (doubt,) = depth_doubts(metres / 1000, Camera(focus_m=3.0), "z", 0.001)
+    assert "leave --depth-scale out" in doubt.message
+
+
+@pytest.mark.parametrize(
+    ("depth", "camera"),
+    [
+        (field(0.002, 0.005), Camera.from_fov(40.0, 0.01, 0.003)),  # all in millimetres but the opening
+        (field(2.0, 5.0), Camera.from_fov(40.0, 12.0, 3.0)),  # the opening alone
+        (field(2.0, 5.0), Camera(50.0, 0.01, 3.0)),
+    ],
+)
+def test_blur_that_no_lens_makes_is_told(depth: torch.Tensor, camera: Camera) -> None:
+    with pytest.warns(DepthWarning, match="more than a lens makes.*which is in another unit"):
+        check(depth, camera)
+
+
+def test_a_gap_of_depth_around_the_focus_is_told() -> None:
+    depth = object_before(torch.full((1, 1, 120, 160), 1.0), 9.0)
+    with pytest.warns(DepthWarning, match=r"no pixel lies near the focus at 3 m, all \(1 to 9 m\)"):
+        check(depth, Camera(85.0, 1.4, 3.0))
+
+
+def test_of_a_batch_the_item_that_is_wrong_is_found(metres: torch.Tensor) -> None:
+    both = torch.cat([metres, metres * 1000])
+    with pytest.warns(DepthWarning, match="millimetres"):
+        check(both, Camera(focus_m=3.0))
+    check(both, Camera(focus_m=torch.tensor([3.0, INF])), strict=True)
+
+
+def test_the_warning_can_be_filtered(metres: torch.Tensor) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DepthWarning)
+        check(metres * 1000, Camera(focus_m=3.0))
+
+
+def test_depths_given_for_circles_of_confusion_are_told() -> None:
+    assert coc_doubts(torch.linspace(-30, 30, 96).expand(1, 1, 8, 96)) == []
+    (doubt,) = coc_doubts(torch.linspace(800, 5000, 96).expand(1, 1, 8, 96))
+    assert "--depth-kind" in doubt.message
+
+
+def test_what_is_no_depth_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"depth must be \[B, 1, H, W\] in metres, got \[8, 8\]"):
+        check(torch.ones(8, 8), Camera())
+    with pytest.raises(ValueError, match="floating-point"):
+        check(torch.ones(1, 1, 8, 8, dtype=torch.int32), Camera())

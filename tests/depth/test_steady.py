@@ -1,0 +1,242 @@
+"""Depth along time: flicker sinks, what moves does not smear, and parts of a shot come out as the whole."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from torchdof import Camera, depth_of_field
+from torchdof.depth import Steady, SteadyFrames
+from torchdof.depth.motion import motion_between, shifted
+from torchdof.reference.metrics import display
+
+HEIGHT, WIDTH, SCALE = 64, 112, 3  # pixels, and samples along each side of one
+CAMERA = Camera(focal_length_mm=50.0, f_number=1.8, focus_m=3.0)
+Shot = list[tuple[Tensor, Tensor]]
+
+
+def texture(seed: int, mean: tuple[float, float, float]) -> Callable[[Tensor, Tensor], Tensor]:
+    """An endless picture of light and dark spots of 4 to 40 pixels, at places x, y."""
+    generator = torch.Generator().manual_seed(seed)
+    size, light = 400, torch.ones(1, 3, 400, 400)
+    for spot, contrast in ((4, 0.4), (10, 0.6), (40, 0.6)):
+        noise = torch.rand(1, 3, size // spot, size // spot, generator=generator) - 0.5
+        light = light + contrast * F.interpolate(noise, size=(size, size), mode="bicubic")
+    light = light.clamp(min=0.05) * torch.tensor(mean).reshape(1, 3, 1, 1)
+
+    def at(x: Tensor, y: Tensor) -> Tensor:
+        grid = torch.stack([x / size * 2 - 1, y / size * 2 - 1], dim=-1)[None]
+        return F.grid_sample(light, grid, padding_mode="reflection", align_corners=False)[0]
+
+    return at
+
+
+WALL, BARS, BALL = texture(0, (0.4, 0.35, 0.3)), texture(1, (0.2, 0.5, 0.3)), texture(2, (0.6, 0.3, 0.2))
+
+
+def shot(frames: int, pan_px: float = 0.0, ball_px: float = 0.0, cut: int = 10**6, toward: float = 0.0) -> Shot:
+    """Bars at 3 m before a slanted wall at 8 m, and a ball at 1.5 m: images and exact depths.
+
+    Args:
+        frames: How many.
+        pan_px: Motion of wall and bars a frame.
+        ball_px: Motion of the ball a frame.
+        cut: Frame at which wall and bars change places.
+        toward: Share of their distance by which wall and bars come nearer in each frame.
+    """
+    made = []
+    for t in range(frames):
+
+        def bar(x: Tensor, y: Tensor, t: int = t) -> Tensor:
+            return ((x + pan_px * t + 0.2 * y) % 45 < 9) ^ (t >= cut)
+
+        def ball(x: Tensor, y: Tensor, t: int = t) -> Tensor:
+            return (x - 30 - ball_px * t) ** 2 + (y - 30) ** 2 < 14**2
+
+        y, x = torch.meshgrid(*((torch.arange(n * SCALE) + 0.5) / SCALE for n in (HEIGHT, WIDTH)), indexing="ij")
+        light = torch.where(bar(x, y), BARS(x + pan_px * t, y), WALL(x + pan_px * t, y))
+        light = torch.where(ball(x, y), BALL(x - ball_px * t, y), light)
+        y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in (HEIGHT, WIDTH)), indexing="ij")
+        depth = torch.where(bar(x, y), 3.0, 8.0 + 0.01 * x) * (1 - toward) ** t
+        depth = torch.where(ball(x, y), 1.5, depth)
+        made.append((F.avg_pool2d(light[None], SCALE), depth[None, None]))
+    return made
+
+
+def as_estimated(depth: Tensor, frame: int, noise: float = 0.01, blocks: bool = False) -> Tensor:
+    """Depth with noise, its edges a pixel off: all by the same, or each block of 8 by its own."""
+    generator = torch.Generator().manual_seed(1000 + frame)
+    size = (HEIGHT // 8, WIDTH // 8) if blocks else (1, 1)
+    jitter = torch.randint(-1, 2, (1, 2, *size), generator=generator).float()
+    depth = shifted(depth, F.interpolate(jitter, size=(HEIGHT, WIDTH), mode="nearest"))
+    return depth * (1 + noise * torch.randn(depth.shape, generator=generator))
+
+
+def steadied(frames: Shot) -> list[Tensor]:
+    steady = Steady()
+    return [steady(image, depth) for image, depth in frames]
+
+
+def rms(values: Tensor) -> float:
+    return float(values.double().square().mean().sqrt())
+
+
+def steps(pictures: list[Tensor]) -> float:
+    """RMS of the difference of neighbouring frames."""
+    stack = torch.cat(pictures)
+    return rms(stack[1:] - stack[:-1])
+
+
+def flicker(pictures: list[Tensor], exact: list[Tensor]) -> float:
+    """RMS of the difference of neighbouring frames beyond that of exact depth."""
+    return max(steps(pictures) ** 2 - steps(exact) ** 2, 0.0) ** 0.5
+
+
+def error(depths: list[Tensor], exact: list[Tensor]) -> float:
+    """RMS error of inverse depth."""
+    return rms(torch.cat([1 / z for z in depths]) - torch.cat([1 / z for z in exact]))
+
+
+def rendered(frames: Shot, depths: list[Tensor]) -> list[Tensor]:
+    return [
+        display(depth_of_field(image, depth, CAMERA, tolerance=4 / 255))
+        for (image, _), depth in zip(frames, depths, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("blocks", [False, True], ids=["edges jitter alike", "edges jitter each on its own"])
+def test_flicker_of_24_frames_sinks_below_a_third(blocks: bool) -> None:
+    exact = shot(24)
+    given = [(image, as_estimated(depth, t, blocks=blocks)) for t, (image, depth) in enumerate(exact)]
+    truth = rendered(exact, [depth for _, depth in exact])
+    before = flicker(rendered(given, [depth for _, depth in given]), truth)
+    after = flicker(rendered(given, steadied(given)), truth)
+    print(f"flicker {before:.5f} -> {after:.5f}: {after / before:.3f} of what it was")
+    assert after < before / 3
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        pytest.param({"ball_px": 2.4}, id="moving foreground"),
+        pytest.param({"pan_px": 2.4}, id="pan"),
+        pytest.param({"pan_px": 0.3, "ball_px": -5.0}, id="both"),
+        pytest.param({"cut": 6}, id="cut"),
+        pytest.param({"toward": 0.01}, id="toward the camera"),
+    ],
+)
+def test_what_moves_does_not_smear(motion: dict[str, Any]) -> None:
+    exact = shot(12, **motion)
+    depths = [depth for _, depth in exact]
+    given = [(image, as_estimated(depth, t)) for t, (image, depth) in enumerate(exact)]
+    of_exact = error(steadied(exact), depths)
+    before, after = error([z for _, z in given], depths), error(steadied(given), depths)
+    print(f"error of inverse depth: {before:.4f} -> {after:.4f}; of exact depth {of_exact:.4f}")
+    assert after < 1.03 * before
+    assert of_exact < 0.25 * before
+
+
+def test_noise_sinks_where_the_camera_pans() -> None:
+    exact = shot(8, pan_px=2.4)
+    given = [(i, z * (1 + 0.01 * torch.randn(z.shape, generator=torch.Generator().manual_seed(t))))
+             for t, (i, z) in enumerate(exact)]  # fmt: skip
+    depths = [z for _, z in exact]
+    assert error(steadied(given), depths) < 0.75 * error([z for _, z in given], depths)
+
+
+def test_exact_depth_of_a_still_shot_comes_back() -> None:
+    frames = shot(4)
+    for (_, depth), steady in zip(frames, steadied(frames), strict=True):
+        torch.testing.assert_close(steady, depth)
+
+
+def test_a_cut_forgets_what_was_before() -> None:
+    before, after = shot(5), shot(1, cut=0)[0]
+    last = steadied([*before, after])[-1]
+    other = (last / after[1] - 1).abs() > 0.02
+    assert float(other.float().mean()) < 0.002
+
+
+def test_a_surface_that_comes_without_a_trace_in_the_image_passes() -> None:
+    image, depth = torch.full((1, 3, HEIGHT, WIDTH), 0.2), torch.full((1, 1, HEIGHT, WIDTH), 4.0)
+    moved = depth.clone()
+    moved[..., 20:40, 30:60] = 1.0
+    torch.testing.assert_close(steadied([(image, depth)] * 5 + [(image, moved)])[-1], moved)
+
+
+def test_exposure_does_not_matter() -> None:
+    frames = [(i, as_estimated(z, t)) for t, (i, z) in enumerate(shot(5, ball_px=2.0))]
+    bright = [(1000.0 * i, z) for i, z in frames]
+    for one, other in zip(steadied(frames), steadied(bright), strict=True):
+        assert float(((one / other - 1).abs() > 1e-3).float().mean()) < 1e-3
+
+
+def test_holes_take_what_was_there_and_infinity_stays() -> None:
+    image, depth = shot(1)[0]
+    depth[..., :10] = torch.inf
+    holed = depth.clone()
+    holed[..., 5:30] = torch.nan
+    steady = Steady()
+    assert bool(steady(image, holed)[..., 5:30].isnan().all())
+    steady.reset()
+    steady(image, depth)
+    torch.testing.assert_close(steady(image, holed), depth)
+
+
+def test_items_of_a_batch_do_not_know_each_other() -> None:
+    one, other = ([(i, as_estimated(z, t)) for t, (i, z) in enumerate(shot(4, **k))] for k in ({}, {"pan_px": 1.5}))
+    both = [(torch.cat([a[0], b[0]]), torch.cat([a[1], b[1]])) for a, b in zip(one, other, strict=True)]
+    alone = steadied(other)
+    for together, single in zip(steadied(both), alone, strict=True):
+        torch.testing.assert_close(together[1:], single)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64])
+def test_dtype_of_depth_is_kept(dtype: torch.dtype) -> None:
+    image, depth = torch.rand(1, 3, 8, 8), torch.full((1, 1, 8, 8), 2.0, dtype=dtype)
+    assert steadied([(image.to(dtype), depth)] * 3)[-1].dtype == dtype
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 2), (33, 49)])
+def test_frames_of_any_size_and_of_another_than_before(size: tuple[int, int]) -> None:
+    steady = Steady()
+    steady(torch.rand(1, 3, 20, 20), torch.ones(1, 1, 20, 20))
+    for _ in range(3):
+        depth = steady(torch.rand(1, 3, *size), torch.full((1, 1, *size), 2.0))
+        torch.testing.assert_close(depth, torch.full((1, 1, *size), 2.0))
+
+
+def test_what_does_not_belong_together_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"depth must be \[1, 1, 8, 8\]"):
+        Steady()(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 4, 4))
+
+
+def test_motion_of_a_pan_is_found_to_a_fraction_of_a_pixel() -> None:
+    (before, _), (now, _) = shot(2, pan_px=2.4)
+    flow = motion_between(now, before, torch.ones_like(now[:, :1], dtype=torch.bool))
+    assert flow[0, 0].median().item() == pytest.approx(2.4, abs=0.25)
+    assert flow[0, 1].median().item() == pytest.approx(0.0, abs=0.25)
+
+
+@pytest.mark.parametrize("parts", [[range(40, 60)], [range(0, 3), range(3, 50)], [[47], [48], [90], [12]]])
+def test_parts_of_a_shot_are_those_of_the_whole(parts: list[Any]) -> None:
+    image = torch.rand(1, 3, 16, 20)
+    depths = [2.0 + 0.02 * torch.rand(1, 1, 16, 20) for _ in range(100)]
+    reads = []
+
+    def read(place: int) -> tuple[Tensor, Tensor]:
+        reads.append(place)
+        return image, depths[place]
+
+    whole = SteadyFrames(read)
+    expected = [whole.depth(place) for place in range(100)]
+    assert reads == list(range(100))
+    for part in parts:
+        again = SteadyFrames(read)
+        for place in part:
+            reads.clear()
+            assert torch.equal(again.depth(place), expected[place])
+            assert len(reads) <= 64

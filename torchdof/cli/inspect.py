@@ -1,0 +1,147 @@
+"""``torchdof inspect``: what a depth map holds, what a camera makes of it, and whether that makes sense."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from ..depth.holes import resolve_holes
+from ..depth.inspect import inspect_depth, panels
+from ..depth.sanity import depth_doubts
+from ..io.images import read_image
+from ..io.sheet import write_sheet
+from .doubts import Said
+from .frame import read_metres
+from .render import parse_fill, parse_point, parse_range
+from .settings import RenderSettings
+
+__all__ = ["inspect"]
+
+_LENS, _DEPTH = "Focus and lens", "Depth map"
+
+
+def inspect(
+    image: Annotated[Path, typer.Argument(metavar="IMAGE", help="All-in-focus image, as for torchdof render.")],
+    depth: Annotated[
+        Path | None, typer.Argument(metavar="[DEPTH]", help="Its depth; not needed if IMAGE has a Z channel.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Picture to write; default: IMAGE's name with .inspect.png, in this folder."),
+    ] = None,
+    focus_m: Annotated[
+        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=_LENS)
+    ] = None,
+    focus_at: Annotated[
+        str | None, typer.Option(metavar="X,Y", help="Focus on what is seen at this pixel.", rich_help_panel=_LENS)
+    ] = None,
+    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_LENS)] = None,
+    focal_length_mm: Annotated[float | None, typer.Option(help="Real focal length.", rich_help_panel=_LENS)] = None,
+    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_LENS)] = None,
+    fov_deg: Annotated[
+        float | None, typer.Option(help="Horizontal field of view of a rendered image.", rich_help_panel=_LENS)
+    ] = None,
+    aperture_radius_m: Annotated[
+        float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=_LENS)
+    ] = None,
+    depth_kind: Annotated[
+        Literal["z", "distance", "disparity", "inverse", "relative"],
+        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=_DEPTH),
+    ] = "z",
+    depth_scale: Annotated[
+        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_DEPTH)
+    ] = None,
+    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_DEPTH)] = 0.0,
+    near_m: Annotated[
+        float | None, typer.Option(help="Distance of the nearest value of relative depth.", rich_help_panel=_DEPTH)
+    ] = None,
+    far_m: Annotated[
+        float | None, typer.Option(help="Distance of its farthest value (inf allowed).", rich_help_panel=_DEPTH)
+    ] = None,
+    relative_kind: Annotated[
+        Literal["disparity", "inverse", "depth"] | None,
+        typer.Option(help="What relative depth is, as for torchdof render.", rich_help_panel=_DEPTH),
+    ] = None,
+    value_range: Annotated[
+        str | None,
+        typer.Option(metavar="LOW,HIGH", help="Smallest and largest value of relative depth.", rich_help_panel=_DEPTH),
+    ] = None,
+    depth_unknown: Annotated[
+        float | None, typer.Option(help="A value that means 'not measured'.", rich_help_panel=_DEPTH)
+    ] = None,
+    fill_depth: Annotated[
+        str | None,
+        typer.Option(
+            metavar="nearest|far|METRES", help="Look at the map with its holes filled.", rich_help_panel=_DEPTH
+        ),
+    ] = None,
+    depth_channel: Annotated[
+        str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=_DEPTH)
+    ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="End with an error where something looks like a mistake.", rich_help_panel=_DEPTH
+        ),
+    ] = False,
+) -> None:
+    """Tell what a depth map holds and what a camera makes of it, before anything is rendered.
+
+    Ranges, the histogram of the blur radius, the share in focus, holes, how many of the map's edges lie where the image
+    has them; and a picture of depth, blur and doubtful edges. Wrong units are said on standard error.
+
+        torchdof inspect photo.jpg depth.png --depth-scale 0.001 --focus-at 320,200 --f-number 1.8
+
+    The lens is found as for torchdof render.
+    """
+    settings = RenderSettings(
+        focus=None if focus_m is None else [(0, focus_m)],
+        focus_at=None if focus_at is None else parse_point(focus_at),
+        f_number=f_number,
+        focal_length_mm=focal_length_mm,
+        sensor_width_mm=sensor_width_mm,
+        fov_x_deg=fov_deg,
+        aperture_radius_m=aperture_radius_m,
+        depth_kind=depth_kind,
+        depth_scale=depth_scale,
+        depth_offset=depth_offset,
+        depth_unknown=depth_unknown,
+        depth_channel=depth_channel,
+        near_m=near_m,
+        far_m=far_m,
+        relative_kind=relative_kind,
+        value_range=None if value_range is None else parse_range(value_range),
+        fill=None if fill_depth is None else parse_fill(fill_depth),
+        strict=strict,
+    )
+    target = Path(f"{image.stem}.inspect.png") if out is None else out
+    if any(source is not None and source.resolve() == target.resolve() for source in (image, depth)):
+        raise ValueError(f"{target}: is one of the inputs; write to another file")
+    picture = read_image(image)
+    metres = read_metres(image, depth, picture, settings)
+    known = metres[metres > 0]
+    if not known.numel():
+        raise ValueError(f"{depth or image}: no pixel has a depth; check the kind, scale and offset of the depth map")
+    filled = 0
+    if settings.fill is not None:
+        metres, filled = resolve_holes(metres, str(depth or image), settings.fill)
+    notes = []
+    if focus_m is None and focus_at is None:
+        notes = ["focus at the median depth"]
+        settings = dataclasses.replace(settings, focus=[(0, float(known.median()))])
+    width = picture.pixels.shape[-1]
+    camera, remarks = settings.camera(picture.metadata, width, 0)
+    if settings.focus_at is not None:
+        camera = camera.focus_at(metres, *settings.focus_at)
+    light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
+    report = inspect_depth(light, metres, camera)
+    typer.echo(f"image         {width} x {picture.pixels.shape[-2]} px, {', '.join(picture.channels)}")
+    notes = [*notes, *remarks]
+    typer.echo(f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""))
+    typer.echo(str(report))
+    if filled:
+        typer.echo(f"filled        {filled} holes ({100 * filled / metres.numel():.1f} %), {settings.fill}")
+    write_sheet(target, panels(light, report))
+    typer.echo(f"picture       {target}")
+    Said(strict).say(depth or image, depth_doubts(metres, camera, depth_kind, depth_scale))

@@ -1,0 +1,255 @@
+"""What a depth map holds and what a camera makes of it: ranges, blur, holes, and how exact its edges are."""
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from ..io.transfer import encode
+from ..optics.camera import Camera
+from ..validation import image_and_map
+
+__all__ = ["EDGES", "DepthReport", "coc_colours", "edges_of", "inspect_depth", "panels"]
+
+EDGES = ("exact", "ramp", "beside", "unclear")
+"""Kinds of depth edges: a step where the image has an edge; not one step; a step that lies beside the image's edge;
+a step where the image is the same on both sides."""
+
+_BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+_REACH = 5  # pixels on each side of a step in which a ramp lies
+_JUMP = 0.08  # least relative difference of inverse depth across an edge
+_STEP = 0.7  # least share of it between two pixels that is a step
+_CONTRAST, _SPREADS = (
+    0.06,
+    2.0,
+)  # of the image across an edge, display-encoded: at least, and over what varies beside it
+_DOUBTFUL = 0.3  # share of edges from which on it is said
+_BESIDE = 0.25  # share of its own side's colour that a pixel at the step has at least
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthReport:
+    """What :func:`inspect_depth` found.
+
+    Args:
+        depth: The map, ``[1, 1, H, W]`` in metres, NaN in holes.
+        coc_px: Signed circle of confusion, ``[1, 1, H, W]``, NaN in holes.
+        edges: ``[1, 1, H, W]``, uint8: 0 where there is no edge of depth, else 1 + the place in :data:`EDGES`.
+        counts: How many edges of each kind of :data:`EDGES` there are, in steps between two pixels.
+    """
+
+    depth: Tensor
+    coc_px: Tensor
+    edges: Tensor
+    counts: tuple[int, int, int, int]
+
+    @property
+    def holes(self) -> int:
+        """Pixels without depth."""
+        return int(self.depth.isnan().sum())
+
+    @property
+    def sharp(self) -> float:
+        """Share of the pixels with depth whose blur radius is at most 1 px."""
+        return float((self.coc_px.abs() <= 1.0).sum()) / max(1, self.depth.numel() - self.holes)
+
+    @property
+    def doubtful(self) -> float:
+        """Share of the edges that are ramps or lie beside the image's, among those where that can be told."""
+        exact, ramp, beside, _ = self.counts
+        return (ramp + beside) / max(1, exact + ramp + beside)
+
+    def histogram(self) -> list[tuple[float, float, float]]:
+        """Lower and upper blur radius in pixels (negative: in front of the focus), and the share of the pixels between.
+
+        The bounds double from 1 px on; bins at both ends that hold nothing are left out.
+        """
+        bounds = [-math.inf, *(-x for x in reversed(_BOUNDS_PX)), *_BOUNDS_PX, math.inf]
+        known = self.coc_px[~self.coc_px.isnan()]
+        edges = torch.tensor(bounds[1:-1], dtype=known.dtype, device=known.device)
+        counts = torch.bincount(torch.bucketize(known, edges), minlength=len(bounds) - 1).tolist()
+        filled = [k for k, count in enumerate(counts) if count] or [len(_BOUNDS_PX)]
+        total = max(1, known.numel())
+        return [(bounds[k], bounds[k + 1], counts[k] / total) for k in range(filled[0], filled[-1] + 1)]
+
+    def __str__(self) -> str:
+        total = self.depth.numel()
+        finite = self.depth[self.depth.isfinite()]
+        lines = []
+        if finite.numel():
+            spread = torch.quantile(finite.flatten()[:: max(1, finite.numel() // 2**20)].double(), _SHARES).tolist()
+            named = "  ".join(f"{share} {metres:.4g}" for share, metres in zip(_SHARE_NAMES, spread, strict=True))
+            lines.append(
+                f"depth, m      nearest {float(finite.min()):.4g}  {named}  farthest {float(finite.max()):.4g}"
+            )
+        infinite = int(self.depth.isinf().sum())
+        lines.append(f"at infinity   {_percent(infinite, total)}   holes {self.holes} ({_percent(self.holes, total)})")
+        known = self.coc_px[~self.coc_px.isnan()]
+        if known.numel():
+            lines.append(f"blur radius   {float(known.min()):+.1f} to {float(known.max()):+.1f} px, negative is near")
+            lines.append(f"in focus      {100 * self.sharp:.1f} % of the pixels (radius of at most 1 px)")
+            longest = max(share for _, _, share in self.histogram())
+            for low, high, share in self.histogram():
+                bar = "#" * math.ceil(40 * share / longest)
+                lines.append(f"{low:+8.0f} to {high:+5.0f} px {100 * share:5.1f} % {bar}".rstrip())
+        steps = sum(self.counts)
+        shares = ", ".join(f"{_percent(n, steps)} {name}" for n, name in zip(self.counts, EDGES, strict=True))
+        lines.append(f"depth edges   {steps} steps between pixels: {shares}")
+        if self.doubtful > _DOUBTFUL:
+            lines.append(
+                "              the edges are not where the image has them: outlines of what is blurred will show"
+            )
+        return "\n".join(lines)
+
+
+_SHARES = torch.tensor([0.01, 0.5, 0.99], dtype=torch.float64)
+_SHARE_NAMES = ("1 %", "median", "99 %")
+
+
+def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
+    """Looks at a depth map: ranges, the circle of confusion that a camera makes of it, holes, exactness of edges.
+
+    Args:
+        image: ``[1, C, H, W]``, linear light.
+        depth: ``[1, 1, H, W]``, metres; NaN, zero and negative ones are holes.
+        camera: The camera.
+
+    Returns:
+        The report; ``print`` tells it.
+
+    Raises:
+        ValueError: If an argument is not as described.
+
+    Example:
+        >>> image, depth = torch.full((1, 3, 16, 24), 0.2), torch.full((1, 1, 16, 24), 4.0)
+        >>> image[..., 12:], depth[..., 12:] = 0.6, 2.0
+        >>> report = inspect_depth(image, depth, Camera(focus_m=2.0))
+        >>> report.counts, report.sharp
+        ((16, 0, 0, 0), 1.0)
+    """
+    image_and_map(image, "depth", depth, "in metres")
+    if image.shape[0] != 1:
+        raise ValueError(f"inspect one image at a time, got a batch of {image.shape[0]}")
+    depth = torch.where(depth > 0, depth, torch.nan)
+    edges, counts = edges_of(image, depth)
+    return DepthReport(depth, camera.coc_px(depth, depth.shape[-1]), edges, counts)
+
+
+def edges_of(image: Tensor, depth: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
+    """Where depth has edges, and which of them are exact.
+
+    Along rows and along columns, an edge is the steepest step of inverse depth within five pixels, where depth on both
+    sides differs by more than it slopes. It is exact where one step between two pixels holds most of the difference and
+    each of the two looks like its own side. Exact depth of a ray tracer has 10 to 20 % doubtful edges by this measure,
+    for textures and mixed pixels; maps that were upsampled, smoothed or shifted by a pixel 45 to 100 %.
+
+    Args:
+        image: ``[1, C, H, W]``, linear light.
+        depth: ``[1, 1, H, W]``, metres, NaN in holes.
+
+    Returns:
+        The map and the counts of :class:`DepthReport`.
+    """
+    light = image.float()
+    level = light.clamp(min=0).mean().clamp(min=1e-12)
+    shown = encode((light * (0.2 / level)).clamp(0.0, 1.0), "srgb", has_alpha=False, straight=False)
+    inverse = 1.0 / depth.float()
+    edges = torch.zeros_like(depth, dtype=torch.uint8)
+    counts = torch.zeros(len(EDGES), dtype=torch.long)
+    for lines, colours, marks in (
+        (inverse, shown, edges),
+        (inverse.transpose(-1, -2), shown.transpose(-1, -2), edges.transpose(-1, -2)),
+    ):
+        if lines.shape[-1] < 2 * _REACH + 2:
+            continue
+        kinds = _kinds(lines, colours)
+        counts += torch.bincount(kinds.flatten(), minlength=len(EDGES) + 1)[1:].cpu()
+        for start in (_REACH, _REACH + 1):  # both pixels of the step
+            window = marks[..., start : start + kinds.shape[-1]]
+            window.copy_(torch.where(kinds > 0, kinds.to(torch.uint8), window))
+    exact, ramp, beside, unclear = counts.tolist()
+    return edges, (exact, ramp, beside, unclear)
+
+
+def _kinds(inverse: Tensor, shown: Tensor) -> Tensor:
+    """Kind of the edge between the pixels ``_REACH + i`` and ``_REACH + i + 1`` of each row, 0 for none."""
+    count = inverse.shape[-1] - 2 * _REACH - 1
+
+    def at(values: Tensor, offset: int) -> Tensor:
+        return values[..., _REACH + offset : _REACH + offset + count]
+
+    steps = (inverse[..., 1:] - inverse[..., :-1]).abs()
+    step = at(steps, 0)
+    around = torch.stack([at(steps, k) for k in range(-_REACH, _REACH + 1)])
+    left, right = at(inverse, -_REACH), at(inverse, _REACH + 1)
+    jump = (right - left).abs()
+    slope = torch.maximum(at(steps, -_REACH), at(steps, _REACH))
+    is_edge = (jump - 2 * _REACH * slope > _JUMP * torch.maximum(left, right)) & (step >= around.amax(0)) & (step > 0)
+    is_step = step >= _STEP * jump
+    mean_left, mean_right = (
+        torch.stack([at(shown, k) for k in places]).mean(0) for places in ((-4, -3, -2), (3, 4, 5))
+    )
+    spread = sum(
+        torch.stack([(at(shown, k) - mean).abs() for k in places]).mean(0).amax(1, keepdim=True)
+        for places, mean in (((-4, -3, -2), mean_left), ((3, 4, 5), mean_right))
+    )
+    across = mean_right - mean_left
+    contrast = across.square().sum(1, keepdim=True)
+    is_told = contrast.sqrt() > torch.maximum(torch.full_like(contrast, _CONTRAST), _SPREADS * spread)
+    share_left, share_right = (
+        ((at(shown, k) - mean_left) * across).sum(1, keepdim=True) / contrast.clamp(min=1e-12) for k in (0, 1)
+    )
+    is_beside = (share_left > 1.0 - _BESIDE) | (share_right < _BESIDE)
+    kind = torch.where(is_step, torch.where(is_told, torch.where(is_beside, 3, 1), 4), 2)
+    return torch.where(is_edge, kind, 0)
+
+
+def coc_colours(coc_px: Tensor) -> Tensor:
+    """A signed map in colour: orange in front of the focus, black in focus, blue behind; linear light.
+
+    Args:
+        coc_px: ``[1, 1, H, W]``, pixels.
+
+    Returns:
+        ``[1, 3, H, W]``; the largest radius, at least 1 px, is full colour.
+
+    Example:
+        >>> coc_colours(torch.tensor([[[[-2.0, 0.0, 2.0]]]]))[0, :, 0].argmax(dim=0).tolist()
+        [0, 0, 2]
+    """
+    size = (coc_px / coc_px.abs().max().clamp(min=1.0)).clamp(-1, 1)
+    near, far = coc_px.new_tensor([1.0, 0.35, 0.02]), coc_px.new_tensor([0.05, 0.3, 1.0])
+    return size.clamp(max=0).neg() * near[:, None, None] + size.clamp(min=0) * far[:, None, None]
+
+
+def panels(image: Tensor, report: DepthReport) -> dict[str, Tensor]:
+    """Pictures of a report, each ``[1, 3, H, W]`` in linear light, by what to write above them.
+
+    Args:
+        image: ``[1, C, H, W]``, linear light.
+        report: What was found.
+    """
+    is_hole = report.depth.isnan()
+    magenta = report.depth.new_tensor([0.6, 0.0, 0.6])[:, None, None]
+    inverse = torch.where(is_hole, 0.0, 1.0 / report.depth)
+    low, high = inverse[~is_hole].aminmax() if bool((~is_hole).any()) else (inverse.min(), inverse.max())
+    grey = ((inverse - low) / (high - low).clamp(min=1e-12)).clamp(0, 1) ** 2.2
+    coc_px = torch.where(is_hole, 0.0, report.coc_px)
+    colours = image.new_tensor([[0, 0, 0], [0.0, 0.7, 0.1], [1.0, 0.05, 0.0], [1.0, 0.0, 0.8], [0.05, 0.1, 0.5]])
+    marks = colours[report.edges[:, 0].long()].permute(0, 3, 1, 2)  # [1, H, W, 3] -> [1, 3, H, W]
+    level = image.mean(1, keepdim=True) / image.mean().clamp(min=1e-12)
+    dim = (0.08 * level).clamp(0, 0.3).expand(-1, 3, -1, -1)
+    return {
+        "depth: near is bright, holes magenta": torch.where(is_hole, magenta, grey),
+        f"blur radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px: near orange, far blue": torch.where(
+            is_hole, magenta, coc_colours(coc_px)
+        ),
+        "depth edges: exact green, ramps red, beside the image's pink, unclear blue": torch.where(
+            report.edges > 0, marks, dim
+        ),
+    }
+
+
+def _percent(count: int, total: int) -> str:
+    return f"{100 * count / max(1, total):.1f} %"

@@ -1,0 +1,113 @@
+"""Where each pixel was in the frame before: block matching from coarse to fine."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+__all__ = ["motion_between", "sample", "shifted"]
+
+_COARSEST_PX, _LEVELS = 24, 5
+_BLOCK = 7
+_GAIN = 0.05  # share of the difference that a fraction must explain: what stands still, stands still
+_NOISE = 1e-4  # squared difference that tells nothing
+_STILL = 1e-3  # share of pixels that may change before motion is looked for
+
+
+def motion_between(frame: Tensor, before: Tensor, changed: Tensor) -> Tensor:
+    """How far from each pixel of a frame its content lay in the frame before.
+
+    Args:
+        frame: ``[B, C, H, W]``.
+        before: The frame before, alike.
+        changed: ``[B, 1, H, W]``, bool: pixels that differ where nothing moves. Where these are next to none there is
+            no motion.
+
+    Returns:
+        ``[B, 2, H, W]``, x and y in pixels, to a fraction of a pixel, found at half the resolution.
+    """
+    batch, _, height, width = frame.shape
+    if float(changed.float().mean()) <= _STILL:
+        return frame.new_zeros(batch, 2, height, width)
+    levels = [tuple(_halved(picture.mean(1, keepdim=True)) for picture in (frame, before))]
+    while min(levels[-1][0].shape[-2:]) >= 2 * _COARSEST_PX and len(levels) < _LEVELS:
+        levels.append(tuple(_halved(picture) for picture in levels[-1]))
+    flow = levels[-1][0].new_zeros(batch, 2, *levels[-1][0].shape[-2:])
+    for depth, (now, then) in enumerate(reversed(levels)):
+        if depth:
+            flow = 2.0 * F.interpolate(flow, size=now.shape[-2:], mode="nearest").round()
+        flow = _matched(now, then, flow, reach=2 if depth == 0 else 1)
+    return 2.0 * F.interpolate(_to_fractions(*levels[0], flow), size=(height, width), mode="nearest")
+
+
+def sample(image: Tensor, flow: Tensor) -> Tensor:
+    """The image at each pixel's place in the frame before, linear between pixels: ``[B, C, H, W]``."""
+    height, width = image.shape[-2:]
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=flow.dtype, device=flow.device),
+        torch.arange(width, dtype=flow.dtype, device=flow.device),
+        indexing="ij",
+    )
+    grid = torch.stack([(x + flow[:, 0] + 0.5) * 2 / width - 1, (y + flow[:, 1] + 0.5) * 2 / height - 1], dim=-1)
+    return F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)
+
+
+def shifted(maps: Tensor, flow: Tensor) -> Tensor:
+    """The maps ``[B, K, H, W]`` at each pixel's place in the frame before, whole pixels: nothing is mixed."""
+    batch, count, height, width = maps.shape
+    y, x = torch.meshgrid(
+        torch.arange(height, device=flow.device), torch.arange(width, device=flow.device), indexing="ij"
+    )
+    column = (x + flow[:, 0].round().long()).clamp(0, width - 1)
+    row = (y + flow[:, 1].round().long()).clamp(0, height - 1)
+    index = (row * width + column).reshape(batch, 1, -1).expand(-1, count, -1)
+    return maps.flatten(2).gather(2, index).reshape(batch, count, height, width)
+
+
+def _halved(picture: Tensor) -> Tensor:
+    return F.avg_pool2d(picture, 2, ceil_mode=True)
+
+
+def _cost(now: Tensor, then: Tensor, flow: Tensor) -> Tensor:
+    """Mean difference of blocks around each pixel and its place in the frame before, ``[B, 1, H, W]``."""
+    return _block_mean((now - shifted(then, flow)).abs())
+
+
+def _block_mean(values: Tensor) -> Tensor:
+    return F.avg_pool2d(values, _BLOCK, stride=1, padding=_BLOCK // 2, count_include_pad=False)
+
+
+def _matched(now: Tensor, then: Tensor, flow: Tensor, reach: int) -> Tensor:
+    """The best of whole displacements around a guess, the guesses of blocks around, and none."""
+    guesses = [flow, torch.zeros_like(flow)]
+    for dim in (-2, -1):
+        guesses += [flow.roll(step, dims=dim) for step in (-_BLOCK, _BLOCK)]
+    best_cost, best = _cost(now, then, guesses[0]), guesses[0]
+    for guess in guesses[1:]:
+        best_cost, best = _better(best_cost, best, _cost(now, then, guess), guess)
+    start = best
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            if dx or dy:
+                step = start + start.new_tensor([dx, dy]).reshape(1, 2, 1, 1)
+                best_cost, best = _better(best_cost, best, _cost(now, then, step), step)
+    return best
+
+
+def _better(best_cost: Tensor, best: Tensor, cost: Tensor, candidate: Tensor) -> tuple[Tensor, Tensor]:
+    is_better = cost < best_cost - 1e-4  # of equals the first: flat areas follow what is around them
+    return torch.where(is_better, cost, best_cost), torch.where(is_better, candidate, best)
+
+
+def _to_fractions(now: Tensor, then: Tensor, flow: Tensor) -> Tensor:
+    """Displacements to a fraction of a pixel, by the parabola through the squared differences of three."""
+    middle = _block_mean((now - shifted(then, flow)).square())
+    fractions = []
+    for step in ((1.0, 0.0), (0.0, 1.0)):
+        offset = flow.new_tensor(step).reshape(1, 2, 1, 1)
+        before, after = (_block_mean((now - shifted(then, flow + sign * offset)).square()) for sign in (-1, 1))
+        bend = (before + after - 2 * middle).clamp(min=1e-6)
+        gain = (before - after).square() / (8 * bend)  # middle less the bottom of the parabola
+        fractions.append(
+            torch.where(gain > _GAIN * middle.clamp(min=_NOISE), 0.5 * (before - after) / bend, 0.0).clamp(-0.5, 0.5)
+        )
+    return flow + torch.cat(fractions, dim=1)

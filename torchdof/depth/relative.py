@@ -1,0 +1,223 @@
+"""Depth without a scale, as estimators give it, to metres: between two distances, or from points that are known."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ..validation import is_traced, number, show
+from .kinds import depth_from_values, number_map
+
+__all__ = ["RELATIVE_KINDS", "RelativeKind", "Scale", "from_relative", "solve_scale"]
+
+RelativeKind = Literal["disparity", "inverse", "depth"]
+RELATIVE_KINDS: tuple[RelativeKind, ...] = ("disparity", "inverse", "depth")
+
+
+def from_relative(
+    values: Tensor,
+    near_m: float,
+    far_m: float,
+    kind: RelativeKind = "disparity",
+    *,
+    value_range: tuple[float, float] | None = None,
+    unknown: float | None = None,
+) -> Tensor:
+    """Relative depth to metres: the nearest value lies at ``near_m``, the farthest at ``far_m``.
+
+    =========== ======================================= =====================================================
+    kind        between the extremes                    for
+    =========== ======================================= =====================================================
+    disparity   1 / depth is linear, larger is nearer   MiDaS, DPT, Depth Anything; stereo of unknown scale
+    inverse     the same                                inverse depth up to scale and shift
+    depth       depth is linear, larger is farther      Marigold, and other affine-invariant depth
+    =========== ======================================= =====================================================
+
+    Args:
+        values: ``[B, 1, H, W]``, floating point or whole numbers, of any range. NaN and infinite values are holes.
+        near_m: Distance of the nearest value, in metres, > 0.
+        far_m: Distance of the farthest value, in metres, > ``near_m``; ``inf`` allowed but for ``"depth"``.
+        kind: What the numbers are.
+        value_range: The smallest and the largest value that count; what lies outside is taken for the nearer of the
+            two. None takes each item's own extremes: give it for the frames of a shot, or each is scaled on its own.
+        unknown: A value that means "not measured", for example 0.
+
+    Returns:
+        ``[B, 1, H, W]`` in metres, on the device and in the dtype of ``values`` (float32 for whole numbers); NaN in
+        holes. Differentiable with respect to ``values``; an infinite depth passes no gradient.
+
+    Raises:
+        ValueError: If an argument is not as described, or an item has no two different values to tell near from far.
+
+    Reference:
+        Ranftl et al., "Towards robust monocular depth estimation", IEEE TPAMI 2022, section 5: disparity up to scale
+        and shift.
+
+    Example:
+        >>> from_relative(torch.tensor([[[[0, 128, 255]]]], dtype=torch.uint8), near_m=1.0, far_m=5.0)
+        tensor([[[[5.0000, 1.6624, 1.0000]]]])
+    """
+    if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
+        raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")
+    near_m, far_m = _near_and_far(near_m, far_m, kind)
+    _relative_map(values)
+    dtype = values.dtype if values.is_floating_point() else torch.float32
+    value = values.to(torch.promote_types(dtype, torch.float32)) if values.is_floating_point() else values.double()
+    is_known = value.isfinite()
+    if unknown is not None:
+        is_known = is_known & (value != number("unknown", unknown, infinite=True))
+    if value_range is None:
+        low = torch.where(is_known, value, torch.inf).amin((1, 2, 3), keepdim=True)
+        high = torch.where(is_known, value, -torch.inf).amax((1, 2, 3), keepdim=True)
+        if not is_traced() and not bool((low < high).all()):
+            problem = "no value" if bool((low > high).any()) else "one value everywhere"
+            raise ValueError(
+                f"relative depth needs two different values to tell near from far, got {problem}; give "
+                "value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
+            )
+    else:
+        low, high = (value.new_tensor(x) for x in _range(value_range))
+    share = (torch.where(is_known, value, low) - low) / (high - low)
+    share = share.clamp(0.0, 1.0)
+    if kind == "depth":
+        depth = near_m + (far_m - near_m) * share
+    else:
+        inverse = share / near_m + (1.0 - share) / far_m
+        depth = 1.0 / torch.where(inverse > 0, inverse, 1.0)
+        depth = torch.where(inverse > 0, depth, torch.inf)
+    return torch.where(is_known, depth, torch.nan).to(dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scale:
+    """How the values of a map become metres, as :func:`torchdof.depth.depth_from_values` takes it.
+
+    Args:
+        kind: "disparity": ``scale / (value + offset)``; "z": ``scale * (value + offset)``.
+        scale: Factor.
+        offset: Added to the value first.
+        residual: RMS relative error of depth at the points it was solved from.
+    """
+
+    kind: Literal["disparity", "z"]
+    scale: float
+    offset: float
+    residual: float
+
+    def depth(self, values: Tensor) -> Tensor:
+        """Metres ``[B, 1, H, W]``, float32; values that lie beyond infinity are at infinity, holes stay NaN.
+
+        Example:
+            >>> Scale("disparity", 2.0, 0.5, 0.0).depth(torch.tensor([[[[0.5, -0.5, -3.0]]]]))
+            tensor([[[[2., inf, inf]]]])
+        """
+        depth = depth_from_values(values, self.kind, scale=self.scale, offset=self.offset)
+        beyond = (values.double() + self.offset) * math.copysign(1.0, self.scale) <= 0
+        return torch.where(beyond, torch.inf, depth) if self.kind == "disparity" else depth
+
+
+def solve_scale(
+    values: Tensor, points: Sequence[tuple[float, float, float]], kind: RelativeKind = "disparity", patch: int = 5
+) -> Scale:
+    """Scale and offset of relative depth from points whose distance is known.
+
+    Two points give it exactly; of more, the sum of squared relative errors of depth is the least. In ``torchdof
+    render`` the result is ``--depth-kind disparity --depth-scale SCALE --depth-offset OFFSET`` (``--depth-kind z`` for
+    "depth").
+
+    Args:
+        values: ``[1, 1, H, W]``, floating point or whole numbers; what is not finite is left out.
+        points: ``(x, y, metres)``, at least two of different values: pixels from the top left edge, and the distance
+            along the optical axis, > 0; for disparity ``inf`` allowed.
+        kind: As for :func:`from_relative`.
+        patch: Side of the square patch around a point, whose median counts.
+
+    Returns:
+        The scale.
+
+    Raises:
+        ValueError: If an argument is not as described, the points have one value only, or they say that the values run
+            the other way.
+
+    Example:
+        >>> values = torch.tensor([[[[1.0, 2.0, 4.0]]]])
+        >>> solve_scale(values, [(0.5, 0.5, 4.0), (2.5, 0.5, 1.0)], patch=1)
+        Scale(kind='disparity', scale=4.0, offset=0.0, residual=0.0)
+    """
+    if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
+        raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")
+    _relative_map(values)
+    if values.shape[0] != 1:
+        raise ValueError(f"values must be one map [1, 1, H, W], got {list(values.shape)}; solve each on its own")
+    if isinstance(patch, bool) or not isinstance(patch, int) or patch < 1:
+        raise ValueError(f"patch must be a whole number of pixels, at least 1, got {show(patch)}")
+    known = [_point(values, point, kind, patch) for point in points]
+    if len({value for value, _ in known}) < 2:
+        raise ValueError(
+            f"scale and offset need at least two points of different values, got {len(known)} points of values "
+            f"{sorted({value for value, _ in known})}"
+        )
+    # (a v + b) / y = 1 with y = 1/z or z: both sides are relative, so that near points do not outweigh far ones.
+    value = torch.tensor([v for v, _ in known], dtype=torch.float64)
+    metres = torch.tensor([z for _, z in known], dtype=torch.float64)
+    weight = 1.0 / metres if kind == "depth" else metres.clamp(max=1e6 * float(metres.min()))
+    target = metres.isfinite().double() if kind != "depth" else torch.ones_like(value)
+    design = torch.stack([value * weight, weight], dim=1)
+    factor, constant = torch.linalg.lstsq(design, target[:, None], driver="gelsd").solution[:, 0].tolist()
+    if not factor > 0:
+        other, way = ("disparity", "nearer") if kind == "depth" else ("depth", "farther")
+        raise ValueError(f"the points say that larger values are {way}; that is kind={other!r}, not {kind!r}")
+    residual = float((design @ torch.tensor([factor, constant], dtype=torch.float64) - target).square().mean().sqrt())
+    if kind == "depth":
+        return Scale("z", factor, constant / factor, residual)
+    return Scale("disparity", 1.0 / factor, constant / factor, residual)
+
+
+def _near_and_far(near_m: float, far_m: float, kind: RelativeKind) -> tuple[float, float]:
+    """Refuse distances that are none, or the wrong way round."""
+    near_m = number("near_m", near_m, low=0, unit="metres")
+    far_m = number("far_m", far_m, low=0, unit="metres", infinite=kind != "depth")
+    if not near_m < far_m:
+        raise ValueError(f"near_m must be nearer than far_m, got near_m={near_m:g} and far_m={far_m:g}")
+    return near_m, far_m
+
+
+def _range(value_range: tuple[float, float]) -> tuple[float, float]:
+    """Refuse what is not two numbers in order."""
+    if not isinstance(value_range, tuple | list) or len(value_range) != 2:
+        raise ValueError(f"value_range must be (smallest, largest), got {show(value_range)}")
+    low, high = (number("value_range", x) for x in value_range)
+    if not low < high:
+        raise ValueError(f"value_range must be (smallest, largest), got ({low:g}, {high:g})")
+    return low, high
+
+
+def _relative_map(values: Tensor) -> None:
+    """Refuse what is not ``[B, 1, H, W]`` of numbers."""
+    if not isinstance(values, Tensor):
+        hint = "; convert an array with torch.from_numpy(array)[None, None]"
+        raise ValueError(f"relative depth must be a tensor [B, 1, H, W], got {type(values).__name__}{hint}")
+    number_map("relative depth", values)
+    if values.ndim != 4 or values.shape[1] != 1:
+        hint = "; add the missing dimensions, as values[:, None] does" if values.ndim < 4 else ""
+        raise ValueError(f"relative depth must be [B, 1, H, W], got {list(values.shape)}{hint}")
+
+
+def _point(values: Tensor, point: tuple[float, float, float], kind: RelativeKind, patch: int) -> tuple[float, float]:
+    """Value and metres of a point."""
+    if not isinstance(point, Sequence) or len(point) != 3:
+        raise ValueError(f"a point must be (x, y, metres), got {show(point)}")
+    x, y = (number(name, place) for name, place in zip("xy", point, strict=False))
+    metres = number("the distance of a point", point[2], low=0, unit="metres", infinite=kind != "depth")
+    height, width = values.shape[-2:]
+    if not (0 <= x < width and 0 <= y < height):
+        raise ValueError(f"point ({x:g}, {y:g}) must lie in the map of {width} x {height} pixels (x, y)")
+    column, row, reach = int(x), int(y), patch // 2
+    window = values[0, 0, max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1].double()
+    window = window[window.isfinite()]
+    if not window.numel():
+        raise ValueError(f"no value within {reach} pixels of point ({x:g}, {y:g}); choose another point")
+    return float(window.median()), metres

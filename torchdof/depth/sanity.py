@@ -1,0 +1,232 @@
+"""Does depth fit the camera? A wrong unit renders without complaint; here it is said, with what mends it.
+
+The rendering itself never asks: it may run under a compiler, on a GPU, a million times. ``torchdof render`` and
+``torchdof inspect`` ask for each frame, others call :func:`check` where they read their depth.
+"""
+
+import dataclasses
+import math
+import warnings
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ..optics.camera import Camera
+from ..validation import real_tensor
+from .kinds import DepthKind
+
+__all__ = ["DepthWarning", "Doubt", "check", "coc_doubts", "depth_doubts"]
+
+_FACTORS = (0.001, 0.01, 1000.0, 100.0)  # millimetres and centimetres; and what was taken for such and is none
+_SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # what counts as in focus: the larger of both
+_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
+_FAR_M, _HAND_M = 500.0, 0.1
+_LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # a real macro lens reaches half the frame's width
+_WIDEST_F_NUMBER = 0.5  # of an aplanatic lens in air
+
+
+class DepthWarning(UserWarning):
+    """Depth and camera hardly fit: a wrong unit, scale or kind of numbers is likely."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Doubt:
+    """What looks like a mistake.
+
+    Args:
+        name: "focus": nothing is in focus; "far": everything is so far that nothing is blurred; "bits": whole numbers
+            as files of 8 bits hold; "blur": blur that no lens makes; "range": relative depth of a sequence without the
+            range of its values.
+        message: What is the case, the likely mistake and what mends it.
+    """
+
+    name: Literal["focus", "far", "bits", "blur", "range"]
+    message: str
+
+
+def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
+    """Warns where a depth map hardly fits the camera: wrong units, a scale that is missing, relative depth as metres.
+
+    Looks at each value, on the device where the depth is, and waits for the result: call it where depth is read, not
+    in a training loop. Sensible extremes pass: macro, astronomy, scenes wholly in focus.
+
+    Args:
+        depth: ``[B, 1, H, W]``, metres; ``inf`` and holes (NaN, zero, negative) are left out.
+        camera: The camera; its numbers floats or ``[B]``.
+        strict: Raise instead of warning.
+
+    Raises:
+        ValueError: If there is a doubt and ``strict``, or an argument is not as described.
+
+    Example:
+        >>> millimetres = torch.linspace(800.0, 5000.0, 96).expand(1, 1, 64, 96)
+        >>> check(millimetres, Camera(focus_m=2.0), strict=True)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: nothing is in focus: the focus at 2 m is nearer than all depth (800 to 5000 m), ...
+    """
+    for doubt in depth_doubts(depth, camera):
+        if strict:
+            raise ValueError(doubt.message)
+        warnings.warn(doubt.message, DepthWarning, stacklevel=2)
+
+
+def depth_doubts(
+    depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"] = "z", scale: float | None = None
+) -> list[Doubt]:
+    """What looks wrong with a depth map seen by a camera.
+
+    Args:
+        depth: ``[B, 1, H, W]``, metres; ``inf`` and holes (NaN, zero, negative) are left out.
+        camera: The camera; its numbers floats or ``[B]``.
+        kind: What the numbers were before they became metres, and
+        scale: the factor they were given, for what is advised.
+
+    Returns:
+        The doubts, of each name at most one, of the first item that raises it.
+
+    Raises:
+        ValueError: If an argument is not as described.
+
+    Example:
+        >>> depth_doubts(torch.full((1, 1, 4, 6), 3.0), Camera(focus_m=3.0))
+        []
+    """
+    real_tensor("depth", depth, "[B, 1, H, W] in metres")
+    if depth.ndim != 4 or depth.shape[1] != 1:
+        raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
+    numbers = [torch.as_tensor(getattr(camera, name)).reshape(-1) for name in _NUMBERS]
+    batch = max(depth.shape[0], *(x.numel() for x in numbers))
+    found: dict[str, Doubt] = {}
+    for item in range(batch):
+        single = camera.replace(
+            **{name: float(x[min(item, x.numel() - 1)]) for name, x in zip(_NUMBERS, numbers, strict=True)}
+        )
+        for doubt in _doubts(depth[min(item, depth.shape[0] - 1)], single, kind, scale):
+            found.setdefault(doubt.name, doubt)
+    return list(found.values())
+
+
+def coc_doubts(coc_px: Tensor) -> list[Doubt]:
+    """What looks wrong with a ready map of the circle of confusion, ``[B, 1, H, W]`` in pixels.
+
+    Example:
+        >>> [doubt.name for doubt in coc_doubts(torch.full((1, 1, 4, 6), 1500.0))]
+        ['blur']
+    """
+    real_tensor("coc_px", coc_px, "[B, 1, H, W] in pixels")
+    size = coc_px[coc_px.isfinite()].abs()
+    width = coc_px.shape[-1]
+    if not size.numel() or _share_at(size, 0.99) <= _LARGEST_WIDTHS * width:
+        return []
+    message = (
+        f"a blur radius of {float(size.max()):.0f} px on an image of {width} px is more than a lens makes; are these "
+        "depths and no circles of confusion? (--depth-kind)"
+    )
+    return [Doubt("blur", message)]
+
+
+def _doubts(depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"], scale: float | None) -> list[Doubt]:
+    """Doubts of one map ``[1, H, W]`` and a camera of plain numbers."""
+    width, focus_m = depth.shape[-1], float(camera.focus_m)
+    known = depth[depth > 0].detach()
+    if not known.numel():
+        return []
+    coc_px = camera.coc_px(known.reshape(1, 1, 1, -1), width).abs().flatten()
+    finite = known[known.isfinite()]
+    if not finite.numel():
+        finite = known
+    near, far = float(finite.min()), float(finite.max())
+    extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
+    of_bits = far <= 65535 and _whole_numbers(finite)
+    sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
+    if float(coc_px.min()) > sharp_px:
+        return [Doubt("focus", _nothing_sharp(near, far, extent, focus_m, of_bits, kind, scale))]
+    found = []
+    if of_bits and far <= 255 and far - near >= 64:
+        found.append(
+            Doubt(
+                "bits", f"all depth is whole numbers {extent}, as files of 8 bits hold; if it is relative, {_RELATIVE}"
+            )
+        )
+    elif _share_at(finite, 0.05) > _FAR_M and float(coc_px.max()) <= sharp_px and (of_bits or focus_m < math.inf):
+        unit = _advice(0.001, scale)
+        message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
+        found.append(Doubt("far", message))
+    largest = float(coc_px.max())
+    too_wide = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
+    if too_wide or _share_at(coc_px, 0.99) > _LARGEST_WIDTHS * width:
+        found.append(Doubt("blur", _too_blurred(largest, width, far, extent, camera)))
+    return found
+
+
+def _nothing_sharp(
+    near: float,
+    far: float,
+    extent: str,
+    focus_m: float,
+    of_bits: bool,
+    kind: DepthKind | Literal["relative"],
+    scale: float | None,
+) -> str:
+    """What to say where nothing is in focus."""
+    if near <= focus_m <= far:
+        return (
+            f"nothing is in focus: no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something "
+            "with --focus-at X,Y"
+        )
+    factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
+    side, hints = "nearer" if focus_m < near else "farther", []
+    if kind in ("disparity", "inverse"):
+        hints.append(
+            "disparity needs its scale, the baseline in metres times the focal length in pixels (--depth-scale, "
+            f"{'not given' if scale is None else f'now {scale:g}'}); where nobody knows it, {_RELATIVE}"
+        )
+    elif kind != "relative" and of_bits and far <= 255:
+        hints.append(f"its whole numbers are those of a file of 8 bits; if they are relative depth, {_RELATIVE}")
+    elif kind != "relative" and 0.9 < far <= 1.0 and focus_m > far:
+        hints.append(f"if these are relative depth from 0 to 1, {_RELATIVE}")
+    elif kind != "relative" and factor is not None:
+        hints.append(f"is it {_advice(factor, scale)}?")
+    if kind in ("z", "distance") and focus_m < near:
+        hints.append("if near is large in it, it is disparity (--depth-kind disparity)")
+    if far < _HAND_M:
+        hints.append("all of it lies within a hand's breadth")
+    hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
+    return f"nothing is in focus: the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
+
+
+def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Camera) -> str:
+    """What to say of blur that no lens makes."""
+    hand = "all depth lies within a hand's breadth" if far < _HAND_M else "the depth"
+    return (
+        f"a blur radius of {largest:.0f} px on an image of {width} px is more than a lens makes: {hand} {extent}, the "
+        f"focus {float(camera.focus_m):.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
+        f"(f/{float(camera.f_number):.2g}); which is in another unit? --depth-scale, --focus-m and --aperture-radius-m "
+        "make or take metres"
+    )
+
+
+_RELATIVE = "--depth-kind relative --near-m METRES --far-m METRES"
+
+
+def _advice(factor: float, scale: float | None) -> str:
+    """What depth is in that this factor makes metres of, and the option that does."""
+    total = factor * (1.0 if scale is None else scale)
+    option = "leave --depth-scale out" if math.isclose(total, 1.0) else f"--depth-scale {total:.4g}"
+    if factor > 1.0:
+        return f"{factor:g} times too small for metres ({option})"
+    return f"{'millimetres' if factor == 0.001 else 'centimetres'} ({option})"
+
+
+def _whole_numbers(values: Tensor) -> bool:
+    """Whether many different values all are whole numbers."""
+    sample = values[:: max(1, values.numel() // 65536)]
+    return bool((sample == sample.round()).all()) and sample.unique().numel() >= 16
+
+
+def _share_at(values: Tensor, share: float) -> float:
+    """The value that this share of the values does not exceed; of many values a sample."""
+    sample = values[:: max(1, values.numel() // 65536)].float()
+    return float(sample.sort().values[min(sample.numel() - 1, int(share * sample.numel()))])

@@ -1,0 +1,39 @@
+"""Pictures side by side in one file, each with a caption."""
+
+import os
+
+import torch
+from torch import Tensor
+
+from .images import Picture, write_image
+
+__all__ = ["write_sheet"]
+
+
+def write_sheet(path: str | os.PathLike[str], panels: dict[str, Tensor], margin: int = 8, caption: int = 34) -> None:
+    """Writes panels side by side, each with its caption above.
+
+    Args:
+        path: Where to, as for :func:`torchdof.io.images.write_image`.
+        panels: Caption -> ``[1, 3, H, W]`` in linear light, all of one size.
+        margin: Pixels between panels.
+        caption: Height of the line of captions in pixels.
+
+    Raises:
+        ValueError: If the type of file is not known.
+        OSError: If the file cannot be written.
+    """
+    import OpenImageIO as oiio
+
+    height, width = next(iter(panels.values())).shape[-2:]
+    sheet = torch.full((1, 3, height + caption + margin, len(panels) * (width + margin) + margin), 0.8)
+    for k, panel in enumerate(panels.values()):
+        left = margin + k * (width + margin)
+        sheet[:, :, caption : caption + height, left : left + width] = panel.cpu()
+    buffer = oiio.ImageBuf(sheet[0].permute(1, 2, 0).contiguous().numpy())  # [3, H, W] -> [H, W, 3]
+    for k, text in enumerate(panels):
+        oiio.ImageBufAlgo.render_text(
+            buffer, margin + k * (width + margin), caption - 11, text, 20, "", (0.0, 0.0, 0.0)
+        )
+    pixels = torch.from_numpy(buffer.get_pixels(oiio.FLOAT)).permute(2, 0, 1)[None]
+    write_image(path, Picture(pixels, sample="8", transfer="srgb"))
