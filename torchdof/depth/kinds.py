@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..validation import number, real_tensor, show
+from ..validation import WHOLE_NUMBERS, number, real_tensor, show
 
 __all__ = ["DepthKind", "depth_from_values", "number_map"]
 
@@ -100,7 +100,7 @@ def number_map(name: str, values: Tensor) -> None:
         ValueError: If it is not a tensor of real numbers, or empty.
     """
     # integers are what files hold; of the rest only what arithmetic works on
-    if isinstance(values, Tensor) and values.dtype in (torch.uint8, torch.int16, torch.int32, torch.int64):
+    if isinstance(values, Tensor) and values.dtype in WHOLE_NUMBERS:
         values = values.double()
     real_tensor(name, values, "[B, 1, H, W]")
     if not values.numel():

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..validation import real_tensor
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
 from .decode import PixelType, existing, first_line, read_array, read_parts
@@ -151,7 +152,8 @@ def write_image(
     if transfer is None:
         same_nature = (sample in ("half", "float")) == (picture.sample in ("half", "float"))
         transfer = picture.transfer if same_nature else default_transfer(sample)
-    pixels, names = picture.pixels.detach().cpu().float(), picture.channels
+    pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
+    names = picture.channels
     if pixels.ndim != 4 or pixels.shape[0] != 1 or pixels.shape[1] != len(names):
         raise ValueError(f"{path}: pixels must be [1, {len(names)}, H, W] for {names}, got {list(pixels.shape)}")
     if picture.has_alpha and suffix not in _HOLDS_ALPHA:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..validation import number, pixels_wide, real_tensor, show
+from ..validation import WHOLE_NUMBERS, floating, number, pixels_wide, real_tensor, show
 from . import psf, table_file
 
 __all__ = ["BlurTable"]
@@ -371,7 +371,7 @@ def _numbers(name: str, value: Any) -> Tensor:
     """Finite numbers as a float64 tensor on the CPU, or a refusal by name."""
     try:
         numbers = torch.as_tensor(value)
-        if numbers.dtype == torch.bool or numbers.is_complex() or numbers.layout != torch.strided:
+        if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
             raise TypeError
         if not isinstance(value, Tensor):
             numbers = torch.as_tensor(value, dtype=torch.float64)  # a list would have come as float32

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ..validation import real_tensor, show
+from ..validation import WHOLE_NUMBERS, real_tensor, show
 from .kernel_cache import KernelCache
 
 __all__ = ["FAMILIES", "disc", "gaussian", "profile", "radial", "pixel_kernels", "ring", "softm", "support"]
@@ -33,7 +33,6 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
-_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 _SMALLEST = 1e-4  # px; a length below it is rendered as this, which is a kernel of one pixel
 _CACHED_HALF_WIDTH = 64
 _LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
@@ -272,7 +271,7 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
 def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
     """One parameter as a float64 tensor, or a refusal by name."""
     if isinstance(value, Tensor):
-        tensor = real_tensor(name, value.double() if value.dtype in _INTEGERS else value, "[...]")
+        tensor = real_tensor(name, value.double() if value.dtype in WHOLE_NUMBERS else value, "[...]")
         if not tensor.numel():
             raise ValueError(f"{name} must hold at least one number, got {show(value)}")
         return tensor.to(device, torch.float64)

@@ -104,7 +104,8 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> tuple[T
     # what the mean colours do not explain goes to both; the own part takes what the other leaves: no light is lost
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
     unexplained = colour - (1.0 - other_weight) * own_mean - other_weight * other_mean
-    other = (other_mean + unexplained * other_weight / (other_weight**2 + (1.0 - other_weight) ** 2)).clamp_min(0.0)
+    other = other_mean + unexplained * other_weight / (other_weight**2 + (1.0 - other_weight) ** 2)
+    other = torch.maximum(other, torch.minimum(colour, other_mean).clamp_max(0.0))  # no darker than dark, or than given
     own = (colour - other_weight * other) / (1.0 - other_weight)
     return (
         pixels.put(light, edge_pixels, own),

@@ -95,6 +95,8 @@ void Job::take_scene() {
     surfaces.coc = clean_coc.data();
   }
   block_peak = Buffer<float>(surfaces.blocks.size());
+  constexpr float BRIGHTEST = 268435456.0f;  // 2 to the 28th: fourth powers of light are summed
+  std::vector<uint8_t> too_bright(surfaces.block_rows, 0);
   auto find_ends = [&] {
     parallel(surfaces.block_rows, [&](int by, int) {
       for (int bx = 0; bx < surfaces.block_columns; bx++) {
@@ -108,14 +110,13 @@ void Job::take_scene() {
         block_low[block] = block_least;
         block_high[block] = block_most;
         block_peak[block] = peak;
+        if (std::max(peak, -dimmest) > BRIGHTEST) too_bright[by] = 1;
         if (block_least < low || block_most > high) beyond[by] = 1;
       }
     });
   };
   find_ends();
-  constexpr float BRIGHTEST = 1.2676506e30f;  // 2 to the 100th
-  for (size_t i = 0; i < surfaces.blocks.size(); i++)
-    if (block_peak[i] > BRIGHTEST) throw TooBright();
+  if (scene.kind != TORCHDOF_STACK && std::count(too_bright.begin(), too_bright.end(), 1)) throw TooBright();
   if (std::count(beyond.begin(), beyond.end(), 1)) {
     const float *given = surfaces.coc;
     Buffer<float> within(area);

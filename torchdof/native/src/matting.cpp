@@ -177,7 +177,8 @@ void split(const Job &job, Window &w, int y, int x, const f8 *falloff, const Blo
   for (int c = 0; c < channels; c++) {
     const float mine = is_near ? front[c] : behind[c], its = is_near ? behind[c] : front[c];
     const float rest = colour[c] - (1.0f - share) * mine - share * its;
-    const float other = std::max(its + rest * share / norm, 0.0f);
+    const float darkest = std::min(std::min(colour[c], its), 0.0f);  // given light may be negative
+    const float other = std::max(its + rest * share / norm, darkest);
     block.other[c * BLOCK_PIXELS + at] = other;
     block.own[c * BLOCK_PIXELS + at] = (colour[c] - share * other) / (1.0f - share);
   }
