@@ -4,7 +4,6 @@ import dataclasses
 import math
 import os
 import time
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -16,7 +15,7 @@ from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
 from ..optics.blur_table import BlurTable
 from ..options import Options
-from ..validation import image_and_map
+from ..validation import coc_of_lens, image_and_map
 from .settings import RenderSettings
 
 __all__ = ["render_frame", "tint_focus"]
@@ -47,7 +46,7 @@ def render_frame(
         ValueError: If input is wrong or missing.
         OSError: If a file cannot be read or written.
     """
-    if any(Path(source).resolve() == Path(out).resolve() for source in (image, depth) if source is not None):
+    if any(os.path.realpath(source) == os.path.realpath(out) for source in (image, depth) if source is not None):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
     start = time.perf_counter()
     picture = read_image(image, settings.transfer, settings.layer)
@@ -63,6 +62,7 @@ def render_frame(
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
+        coc_of_lens(coc_px, values, settings.stated(camera))
         parts.append(
             f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
             f"{camera.sensor_width_mm:.4g} mm"

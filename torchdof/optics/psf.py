@@ -207,7 +207,7 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
         return (r <= checked["radius"]).to(torch.float64)
     if family == "softm":
         edge = 0.5 * torch.erfc((r - checked["radius"]) / (math.sqrt(2) * checked["sigma"].clamp_min(1e-12)))
-        return edge * _tilt(r, checked)
+        return edge * _tilt(torch.where(edge > 0, r, 0.0), checked)
     values, radius = checked["values"], checked["radius"]
     place = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
     low = place.floor().long().clamp(max=values.shape[-1] - 2)
@@ -367,7 +367,9 @@ def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Ten
     if family == "softm":
         width = math.sqrt(2) * p["sigma"]
         rise = _erfc_integral((outer - p["radius"]) / width) - _erfc_integral((inner - p["radius"]) / width)
-        return (rise * width / thickness).clamp_min(0.0) * _tilt((inner + outer) / 2, p)
+        # far out the edge is 0, and the tilt may be beyond numbers
+        middle = torch.where(rise > 0, (inner + outer) / 2, 0.0)
+        return (rise * width / thickness).clamp_min(0.0) * _tilt(middle, p)
     return (_table_integral(outer, p) - _table_integral(inner, p)).clamp_min(0.0) / thickness
 
 
