@@ -16,6 +16,7 @@ __all__ = ["BlurTable"]
 UNITS = ("fraction", "mm", "relative")
 _COC_RANGE = (1e-9, 1e6)
 _WIDEST = 1e4  # times the circle of confusion; a blur that is not of the focus shows at small ones
+_STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
 _TRIED_PX = (0.5, 6.0)  # radii of the widest kernel tried
 
 
@@ -319,6 +320,8 @@ class BlurTable:
             low = -1.0 if name == "b" else 0.0
             if bool((value < low).any()):
                 raise ValueError(f"params.{name} must be >= {low:g}, got {float(value.min()):g}")
+            if name == "m" and bool((value > _STEEPEST).any()):
+                raise ValueError(f"params.m must be <= {_STEEPEST:g}, got {float(value.max()):g}")
             if name == "values" and (value.shape[-1] < 2 or bool((value.sum(-1) == 0).any())):
                 raise ValueError("params.values must hold at least two values a node, not all of them 0")
             checked[name] = value

@@ -34,6 +34,7 @@ LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
 _SMALLEST = 1e-4  # px; a length below it is rendered as this, which is a kernel of one pixel
+_TILT_EXPONENT = 460.0  # of e: 1e200
 _CACHED_HALF_WIDTH = 64
 _LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
 _ALWAYS_WHOLE = 256  # px on each side of the centre; a kernel up to there is computed whole, whatever its window
@@ -207,7 +208,7 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
         return (r <= checked["radius"]).to(torch.float64)
     if family == "softm":
         edge = 0.5 * torch.erfc((r - checked["radius"]) / (math.sqrt(2) * checked["sigma"].clamp_min(1e-12)))
-        return edge * _tilt(torch.where(edge > 0, r, 0.0), checked)
+        return edge * _tilt(r, checked)
     values, radius = checked["values"], checked["radius"]
     place = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
     low = place.floor().long().clamp(max=values.shape[-1] - 2)
@@ -295,7 +296,8 @@ def _reach(family: str, params: Mapping[str, Tensor]) -> Tensor:
 
 
 def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
-    return (1.0 + params["b"] * (r / params["radius"]) ** params["m"]).clamp_min(0.0)
+    farthest = torch.exp(_TILT_EXPONENT / params["m"].detach().clamp_min(1.0))  # a larger power would overflow
+    return (1.0 + params["b"] * torch.minimum(r / params["radius"], farthest) ** params["m"]).clamp_min(0.0)
 
 
 def _gaussian_quadrant(sigma: Tensor, half: int) -> Tensor:
@@ -367,9 +369,7 @@ def _slice_means(family: str, p: Mapping[str, Tensor], inner: Tensor, outer: Ten
     if family == "softm":
         width = math.sqrt(2) * p["sigma"]
         rise = _erfc_integral((outer - p["radius"]) / width) - _erfc_integral((inner - p["radius"]) / width)
-        # far out the edge is 0, and the tilt may be beyond numbers
-        middle = torch.where(rise > 0, (inner + outer) / 2, 0.0)
-        return (rise * width / thickness).clamp_min(0.0) * _tilt(middle, p)
+        return (rise * width / thickness).clamp_min(0.0) * _tilt((inner + outer) / 2, p)
     return (_table_integral(outer, p) - _table_integral(inner, p)).clamp_min(0.0) / thickness
 
 
