@@ -4,7 +4,6 @@ OpenImageIO is imported when a file is read, so that ``import torchdof`` stays l
 """
 
 import dataclasses
-import mmap
 import os
 import struct
 import tokenize
@@ -16,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..validation import show
+from . import png
 from .memory import free_bytes
 from .metadata import kept_metadata
 
@@ -98,7 +98,7 @@ def _read_every_part(path: Path) -> list[Part]:
     import OpenImageIO as oiio
 
     if path.suffix.lower() == ".png":
-        _check_png(path)
+        png.check(path)
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
@@ -231,28 +231,6 @@ def _check_size(path: Path, width: int, height: int, pixel_bytes: int, others: i
             f"{max(0.0, free) / 2**30:.3g} GiB of memory are free"
         )
     return needed
-
-
-def _check_png(path: Path) -> None:
-    """Refuse a PNG that is cut short or damaged: its library would print a line of its own besides.
-
-    Raises:
-        OSError: If a chunk is not there to its end, or its checksum is wrong.
-    """
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        place, name = 8, b""
-        if content[:place] != b"\x89PNG\r\n\x1a\n":
-            raise OSError(f"{path}: is not a PNG file")
-        while name != b"IEND":
-            length, name = struct.unpack(">I4s", content[place : place + 8].ljust(8, b"\0"))
-            end = place + 12 + length
-            if end > len(content):
-                raise OSError(f"{path}: is damaged or cut short (it ends before its pixels do)")
-            with memoryview(content) as view, view[place + 4 : end - 4] as checked:
-                wrong = zlib.crc32(checked) != int.from_bytes(content[end - 4 : end], "big")
-            if wrong:
-                raise OSError(f"{path}: is damaged or cut short (its part {show(name)} has another checksum)")
-            place = end
 
 
 def first_line(text: str) -> str:
