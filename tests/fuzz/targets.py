@@ -256,6 +256,8 @@ def _render(path: Path) -> None:
     plain, compiled = pictures
     good = torch.isfinite(image).all(1, keepdim=True) & torch.isfinite(coc)
     light = torch.where(good, image, 0.0).abs().amax().double()
+    if not options["normalize"] and light > 1e37:  # a plain sum may be beyond what its type holds
+        return
     for name, picture in (("plain", plain), ("compiled", compiled)):
         assert bool(torch.isfinite(picture[good.expand_as(picture)]).all()), f"{name}: light that is not finite"
         largest = torch.where(good, picture, 0.0).abs().amax().double()

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..validation import show
-from . import png
+from . import exr, png
 from .memory import free_bytes
 from .metadata import kept_metadata
 
@@ -99,6 +99,8 @@ def _read_every_part(path: Path) -> list[Part]:
 
     if path.suffix.lower() == ".png":
         png.check(path)
+    elif path.suffix.lower() == ".exr":
+        exr.check(path)
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)

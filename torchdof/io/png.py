@@ -16,6 +16,7 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a pixel, by the type of colour
 _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 _PASSES = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
+_MOST_PARTS = 4096  # texts, most of them; the library takes minutes for 1e5
 _PIECE = 2**20  # bytes inflated at once
 
 
@@ -50,6 +51,8 @@ def _check(content: mmap.mmap) -> None:
         known = name in (b"IHDR", b"PLTE", b"IDAT", b"IEND") or name[:1].islower()
         if not known or not name.isalpha() or not name[2:3].isupper():
             raise _Damaged(f"it has a part {name!r}")
+    if len(names) - count > _MOST_PARTS:
+        raise _Damaged(f"it has more than {_MOST_PARTS} parts beside its pixels")
     start, end = chunks[0][1:]
     if end - start != 13:
         raise _Damaged("its header has another length")
