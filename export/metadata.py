@@ -9,13 +9,17 @@ from typing import Any
 import onnx
 
 from torchdof import BlurTable, DepthOfField
+from torchdof.io.memory import free_bytes
 from torchdof.optics.camera import Camera
 
 from .graph import OUTPUT, Portable
 
-__all__ = ["UNITS", "describe", "facts_of", "label", "load", "table_hash", "write_facts"]
+__all__ = ["UNITS", "describe", "facts_of", "label", "load", "shown", "table_hash", "write_facts"]
 
 PREFIX = "torchdof."
+_LONGEST, _MOST = 2**16, 100  # characters of one of the metadata, and how many there are at most
+_SHOWN = 300  # characters of a text
+_TIMES_READ = 3  # memory that reading a file takes
 UNITS = {
     "image": "[B, {channels}, H, W] float32, linear light, >= 0, any range",
     "depth": "[B, 1, H, W] float32, metres along the optical axis, inf allowed; NaN, zero and negative pass sharp",
@@ -70,33 +74,65 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
         ValueError: If it is not such a file.
         FileNotFoundError: If there is no file.
     """
-    return facts_of(load(path), str(path))
+    return facts_of(load(path, whole=False), str(path))
 
 
-def load(path: str | os.PathLike[str]) -> onnx.ModelProto:
+def load(path: str | os.PathLike[str], whole: bool = True) -> onnx.ModelProto:
     """Read an ONNX file.
 
+    Args:
+        path: The file.
+        whole: Whether tensors that lie in other files are read as well; a stranger's file may name any.
+
     Raises:
-        ValueError: If it is not one.
+        ValueError: If it is not one, or larger than there is memory for.
         FileNotFoundError: If there is none.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(f"there is no file {path}")
+    size, free = os.path.getsize(path), free_bytes()
+    if _TIMES_READ * size > free:
+        raise ValueError(f"{path} takes {size / 2**30:.3g} GiB, more than there is memory for")
     try:
-        model = onnx.load(path)
+        model = onnx.load(path, load_external_data=whole)
     except Exception as error:  # protobuf has several ways to fail on bytes that are none
-        raise ValueError(f"{path} is not an ONNX file: {error}") from error
+        raise ValueError(f"{path} is not an ONNX file: {shown(str(error))}") from error
     if not model.graph.output:
         raise ValueError(f"{path} is not an ONNX file: it has no outputs")
     return model
 
 
 def facts_of(model: onnx.ModelProto, name: str) -> dict[str, Any]:
-    """The metadata of a model that has been read."""
-    facts = {p.key.removeprefix(PREFIX): p.value for p in model.metadata_props if p.key.startswith(PREFIX)}
-    if "options" not in facts:
+    """The metadata of a model that has been read, of a file of that name.
+
+    Raises:
+        ValueError: If they are not those that an export writes.
+    """
+    written: dict[str, str] = {}
+    for entry in model.metadata_props:
+        key, value = entry.key, entry.value
+        if not isinstance(key, str) or not isinstance(value, str):  # bytes that are no text come as bytes
+            raise ValueError(f"{name}: its metadata hold bytes that are no text")
+        if not key.startswith(PREFIX):
+            continue
+        if len(value) > _LONGEST or len(written) == _MOST:
+            raise ValueError(f"{name}: its metadata {shown(key)} are more than torchdof.export writes")
+        written[key.removeprefix(PREFIX)] = value
+    if "options" not in written:
         raise ValueError(f"{name} was not written by torchdof.export: it lacks the metadata {PREFIX}options")
-    return {key: json.loads(value) for key, value in facts.items()}
+    facts = {}
+    for key, value in written.items():
+        try:
+            facts[key] = json.loads(value)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{name}: its metadata {shown(PREFIX + key)} are not JSON: {shown(str(error))}") from None
+    return facts
+
+
+def shown(text: str) -> str:
+    """A stranger's text for people: one line, what would steer a terminal escaped, its beginning if it is long."""
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text[:_SHOWN])
+    return line if len(text) <= _SHOWN else f"{line}... ({len(text)} characters)"
 
 
 def table_hash(table: BlurTable) -> str:

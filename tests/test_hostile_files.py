@@ -11,8 +11,10 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from torchdof import BlurTable, Camera, DepthOfField
+from torchdof.cli.main import app
 from torchdof.export import describe
 from torchdof.fit import FitError, read_captures
 from torchdof.fit.lens.lens import Lens
@@ -152,3 +154,73 @@ def test_a_state_is_loaded_as_weights_only(tmp_path: Path) -> None:
     other = DepthOfField(Camera())
     other.load_state_dict(torch.load(tmp_path / "dof.pt", weights_only=True))
     assert other.camera.focus_m == 1.5 and other.options.table.to_dict() == dof.options.table.to_dict()
+
+
+# What `torchdof export --show` shows
+
+
+def model_with(path: Path, facts: dict[str, str], external: str | None = None) -> None:
+    """An ONNX file with these metadata and, if named, a tensor that lies in another file."""
+    node = onnx.helper.make_node("Identity", ["image"], ["out"])
+    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in ("image", "out")]
+    graph = onnx.helper.make_graph([node], "g", values[:1], values[1:])
+    if external is not None:
+        tensor = graph.initializer.add(name="w", data_type=onnx.TensorProto.FLOAT, dims=[1])
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value=external)
+    model = onnx.helper.make_model(graph)
+    for key, value in {"torchdof.options": "{}", **facts}.items():
+        model.metadata_props.add(key=key, value=value)
+    onnx.save_model(model, path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["\x1b[2J\x1b]0;title\x07", "line\nbreak\rback", "\u202edrow", "\x00\x08\x7f\x9b", "x" * 20_000],
+    ids=["escape", "lines", "direction", "control", "long"],
+)
+def test_shown_metadata_cannot_steer_a_terminal_or_fill_it(tmp_path: Path, text: str) -> None:
+    facts = {"torchdof.table": json.dumps({"name": text, text: 1}), f"torchdof.{text}": json.dumps(text)}
+    model_with(tmp_path / "x.onnx", facts)
+    result = CliRunner().invoke(app, ["export", "--show", str(tmp_path / "x.onnx")])
+    assert result.exit_code == 0 and len(result.output) < 3000
+    assert all(line.isprintable() for line in result.output.split("\n"))
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ('"' + "x" * 2**20 + '"', "are more than torchdof.export writes"),
+        ("[" * 50_000, "are not JSON"),
+        ("9" * 10_000, "are not JSON"),
+        ("{'a': 1}", "are not JSON"),
+    ],
+)
+def test_metadata_that_no_export_writes_are_refused_by_name(tmp_path: Path, value: str, message: str) -> None:
+    model_with(tmp_path / "x.onnx", {"torchdof.camera": value})
+    with pytest.raises(ValueError, match=rf"x\.onnx: its metadata torchdof.camera {message}"):
+        describe(tmp_path / "x.onnx")
+
+
+def test_endless_metadata_are_refused(tmp_path: Path) -> None:
+    model_with(tmp_path / "x.onnx", {f"torchdof.k{i}": "1" for i in range(1000)})
+    with pytest.raises(ValueError, match="are more than torchdof.export writes"):
+        describe(tmp_path / "x.onnx")
+
+
+def test_describing_a_file_opens_no_other(tmp_path: Path) -> None:
+    (tmp_path / "secret").write_bytes(b"1234")
+    model_with(tmp_path / "x.onnx", {}, external="secret")
+    (tmp_path / "secret").unlink()
+    assert describe(tmp_path / "x.onnx") == {"options": {}}
+    model_with(tmp_path / "y.onnx", {}, external="/etc/passwd")
+    assert describe(tmp_path / "y.onnx") == {"options": {}}
+
+
+def test_an_onnx_file_larger_than_memory_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model_with(tmp_path / "x.onnx", {})
+    monkeypatch.setattr("torchdof.export.metadata.free_bytes", lambda: 100.0)
+    with pytest.raises(ValueError, match=r"x\.onnx takes .* more than there is memory for"):
+        describe(tmp_path / "x.onnx")

@@ -598,7 +598,7 @@ def test_a_table_of_other_channels_than_the_image_is_refused() -> None:
         blur_by_coc(torch.rand(1, 1, 4, 5), torch.zeros(1, 1, 4, 5), table=TABLES["colours"])
 
 
-@pytest.mark.parametrize("wrong", [3, "plan", (0.0, 1.0), Plan((), 0.1), Plan((1.0, 0.0), 0.1), Plan(5, 0.1)])  # type: ignore[arg-type]
+@pytest.mark.parametrize("wrong", [3, "plan", (0.0, 1.0)])
 def test_what_is_no_plan_is_refused(wrong: Any) -> None:
     image, depth, camera = torch.rand(1, 3, 6, 7), torch.full((1, 1, 6, 7), 3.0), Camera(focus_m=1.0)
     for call in (
@@ -606,7 +606,7 @@ def test_what_is_no_plan_is_refused(wrong: Any) -> None:
         lambda: depth_of_field(image, depth, camera, plan=wrong),
         lambda: blur_by_coc(image, depth, plan=wrong),
     ):
-        with pytest.raises(ValueError, match=r"plan must (be a Plan, as|hold layers).* got "):
+        with pytest.raises(ValueError, match=r"plan must be a Plan, as.* got "):
             call()
 
 

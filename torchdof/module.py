@@ -1,6 +1,6 @@
 """Depth of field as a module and as functions: configuration, checks, then one call of the pipeline."""
 
-import math
+from collections.abc import Callable
 from typing import Any, Unpack
 
 import torch
@@ -10,7 +10,7 @@ from . import validation
 from .depth.edges import repair
 from .depth.size import at_size_of
 from .optics.blur_table import BlurTable
-from .optics.camera import Camera
+from .optics.camera import CAMERA_NUMBERS, Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import pipeline
 from .render.attention import Attention
@@ -81,7 +81,8 @@ class DepthOfField(nn.Module):
                 (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes the image's size only.
             focus_m: Focus distance in metres for this call, float or ``[B]``; None takes the camera's.
             f_number: F-number for this call, float or ``[B]``; None takes the camera's.
-            plan: Layers to render with, from :meth:`plan`; None plans for this image.
+            plan: Layers to render with, from :meth:`plan`; None plans for this image. Where the image is blurred more
+                than the plan reaches, layers are added; compiled code takes a plan as it is.
             background: What is seen where the nearer surfaces of the image are taken away, ``[B, C, H, W]``, where it
                 is known; it takes the place of the guess that fills what a blurred foreground uncovers.
             background_depth: Its depth in metres, ``[B, 1, H, W]`` or ``[1, 1, H, W]``; nowhere nearer than the image's
@@ -98,11 +99,11 @@ class DepthOfField(nn.Module):
             ValueError: If shapes, types or values are not as described.
         """
         options = self.options
-        coc = self._given_coc_px(image, depth, focus_m, f_number)
+        coc = self._coc_px(image, depth, focus_m, f_number, "depth")
+        validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
-            behind = self._given_coc_px(background, background_depth, focus_m, f_number)
-        validation.both_or_none(background, background_depth)  # here it is the depth that is missing
+            behind = self._coc_px(background, background_depth, focus_m, f_number, "background_depth")
         return _blur(image, coc, options, plan, background, behind, attention)
 
     def layers(
@@ -139,8 +140,8 @@ class DepthOfField(nn.Module):
         maps = depth.expand(batch, -1, 1, height, width).transpose(1, 2).flatten(2, 3)  # [B, 1, N * H, W]
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
-        coc = self._given_coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number)
-        return pipeline.blur_stack(rgba, coc.unflatten(2, (count, height)).transpose(1, 2), options)
+        coc = self._coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number, "depth_m")
+        return _rendered(pipeline.blur_stack, rgba, coc.unflatten(2, (count, height)).transpose(1, 2), options)
 
     def coc_px(
         self,
@@ -149,23 +150,35 @@ class DepthOfField(nn.Module):
         focus_m: float | Tensor | None = None,
         f_number: float | Tensor | None = None,
     ) -> Tensor:
-        """Signed circle of confusion of the call :meth:`forward` with the same arguments: ``[B, 1, H, W]``, pixels."""
-        return _with_edges(image, self._given_coc_px(image, depth, focus_m, f_number), self.options)
+        """Signed circle of confusion of the call :meth:`forward` with the same arguments: ``[B, 1, H, W]``, pixels.
 
-    def _given_coc_px(
-        self, image: Tensor, depth: Tensor, focus_m: float | Tensor | None, f_number: float | Tensor | None
+        Raises:
+            ValueError: As :meth:`forward`; so does a lens that blurs beyond what numbers hold.
+        """
+        return _with_edges(image, self._coc_px(image, depth, focus_m, f_number, "depth"), self.options)
+
+    def _coc_px(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        focus_m: float | Tensor | None,
+        f_number: float | Tensor | None,
+        name: str,
     ) -> Tensor:
-        """The same of the depth as it is given."""
+        """That of a depth as it is given, which the caller knows by a name."""
         check = self.options.check
         if not validation.is_traced() and validation.is_resizable(image, depth):
             depth = at_size_of(image, depth)
-        validation.image_and_depth(image, depth, values=check)
+        validation.image_and_depth(image, depth, values=check, name=name)
         changes = {"focus_m": focus_m, "f_number": f_number}
         camera = self.camera.replace(**{k: v for k, v in changes.items() if v is not None})
         # as a tensor: an exported graph would take Python's arithmetic with the width to be in float32
         width: Any = torch.scalar_tensor(image.shape[-1], dtype=torch.float64)
         coc = camera.coc_px(depth, width)
-        return coc if check else torch.where(depth > 0, coc, torch.nan)
+        if not check:
+            return torch.where(depth > 0, coc, torch.nan)
+        validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
+        return coc
 
     def plan(
         self,
@@ -175,6 +188,8 @@ class DepthOfField(nn.Module):
         f_number: float | Tensor | None = None,
     ) -> Plan:
         """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`.
+
+        Plan for the frame that is blurred most: what other frames need beyond it is added anew in each.
 
         ``print`` tells which layers there are, of which radius, at which resolution, and which share of the pixels
         each carries.
@@ -299,19 +314,28 @@ def _blur(
     background_coc_px: Tensor | None,
     attention: Attention | None,
 ) -> Tensor:
-    """Check the arguments of a rendering, then render, with autocast switched off."""
+    """Check the arguments of a rendering, then render."""
     channels = options.table.channels
     validation.image_and_coc(image, coc_px, channels, values=options.check)
     _check_plan(plan)
-    hidden = validation.background(image, background, background_coc_px, channels, values=options.check)
+    validation.background(image, background, "background_coc_px", background_coc_px, "in pixels")
+    if options.check:
+        validation.finite_background(background, background_coc_px)
+    hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
     if hidden is not None and not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
     _check_attention(attention, plan)
     coc_px = _with_edges(image, coc_px, options)
-    if torch.is_autocast_enabled(image.device.type):  # it would run the convolutions in half precision
-        with torch.autocast(image.device.type, enabled=False):
-            return pipeline.blur_attended(image, coc_px, plan, options, hidden, attention)
-    return pipeline.blur_attended(image, coc_px, plan, options, hidden, attention)
+    return _rendered(pipeline.blur_attended, image, coc_px, plan, options, hidden, attention)
+
+
+def _rendered(render: Callable[..., Tensor], light: Tensor, *arguments: Any) -> Tensor:
+    """What a function of the pipeline makes of light, with autocast off: it would convolve in half precision."""
+    device = light.device.type
+    if not torch.is_autocast_enabled(device):
+        return render(light, *arguments)
+    with torch.autocast(device, enabled=False):
+        return render(light, *arguments)
 
 
 def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
@@ -323,19 +347,11 @@ def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
 
 
 def _check_plan(plan: Plan | None) -> None:
-    """Refuse what is not a plan, or one without layers in order."""
-    if plan is None:
-        return
-    if not isinstance(plan, Plan):
+    """Refuse what is not a plan."""
+    if plan is not None and not isinstance(plan, Plan):
         raise ValueError(
             f"plan must be a Plan, as DepthOfField.plan(image, depth) gives, or None, got {validation.show(plan)}; "
             "leave it out to plan for this image"
-        )
-    nodes = plan.nodes
-    numbers = isinstance(nodes, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in nodes)
-    if not numbers or not nodes or any(low >= high for low, high in zip(nodes, nodes[1:], strict=False)):
-        raise ValueError(
-            f"plan must hold layers as a tuple of strictly increasing numbers, got {validation.show(nodes)}"
         )
 
 

@@ -1,15 +1,20 @@
 """Tensors and numbers at the public boundary: taken as they are, or refused, saying what was expected and what came."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 __all__ = [
+    "WHOLE_NUMBERS",
     "background",
     "both_or_none",
+    "coc_of_lens",
     "depth_edges",
+    "finite_background",
+    "floating",
     "is_resizable",
     "image_and_coc",
     "image_and_depth",
@@ -23,6 +28,15 @@ __all__ = [
     "stack",
     "whole",
 ]
+
+
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+"""Types of number that PyTorch computes with; of smaller ones it only stores."""
+
+WHOLE_NUMBERS = (
+    *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
+    *(torch.int8, torch.int16, torch.int32, torch.int64),
+)
 
 
 def is_traced() -> bool:
@@ -59,6 +73,11 @@ def number(
     bounds = [f"> {low:g}"] * (low > -math.inf) + [f"< {high:g}"] * (high < math.inf)
     wanted = " ".join(["a number", *([f"of {unit}"] * bool(unit)), " and ".join(bounds)]).rstrip()
     raise ValueError(f"{name} must be {wanted}{' (inf allowed)' if infinite else ''}, got {show(value)}")
+
+
+def floating(value: Any) -> bool:
+    """Whether something is a tensor of floating-point numbers that can be computed with: not of 8 bits or fewer."""
+    return isinstance(value, Tensor) and value.dtype in _FLOATS
 
 
 def whole(name: str, value: Any, low: int, high: int) -> int:
@@ -100,7 +119,7 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
     """
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a tensor {what}, got {show(value)}")
-    if not value.is_floating_point():
+    if not floating(value):
         raise ValueError(f"{name} must be a floating-point tensor {what}, got {value.dtype}; convert it with .float()")
     if value.layout != torch.strided:
         raise ValueError(f"{name} must be a dense tensor {what}, got {value.layout}; convert it with .to_dense()")
@@ -119,19 +138,19 @@ def depth_edges(value: Any) -> None:
         raise ValueError(f"depth_edges must be 'auto', 'repair' or 'as given', got {show(value)}")
 
 
-def image_and_depth(image: Tensor, depth: Tensor, values: bool) -> None:
-    """Refuse an image and a depth map that do not belong together.
+def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "depth") -> None:
+    """Refuse an image and a depth map, which the caller knows by a name, that do not belong together.
 
     Raises:
         ValueError: If shapes or types are wrong, or, with ``values``, a depth is NaN or not positive.
     """
-    image_and_map(image, "depth", depth, "in metres")
+    image_and_map(image, name, depth, "in metres")
     if values and not is_traced():
         bad = int((~(depth > 0)).sum())
         if bad:
             raise ValueError(
-                f"depth must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or negative; "
-                "fill the holes, or pass check=False to let these pixels through sharp"
+                f"{name} must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or "
+                "negative; fill the holes, or pass check=False to let these pixels through sharp"
             )
 
 
@@ -180,15 +199,8 @@ def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) ->
     if channels not in (1, image.shape[1]):
         raise ValueError(f"the table blurs {channels} channels, the image has {image.shape[1]}")
     if values and not is_traced():
-        for name, tensor in (("coc_px", coc_px), ("image", image)):
-            if bool(torch.isfinite(tensor.sum())):  # one look at each value; a sum that overflows tells nothing
-                continue
-            bad = tensor.numel() - int(torch.isfinite(tensor).sum())
-            if bad:
-                raise ValueError(
-                    f"{name} must be finite, got {bad} of {tensor.numel()} values that are NaN or infinite; "
-                    "mend them, or pass check=False"
-                )
+        _finite("coc_px", coc_px)
+        _finite("image", image)
 
 
 def both_or_none(background: Tensor | None, where: Tensor | None) -> None:
@@ -202,37 +214,43 @@ def both_or_none(background: Tensor | None, where: Tensor | None) -> None:
         raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
 
 
-def background(
-    image: Tensor, hidden: Tensor | None, coc_px: Tensor | None, channels: int, values: bool
-) -> tuple[Tensor, Tensor] | None:
+def background(image: Tensor, hidden: Tensor | None, name: str, where: Tensor | None, unit: str) -> None:
     """Refuse a background that does not belong to an image.
 
     Args:
         image: ``[B, C, H, W]``.
         hidden: What lies behind it, of the same shape; None if nothing is known.
-        coc_px: Signed circle of confusion of ``hidden``, in pixels.
-        channels: As for :func:`image_and_coc`.
-        values: As for :func:`image_and_coc`.
-
-    Returns:
-        The background and its circle of confusion; None if there is none.
+        name: Of the map that tells where it lies.
+        where: That map.
+        unit: Of its numbers.
 
     Raises:
         ValueError: If one of both is missing, or shapes or types are wrong.
     """
-    both_or_none(hidden, coc_px)
-    if hidden is None or coc_px is None:
-        return None
-    if (
-        not isinstance(hidden, Tensor)
-        or not isinstance(coc_px, Tensor)
-        or hidden.shape != image.shape
-        or hidden.dtype != image.dtype
+    both_or_none(hidden, where)
+    if hidden is None or where is None:
+        return
+    if not isinstance(hidden, Tensor) or (hidden.shape, hidden.dtype, hidden.device) != (
+        image.shape,
+        image.dtype,
+        image.device,
     ):
-        got = f"{hidden.dtype} {list(hidden.shape)}" if isinstance(hidden, Tensor) else type(hidden).__name__
-        raise ValueError(f"background must be as the image is, {image.dtype} {list(image.shape)}, got {got}")
-    image_and_coc(hidden, coc_px, channels, values=values)
-    return hidden, coc_px
+        raise ValueError(f"background must be as the image is, {show(image)}, got {show(hidden)}")
+    _map(name, unit, where, image)
+    if not is_traced():
+        real_tensor("background", hidden, "[B, C, H, W]")
+        real_tensor(name, where, f"[B, 1, H, W] {unit}")
+
+
+def finite_background(hidden: Tensor | None, coc_px: Tensor | None) -> None:
+    """Refuse a background, or a circle of confusion of it, that is not finite.
+
+    Raises:
+        ValueError: Counting the values.
+    """
+    for name, values in (("background_coc_px", coc_px), ("background", hidden)):
+        if values is not None and not is_traced():
+            _finite(name, values)
 
 
 def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
@@ -242,10 +260,11 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
         The depths as ``[B, N, 1, H, W]``, each axis but N of its size or 1.
 
     Raises:
-        ValueError: If shapes or types are wrong, or, with ``values``, a coverage is outside [0, 1].
+        ValueError: If shapes or types are wrong, or, with ``values``, a coverage is outside [0, 1] or light is not
+            finite.
     """
     for name, value in (("rgba", rgba), ("depth_m", depth_m)):
-        if not isinstance(value, Tensor) or not value.is_floating_point():
+        if not floating(value):
             got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
             raise ValueError(f"{name} must be a floating-point tensor, got {got}")
     if rgba.ndim != 5 or rgba.shape[2] < 2 or 0 in rgba.shape:
@@ -269,7 +288,45 @@ def stack(rgba: Tensor, depth_m: Tensor, values: bool) -> Tensor:
             raise ValueError(
                 f"the last channel of rgba is coverage, in [0, 1]; {bad} of {cover.numel()} values are not"
             )
+        _finite("rgba", rgba)
     return depth
+
+
+def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
+    """Refuse a circle of confusion, computed from a lens and a depth > 0, that is beyond what numbers hold.
+
+    Args:
+        coc_px: What came out.
+        depth: In metres.
+        lens: What the caller stated of the lens: name and number or tensor.
+
+    Raises:
+        ValueError: Naming the nearest depth and all numbers of the lens.
+    """
+    if not is_traced() and not bool(torch.isfinite(coc_px.sum())) and not bool(torch.isfinite(coc_px).all()):
+        stated = ", ".join(f"{name} {_number(value)}" for name, value in lens.items())
+        raise ValueError(
+            f"this lens ({stated}) blurs a depth of {float(depth.detach().min()):.3g} m beyond any number of pixels; "
+            "check both"
+        )
+
+
+def _number(value: Any) -> str:
+    """A number of a lens, or those of its batch."""
+    numbers = value.detach().flatten().tolist() if isinstance(value, Tensor) else [value]
+    return " ".join(f"{x:.6g}" for x in numbers)
+
+
+def _finite(name: str, values: Tensor) -> None:
+    """Refuse numbers that are NaN or infinite."""
+    if bool(torch.isfinite(values.sum())):  # one look at each value; a sum that overflows tells nothing
+        return
+    bad = values.numel() - int(torch.isfinite(values).sum())
+    if bad:
+        raise ValueError(
+            f"{name} must be finite, got {bad} of {values.numel()} values that are NaN or infinite; "
+            "mend them, or pass check=False"
+        )
 
 
 def image_and_map(image: Tensor, name: str, value: Tensor, unit: str) -> None:
@@ -289,8 +346,9 @@ def _image(image: Tensor) -> None:
     """Refuse what is no image ``[B, C, H, W]`` of floating-point light."""
     if not isinstance(image, Tensor):
         raise ValueError(f"image must be a tensor [B, C, H, W] in linear light, got {type(image).__name__}")
-    if not image.is_floating_point():
-        raise ValueError(f"image must be floating point in linear light, got {image.dtype}; decode it first")
+    if not floating(image):
+        hint = "convert it with .float()" if image.is_floating_point() else "decode it first"
+        raise ValueError(f"image must be floating point in linear light, of 16 bits or more, got {image.dtype}; {hint}")
     if image.ndim != 4:
         hint = "; did you forget the batch dimension? use image[None]" if image.ndim == 3 else ""
         raise ValueError(f"image must be [B, C, H, W] in linear light, got {list(image.shape)}{hint}")
@@ -302,7 +360,7 @@ def _map(name: str, unit: str, value: Tensor, image: Tensor) -> None:
     """Refuse what is no map of one number for each pixel of an image, on its device."""
     batch, _, height, width = image.shape
     expected = f"{name} must be [{batch}, 1, {height}, {width}] or [1, 1, {height}, {width}] {unit}"
-    if not isinstance(value, Tensor) or not value.is_floating_point():
+    if not floating(value):
         got = f"a {value.dtype} tensor" if isinstance(value, Tensor) else type(value).__name__
         raise ValueError(f"{expected} and floating point, got {got}")
     if value.ndim != 4:

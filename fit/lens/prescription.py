@@ -26,6 +26,9 @@ __all__ = ["COLUMNS", "fault", "lines", "parse"]
 COLUMNS = ("radius", "thickness", "index", "diameter")
 """The columns of a line."""
 
+_SMALLEST_MM, _LARGEST_MM = 1e-3, 1e7
+_MOST_SURFACES = 1000
+
 
 def parse(text: str) -> tuple[dict[str, Array], int, str]:
     r"""Read the text of a prescription.
@@ -65,6 +68,8 @@ def parse(text: str) -> tuple[dict[str, Array], int, str]:
         for column, value in zip(COLUMNS, (radius, thickness, index, diameter), strict=True):
             if problem := fault(column, value):
                 raise ValueError(f"line {number}, column {column}: {problem}")
+        if len(rows) == _MOST_SURFACES:
+            raise ValueError(f"line {number}: a lens has at most {_MOST_SURFACES} surfaces")
         rows.append([radius, thickness, index, abbe, diameter])
     if stop is None:
         raise ValueError(f"no aperture stop among {len(rows)} surfaces; one line must have radius 0")
@@ -92,21 +97,21 @@ def _number(text: str, column: str, line: int) -> tuple[float, float]:
     except ValueError:
         kind = "a number or index/V" if column == "index" else "a number"
         raise ValueError(f"line {line}, column {column}: expected {kind}, got {text!r}") from None
-    if not pair[1] > 0:
-        raise ValueError(f"line {line}, column {column}: the Abbe number must be positive, got {text!r}")
+    if problem := fault("abbe", pair[1]):
+        raise ValueError(f"line {line}, column {column}: {problem}")
     return pair
 
 
 def fault(column: str, value: float) -> str:
     """What is wrong with a number of a column, or nothing."""
-    if column == "radius" and (math.isnan(value) or value == 0.0):
-        return f"radius must be a number other than 0, got {value:g}"
-    if column == "thickness" and not 0 <= value < math.inf:
-        return f"thickness must be >= 0 and finite, got {value:g}"
+    if column == "radius" and not (abs(value) == math.inf or _SMALLEST_MM <= abs(value) <= _LARGEST_MM):
+        return f"radius must be a number other than 0, {_SMALLEST_MM:g} to {_LARGEST_MM:g} mm or inf, got {value:g}"
+    if column == "thickness" and not 0 <= value <= _LARGEST_MM:
+        return f"thickness must be >= 0 and finite, at most {_LARGEST_MM:g} mm, got {value:g}"
     if column == "index" and not 1 <= value < 5:
         return f"index must be between 1 and 5 (0 at the stop only), got {value:g}"
-    if column == "abbe" and not value > 0:
-        return f"the Abbe number must be positive, got {value:g}"
-    if column == "diameter" and not 0 < value < math.inf:
-        return f"diameter must be positive and finite, got {value:g}"
+    if column == "abbe" and not value >= 1:
+        return f"the Abbe number must be positive, at least 1, got {value:g}"
+    if column == "diameter" and not _SMALLEST_MM <= value <= _LARGEST_MM:
+        return f"diameter must be positive and finite, {_SMALLEST_MM:g} to {_LARGEST_MM:g} mm, got {value:g}"
     return ""

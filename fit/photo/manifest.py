@@ -23,6 +23,15 @@ from .crop import Capture, Dots, cut_pairs, size_of
 __all__ = ["Capture", "Captures", "read_captures", "read_pair"]
 
 MANIFEST = "capture.toml"
+_RANGES = {  # beyond any camera's
+    "focus_m": (1e-5, 1e6),
+    "distance_m": (1e-5, 1e6),
+    "focal_length_mm": (1e-3, 1e6),
+    "f_number": (1e-2, 1e4),
+    "sensor_width_mm": (1e-3, 1e5),
+    "exposure_s": (1e-9, 1e7),
+    "width_px": (1, 2**31),
+}
 
 
 @dataclass(frozen=True)
@@ -63,9 +72,9 @@ class Captures:
         _check_distances([p.distance_m for p in self.pairs], self.focus_m, None)
         for what in ("width_px", "focal_length_mm", "f_number", "sensor_width_mm"):
             value = getattr(self, what)
-            plain = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (plain and 0 < value < 1e100) and (value is not None or what == "width_px"):
-                raise FitError(f"{what} must be positive, got {show(value)}")
+            plain, (low, high) = isinstance(value, int | float) and not isinstance(value, bool), _RANGES[what]
+            if not (plain and low <= value <= high) and (value is not None or what == "width_px"):
+                raise FitError(f"{what} must be positive, got {show(value)}; a camera's is {low:g} to {high:g}")
 
     def __iter__(self) -> Iterator[Capture]:
         """Iterate over the pairs."""
@@ -76,7 +85,9 @@ class Captures:
         return len(self.pairs)
 
 
-def read_captures(folder: str | os.PathLike[str], *, dots: Dots | None = None) -> list[Captures]:
+def read_captures(
+    folder: str | os.PathLike[str], *, dots: Dots | None = None, root: str | os.PathLike[str] | None = None
+) -> list[Captures]:
     """Read a folder of photographs described by its `capture.toml`.
 
     ```toml
@@ -100,6 +111,8 @@ def read_captures(folder: str | os.PathLike[str], *, dots: Dots | None = None) -
     Args:
         folder: with the manifest and the pictures, or the manifest's path.
         dots: instead of the manifest's "dots".
+        root: folder that the manifest and every picture must lie in, links followed, for a service that reads
+            manifests of strangers. None reads whatever they name, `../` and absolute paths among it.
 
     Returns:
         One `Captures`; with `dots="each"` one for every dot of the grid, the most central first.
@@ -114,6 +127,8 @@ def read_captures(folder: str | os.PathLike[str], *, dots: Dots | None = None) -
         raise ManifestError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}")
     path = Path(folder)
     path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
+    if root is not None:
+        _inside(path, root, str(path))
     fields = _manifest(path)
     where, base = str(path), path.parent
     focus = _number(fields, "focus_m", where)
@@ -132,13 +147,16 @@ def read_captures(folder: str | os.PathLike[str], *, dots: Dots | None = None) -
     if chosen not in ("one", "centre", "each"):
         raise ManifestError(f"dots must be 'one', 'centre' or 'each', got {chosen!r}", file=where)
     dark = _text(fields, "dark", where)
-    darkness = None if dark is None else _read(base / dark, transfer)[0]
     sharp = base / _text(fields, "sharp", where, needed=True)  # type: ignore[operator]
+    files = [base / _text(shot, "file", where, needed=True) for shot in shots]  # type: ignore[operator]
+    if root is not None:
+        for file in [sharp, *files, *([] if dark is None else [base / dark])]:
+            _inside(file, root, where)
+    darkness = None if dark is None else _read(base / dark, transfer)[0]
     still, white = _read(sharp, transfer, darkness)
     first = _optional(fields, "exposure_s", where)
     columns: list[list[Capture]] = []
-    for shot, distance in zip(shots, distances, strict=True):
-        file = base / _text(shot, "file", where, needed=True)  # type: ignore[operator]
+    for shot, distance, file in zip(shots, distances, files, strict=True):
         moved, _ = _read(file, transfer, darkness)
         if moved.shape != still.shape:
             raise ManifestError(f"{file.name} is {size_of(moved)}, {sharp.name} is {size_of(still)}", file=where)
@@ -209,6 +227,15 @@ def _manifest(path: Path) -> dict[str, Any]:
         raise ManifestError(f"is not TOML: {error}", file=str(path)) from error
 
 
+def _inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
+    """Refuse a file that does not lie in a folder, wherever its name and links lead."""
+    folder, real = os.path.realpath(root), os.path.realpath(file)
+    if not os.path.isdir(folder):
+        raise ManifestError(f"root must be a folder, got {show(str(root))}", file=where)
+    if os.path.commonpath([folder, real]) != folder:
+        raise ManifestError(f"{str(file)!r} lies outside of {root}, and nothing else may be read (--root)", file=where)
+
+
 def _known(fields: Mapping[str, Any], names: Sequence[str], where: str) -> None:
     for name in fields:
         if name not in names:
@@ -216,9 +243,11 @@ def _known(fields: Mapping[str, Any], names: Sequence[str], where: str) -> None:
 
 
 def _number(fields: Mapping[str, Any], name: str, where: str) -> float:
-    value = fields.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
-        raise ManifestError(f"{name} must be a positive number, got {value!r}", file=where)
+    value, (low, high) = fields.get(name), _RANGES[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise ManifestError(
+            f"{name} must be a positive number, got {show(value)}; a camera's is {low:g} to {high:g}", file=where
+        )
     return float(value)
 
 

@@ -355,6 +355,33 @@ def _(dtype: torch.dtype) -> float:
     return error(blur_by_coc(bright, whole(4.0)), bright)
 
 
+def _step() -> Tensor:
+    coc = whole(-5.0)
+    coc[..., WIDTH // 2 :] = 4.0
+    return coc
+
+
+@case("light", "1e30 at random beside a depth step (float16: 65504)", "float64")
+def _(dtype: torch.dtype) -> float:
+    return coc_against_double(texture(torch.float32).mul(min(1e30, torch.finfo(dtype).max)).to(dtype), _step())
+
+
+@case("light", "1e30 in 0.1, 3 x 3 pixels, beside a depth step (float16: 65504)", "float64, relative to the largest",
+      float32=1e-6)  # fmt: skip
+def _(dtype: torch.dtype) -> float:
+    image = torch.full((1, 3, HEIGHT, WIDTH), 0.1, dtype=dtype)
+    image[..., 11:14, 15:18] = min(1e30, torch.finfo(dtype).max)
+    truth = blur_by_coc(image.double(), _step())
+    return float((blur_by_coc(image, _step()).double() - truth).abs().max() / truth.abs().max())
+
+
+@case("light", "negative values, a depth step", "float64, relative to the largest", float32=1e-6)
+def _(dtype: torch.dtype) -> float:
+    image = texture(dtype) - 0.5
+    truth = blur_by_coc(image.double(), _step())
+    return float((blur_by_coc(image, _step()).double() - truth).abs().max() / truth.abs().max())
+
+
 # Sums and quotients
 
 

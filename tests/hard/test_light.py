@@ -139,3 +139,78 @@ def test_the_ring_of_the_paper_keeps_a_highlight_inside_its_support() -> None:
 def test_a_plane_of_nearly_the_largest_float_does_not_overflow() -> None:
     bright = torch.full((1, 1, 24, 32), 3e38)
     torch.testing.assert_close(blur_by_coc(bright, torch.full((1, 1, 24, 32), 4.0)), bright, rtol=1e-6, atol=0.0)
+
+
+EVERY_ENGINE = pytest.mark.parametrize("engine", ["torch", "native"])
+
+
+def step(left: float = -6.0, right: float = 5.0) -> Tensor:
+    coc = torch.full((1, 1, 24, 32), left)
+    coc[..., 16:] = right
+    return coc
+
+
+def thin_post() -> Tensor:
+    """A foreground one pixel wide: none of its pixels is surely unmixed."""
+    coc = torch.full((1, 1, 24, 32), 5.0)
+    coc[..., 14] = -4.0
+    return coc
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+@pytest.mark.parametrize("coc", [step(), thin_post()], ids=["step", "post"])
+@pytest.mark.parametrize("light", [1e10, 2e19, 1e30, 3e38])
+def test_light_of_any_size_beside_a_depth_step_is_as_in_float64(
+    engine: str, way: dict[str, Any], coc: Tensor, light: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    image = torch.rand(1, 3, 24, 32)
+    image[..., 12, 8:24] = 1.0
+    image = (image * light).clamp(max=light)
+    out, truth = blur_by_coc(image, coc, **way), blur_by_coc(image.double(), coc, **way)
+    assert_close(out.double() / light, truth / light, rtol=1e-4, atol=1e-6)
+
+
+@EVERY_ENGINE
+@pytest.mark.parametrize("light", [2e19, 1e30, -1e30])
+def test_bright_layers_and_backgrounds_do_not_overflow(
+    engine: str, light: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    dof, depth = DepthOfField(CAMERA), torch.full((1, 1, 24, 32), 1.2)
+    depth[..., 16:] = 2.5
+    image, far = torch.rand(1, 3, 24, 32), torch.full((1, 1, 24, 32), 9.0)
+    out = dof(image, depth, background=image * light, background_depth=far)
+    wide = dof(image.double(), depth, background=image.double() * light, background_depth=far)
+    assert_close(out.double() / light, wide / light, rtol=1e-4, atol=1e-6)
+    rgba = torch.rand(1, 2, 4, 24, 32)
+    rgba[:, :, -1] = torch.tensor([1e-6, 1.0])[:, None, None]  # light over a tiny coverage is brighter still
+    rgba[:, :, :-1] *= light
+    out, wide = dof.layers(rgba, torch.tensor([1.2, 9.0])), dof.layers(rgba.double(), torch.tensor([1.2, 9.0]))
+    assert_close(out[:, :-1].double() / light, wide[:, :-1] / light, rtol=1e-4, atol=1e-6)
+    assert_close(out[:, -1].double(), wide[:, -1], rtol=1e-5, atol=1e-6)
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+@pytest.mark.parametrize("coc", [step(), thin_post()], ids=["step", "post"])
+def test_negative_light_passes_through_edges_as_it_does_elsewhere(
+    engine: str, way: dict[str, Any], coc: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    image = 0.1 + torch.rand(1, 3, 24, 32)
+    # a part of a split pixel may be darker than its surface, not darker than nothing
+    assert_close(blur_by_coc(-image, coc, **way), -blur_by_coc(image, coc, **way), rtol=0.0, atol=5e-4)
+    mixed = torch.where(coc > 0, -1.0, -3.0).expand(1, 3, -1, -1).clone()
+    mixed[..., 16] = -2.0
+    out = blur_by_coc(mixed, coc, **way)
+    assert -3.0001 <= float(out.min()) and float(out.max()) <= -0.9999
+
+
+def test_gradients_of_light_of_any_size_are_those_of_small_light() -> None:
+    image, coc = torch.rand(1, 1, 24, 32, dtype=torch.float32), step()
+    small, bright = ((image * k).requires_grad_() for k in (2.0**20, 2.0**90))
+    for way in WAYS:
+        grads = [torch.autograd.grad(blur_by_coc(x, coc, **way).mean(), x)[0] for x in (small, bright)]
+        assert_close(grads[0], grads[1], rtol=1e-4, atol=1e-9)

@@ -2,9 +2,12 @@
 
 import io
 import os
+import re
+import signal
 import struct
 import subprocess
 import sys
+import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -242,3 +245,159 @@ def test_a_missing_channel_is_named_with_those_that_are_there(tmp_path: Path, mi
     assert output.write_image(np.ones((3, 4, 2), np.float32)) and output.close()
     with pytest.raises(ValueError, match="has no colour: expected channels R, G, B or Y, found"):
         read_image(tmp_path / "x.exr")
+
+
+# What is killed while it writes
+
+WRITING = """
+import sys, time
+from torchdof.io.atomic import whole_file
+with whole_file(sys.argv[1]) as part:
+    part.write_bytes(b"half")
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def killed_while_writing(path: Path, number: int) -> int:
+    """The exit status of a process that a signal reached while it wrote a file."""
+    with subprocess.Popen([sys.executable, "-c", WRITING, str(path)], stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None and run.stdout.readline() == "writing\n"
+        run.send_signal(number)
+        return run.wait(timeout=30)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_termination_while_a_file_is_written_leaves_nothing_of_it(tmp_path: Path, number: int) -> None:
+    (tmp_path / "x.exr").write_text("old")
+    assert killed_while_writing(tmp_path / "x.exr", number) == -number
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("x.exr", "old")]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_what_a_killed_process_left_is_removed_by_the_next_that_writes_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from torchdof.io import atomic
+
+    killed_while_writing(tmp_path / "x.exr", signal.SIGKILL)
+    (left,) = tmp_path.iterdir()
+    owner = left.name.split(".")[2].split("-")
+    mine = tmp_path / ".y.exr-like.part"
+    elsewhere = left.with_name(left.name.replace(owner[0], "0" * 8))  # of a process of another machine
+    with subprocess.Popen([sys.executable, "-c", WRITING, str(tmp_path / "z.exr")], stdout=subprocess.PIPE) as living:
+        assert living.stdout is not None and living.stdout.readline() == b"writing\n"
+        others = {p.name for p in tmp_path.iterdir()} - {left.name}
+        mine.write_text("of somebody else")
+        elsewhere.write_text("of another machine")
+        monkeypatch.setattr(atomic, "_tidied", set())
+        BlurTable.disc().save(tmp_path / "table.json")
+        assert {p.name for p in tmp_path.iterdir()} == {mine.name, elsewhere.name, "table.json", *others}
+        living.kill()
+
+
+def test_a_handler_of_the_caller_is_left_alone(tmp_path: Path) -> None:
+    def handler(*_: Any) -> None: ...
+
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        BlurTable.disc().save(tmp_path / "x.json")
+        assert signal.getsignal(signal.SIGTERM) is handler
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        BlurTable.disc().save(tmp_path / "x.json")
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+# Files that are not what they are called
+
+
+@pytest.mark.parametrize("name", ["x.png", "x.npy", "x.npz", "x.exr", "x.pfm"])
+def test_a_link_to_itself_is_refused_for_reading_and_writing(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).symlink_to(tmp_path / name)
+    (tmp_path / "table.json").symlink_to("other.json")
+    (tmp_path / "other.json").symlink_to("table.json")
+    with pytest.raises(OSError, match=f"{name}: is a link that leads back to itself"):
+        read_values(tmp_path / name)
+    if name in ("x.png", "x.exr", "x.pfm"):
+        with pytest.raises(OSError, match=f"{name}: is a link that leads back to itself"):
+            write_image(tmp_path / name, Picture(tiny()))
+    with pytest.raises(OSError, match="table.json: is a link that leads back to itself"):
+        BlurTable.disc().save(tmp_path / "table.json")
+    assert (tmp_path / name).is_symlink() and (tmp_path / "table.json").is_symlink()
+
+
+@pytest.mark.parametrize("member", ["depth.txt", "depth", "depth.npy"])
+def test_members_of_an_npz_that_are_no_arrays_are_refused(tmp_path: Path, member: str) -> None:
+    with zipfile.ZipFile(tmp_path / "x.npz", "w") as archive:
+        archive.writestr(member, "no array")
+    with pytest.raises(ValueError, match=r"x\.npz: cannot be read as an array"):
+        read_values(tmp_path / "x.npz")
+
+
+SILENT = """
+import sys
+from pathlib import Path
+from torchdof.io.images import read_image
+content = Path(sys.argv[1]).read_bytes()
+for end in range(1, len(content), 1 + len(content) // 50):
+    Path("x" + sys.argv[2]).write_bytes(content[:end])
+    try:
+        read_image("x" + sys.argv[2])
+    except (ValueError, OSError):
+        pass
+for place in range(0, len(content), 1 + len(content) // 100):
+    Path("x" + sys.argv[2]).write_bytes(content[:place] + bytes([content[place] ^ 77]) + content[place + 1 :])
+    try:
+        read_image("x" + sys.argv[2])
+    except (ValueError, OSError):
+        pass
+"""
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".exr", ".hdr", ".pfm"])
+def test_no_library_prints_a_line_of_its_own_about_a_damaged_picture(tmp_path: Path, suffix: str) -> None:
+    write_image(tmp_path / f"whole{suffix}", Picture(tiny()))
+    call = [sys.executable, "-c", SILENT, f"whole{suffix}", suffix]
+    run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
+def a_million_pixels(path: Path) -> None:
+    """Whole pictures as their headers go, of 1024 x 1024 pixels, in small files."""
+    picture = torch.zeros(1, 3, 1, 1).expand(1, 3, 1024, 1024)
+    if path.suffix in (".npy", ".npz"):
+        zeros = np.zeros((1024, 1024), np.float32)
+        np.save(path, zeros) if path.suffix == ".npy" else np.savez_compressed(path, depth=zeros)
+    else:
+        write_image(path, Picture(picture, sample="float" if path.suffix != ".png" else "16"))
+
+
+LITTLE_MEMORY = """
+import resource, sys
+from torchdof.io.images import read_image, read_values
+import OpenImageIO
+from torchdof.io.memory import free_bytes
+pages = int(open("/proc/self/statm").read().split()[0])
+limit = pages * resource.getpagesize() + (4 << 20)
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+assert free_bytes() <= 4 << 20
+try:
+    (read_values if sys.argv[1].endswith(("y", "z")) else read_image)(sys.argv[1])
+except (ValueError, OSError) as error:
+    print("refused:", error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
+@pytest.mark.parametrize("name", ["x.png", "x.exr", "x.tif", "x.pfm", "x.npy", "x.npz"])
+def test_a_picture_that_memory_cannot_hold_is_refused_before_it_is_read(tmp_path: Path, name: str) -> None:
+    a_million_pixels(tmp_path / name)
+    call = [sys.executable, "-c", LITTLE_MEMORY, name]
+    run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr[-500:]
+    assert re.match(
+        rf"refused: {name}: .*(GiB of memory are free|more than there is memory for|Cannot allocate)", run.stdout
+    )

@@ -388,3 +388,50 @@ def test_kernels_sum_to_one_at_any_coc() -> None:
     for table in ROUND_TRIPS:
         sums = table.kernels(coc, 100).sum((-2, -1))
         assert_close(sums, torch.ones_like(sums), rtol=0.0, atol=1e-12)
+
+
+# Tables that make no kernels
+
+SOFT = {"radius": [0.01], "sigma": [0.003], "b": [1.0]}
+
+
+@pytest.mark.parametrize(
+    ("family", "coc", "params", "message"),
+    [
+        (
+            "softm",
+            [0.01],
+            {**SOFT, "m": [1000.0]},
+            "params.m must be <= 100, got 1000",
+        ),
+        ("softm", [0.01], {**SOFT, "m": [1e300]}, "params.m must be <= 100, got 1e"),
+        (
+            "softm",
+            [0.01],
+            {**SOFT, "b": [1e308], "m": [2.0]},
+            "params of softm make kernels that are no numbers",
+        ),
+        ("gaussian", [0.01], {"sigma": [1e9]}, "params must be lengths in the unit of coc, got such as reach to"),
+        ("disc", [1e-300], {"radius": [1e-300]}, "coc must reach somewhere from 1e-09 to"),
+        ("disc", [1e300], {"radius": [1e300]}, r"coc must reach somewhere from 1e-09 to 1e\+06 \(fraction\), got 1e"),
+    ],
+)
+def test_tables_without_kernels_are_refused_on_load(
+    tmp_path: Path, family: str, coc: list[float], params: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        BlurTable(family, coc, params, unit="fraction")
+    fields = {"family": family, "unit": "fraction", "coc": coc, "params": params}
+    path = tmp_path / "lens.json"
+    path.write_text(json.dumps({"schema": "torchdof/blur-table", "version": 1, **fields}))
+    with pytest.raises(ValueError, match="lens.json: .*" + message):
+        BlurTable.load(path)
+
+
+@pytest.mark.parametrize(("m", "sigma"), [(2.0, 0.003), (8.0, 0.003), (100.0, 0.0005), (100.0, 0.003)])
+@pytest.mark.parametrize("coc", [0.0, 1e-6, 0.3, 0.8, 3.0, 40.0])
+def test_steep_tilts_have_kernels_at_any_blur(m: float, sigma: float, coc: float) -> None:
+    table = BlurTable("softm", [0.01], {**SOFT, "m": [m], "sigma": [sigma]}, unit="fraction")
+    kernels = table.kernels(torch.tensor([coc, -coc]), 640)
+    assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0
+    assert torch.allclose(kernels.sum((-2, -1)), torch.ones(1, dtype=torch.float64))

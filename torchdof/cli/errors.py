@@ -11,6 +11,10 @@ __all__ = ["advice", "told_in_one_sentence"]
 
 _EXTRAS = {"scipy": "fit", "onnx": "export", "onnxscript": "export", "onnxruntime": "export", "matplotlib": "plot"}
 
+_TOO_LITTLE = "there is too little memory for this image; try a smaller one, or --tolerance draft"
+# PyTorch's own words for it on the CPU are those of what it is built from
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")
+
 
 @contextlib.contextmanager
 def told_in_one_sentence() -> Iterator[None]:
@@ -28,13 +32,18 @@ def told_in_one_sentence() -> Iterator[None]:
         if error.errno == errno.EPIPE:
             raise
         message = str(error)
-    except (ValueError, MemoryError) as error:
-        message = str(error) or "there is too little memory for this image"
+    except ValueError as error:
+        message = str(error) or type(error).__name__
+    except MemoryError:  # numpy's has a message of its own, about arrays
+        message = _TOO_LITTLE
     except RuntimeError as error:
-        torch = sys.modules.get("torch")  # whoever ran out of its memory has imported it
-        if torch is None or not isinstance(error, torch.OutOfMemoryError):
+        torch = sys.modules.get("torch")  # whoever ran out of a device's memory has imported it
+        if torch is not None and isinstance(error, torch.OutOfMemoryError):
+            message = "the device has too little memory for this image; try --device cpu"
+        elif any(words in str(error) for words in _NO_MEMORY):
+            message = _TOO_LITTLE
+        else:
             raise
-        message = "the device has too little memory for this image; try --device cpu"
     typer.echo(f"error: {message}", err=True)
     raise typer.Exit(2)
 

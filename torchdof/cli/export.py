@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import typer
@@ -12,7 +12,7 @@ from rich.console import Console
 from torchdof import Camera, DepthOfField
 from torchdof.cli.settings import load_table
 from torchdof.export.conversion import OPSET, to_onnx
-from torchdof.export.metadata import describe
+from torchdof.export.metadata import describe, shown
 from torchdof.options import tolerance_of_text
 
 __all__ = ["export"]
@@ -119,8 +119,12 @@ def _lines(path: Path) -> Sequence[str]:
     lines = []
     for name, value in describe(path).items():
         if isinstance(value, dict):
-            lines.append(f"{name}:")
-            lines += [f"  {k}: {v if isinstance(v, str) else json.dumps(v)}" for k, v in value.items()]
+            lines.append(f"{shown(name)}:")
+            lines += [f"  {shown(k)}: {_told(v)}" for k, v in value.items()]
         else:
-            lines.append(f"{name}: {value if isinstance(value, str) else json.dumps(value)}")
+            lines.append(f"{shown(name)}: {_told(value)}")
     return lines
+
+
+def _told(value: Any) -> str:
+    return shown(value if isinstance(value, str) else json.dumps(value))

@@ -44,6 +44,13 @@ def fit(
             rich_help_panel=_CAPTURE,
         ),
     ] = "manifest",
+    root: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder that capture.toml and all its pictures must lie in; by default they may lie anywhere.",
+            rich_help_panel=_CAPTURE,
+        ),
+    ] = None,
     lens: Annotated[
         str | None,
         typer.Option(help="Prescription: a file, or the name of a shipped one.", rich_help_panel=_LENS),
@@ -69,6 +76,8 @@ def fit(
     console = Console(soft_wrap=True)
     if (captures is None) == (lens is None):
         raise FitError("give either a folder of captures or --lens FILE")
+    if root is not None and lens is not None:
+        raise FitError("--root is the folder of photographs; leave it out with --lens")
     if output.suffix != ".json":
         raise FitError(f"the table is written as JSON: name it {output.with_suffix('.json')}", file=str(output))
     if plots is not None:
@@ -80,7 +89,7 @@ def fit(
         if plots is not None:
             _draw_table(table, plots, output.stem, console)
         return
-    capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots)
+    capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots, root=root)
     for i, capture_set in enumerate(capture_sets):
         target = output if len(capture_sets) == 1 else output.with_name(f"{output.stem}_{i:02d}.json")
         if len(capture_sets) > 1:

@@ -4,7 +4,6 @@ import dataclasses
 import math
 import os
 import time
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -19,7 +18,7 @@ from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
 from ..optics.blur_table import BlurTable
 from ..options import Options
-from ..validation import image_and_map, same_aspect
+from ..validation import coc_of_lens, image_and_map, same_aspect
 from .doubts import Said
 from .settings import RenderSettings
 
@@ -88,7 +87,7 @@ def render_frame(
         OSError: If a file cannot be read or written.
     """
     said = Said(settings.strict) if said is None else said
-    if any(Path(source).resolve() == Path(out).resolve() for source in (image, depth) if source is not None):
+    if any(os.path.realpath(source) == os.path.realpath(out) for source in (image, depth) if source is not None):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
     start = time.perf_counter()
     source = read_frame(image, depth, settings) if source is None else source
@@ -105,6 +104,7 @@ def render_frame(
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
+        coc_of_lens(coc_px, values, settings.stated(camera))
         said.say(image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
         parts.append(
             f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -267,7 +267,8 @@ def render(
     if FramePattern.matches(image):
         _render_sequence(image, depth, out, settings, frames, resume, steady)
         return
-    if FramePattern.matches(out) or (depth is not None and FramePattern.matches(depth)) or frames is not None or steady:
+    sequences = FramePattern.is_padded(out) and not FramePattern.is_padded(image) and FramePattern.matches(out)
+    if sequences or (depth is not None and FramePattern.matches(depth)) or frames is not None or steady:
         raise ValueError(f"{image}: is a single image; for a sequence write it as shot.####.exr")
     if len(settings.focus or []) > 1:
         raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
@@ -292,16 +293,16 @@ def _render_sequence(
     """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
     source, target = FramePattern(image), FramePattern(out)
     depths = FramePattern(depth) if depth is not None and FramePattern.matches(depth) else None
-    numbers = source.frames()
+    numbers: Sequence[int] = source.frames()
     if frames is not None:
         first, last = parse_frames(frames)
-        existing = set(numbers)
-        numbers = list(range(first, last + 1))
-        absent = [source.name(n) for n in numbers if n not in existing]
-        if absent:
+        wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
+        if len(existing) < len(wanted):
+            missing = source.name(next(n for n in wanted if n not in existing))
             raise FileNotFoundError(
-                f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} frames missing)"
+                f"{missing}: there is no such file ({len(wanted) - len(existing)} of {len(wanted)} frames missing)"
             )
+        numbers = wanted
     if not numbers:
         raise FileNotFoundError(f"{image}: there are no such files")
     if depths is not None:

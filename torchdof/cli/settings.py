@@ -1,8 +1,10 @@
 """What the user of ``torchdof render`` said, checked: lens, depth map, blur and files."""
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import torch
@@ -16,12 +18,20 @@ from ..io.metadata import camera_facts
 from ..io.sequence import focus_at_frame
 from ..io.transfer import Transfer
 from ..optics.blur_table import BlurTable
-from ..optics.camera import Camera
+from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Method
 from ..validation import number, show
 
 __all__ = ["RenderSettings", "load_table", "pick_device"]
 
+_OPTIONS = {
+    "focal_length_mm": "--focal-length-mm",
+    "f_number": "--f-number",
+    "focus_m": "--focus-m",
+    "sensor_width_mm": "--sensor-width-mm",
+    "fov_x_deg": "--fov-deg",
+    "aperture_radius_m": "--aperture-radius-m",
+}
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 
 
@@ -153,7 +163,8 @@ class RenderSettings:
                 radius_m = 18.0 / math.tan(math.radians(self.fov_x_deg) / 2) / (2000.0 * self.f_number)
             if radius_m is None:
                 raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
-            return Camera.from_fov(self.fov_x_deg, radius_m, focus_m), remarks
+            with _by_option(_OPTIONS):
+                return Camera.from_fov(self.fov_x_deg, radius_m, focus_m), remarks
         lens: dict[str, float] = {}
         for name, assumed in _ASSUMED.items():
             stated = getattr(self, name)
@@ -161,7 +172,39 @@ class RenderSettings:
             if stated is None:
                 words = name.rsplit("_", 1)[0].replace("_", " ") if name != "f_number" else "f-number"
                 remarks.append(f"{words} {'from the file' if name in facts else 'assumed'}")
-        return Camera(lens["focal_length_mm"], lens["f_number"], focus_m, lens["sensor_width_mm"]), remarks
+        names = {name: self._name_of(name) for name in _OPTIONS}
+        with _by_option(names):
+            return Camera(lens["focal_length_mm"], lens["f_number"], focus_m, lens["sensor_width_mm"]), remarks
+
+    def stated(self, camera: Camera) -> dict[str, Any]:
+        """The numbers of a camera by the options, or the file, that they are from."""
+        if self.fov_x_deg is None:
+            return {self._name_of(name): getattr(camera, name) for name in CAMERA_NUMBERS}
+        opening = "aperture_radius_m" if self.f_number is None else "f_number"
+        return {
+            "--fov-deg": self.fov_x_deg,
+            _OPTIONS[opening]: getattr(self, opening),
+            self._name_of("focus_m"): camera.focus_m,
+        }
+
+    def _name_of(self, name: str) -> str:
+        """What the user knows a number of the camera as: the option that states it, or the file's own."""
+        if name == "focus_m":
+            stated = self.focus is not None or self.focus_at is not None
+            option = "--focus-at" if self.focus_at is not None else "--focus-m"
+        else:
+            stated, option = getattr(self, name, None) is not None, _OPTIONS[name]
+        return option if stated else f"{option} (not given)"
+
+
+@contextlib.contextmanager
+def _by_option(names: Mapping[str, str]) -> Iterator[None]:
+    """Has a refusal of the camera say the option's name where it says its own."""
+    try:
+        yield
+    except ValueError as error:
+        pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
+        raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
 
 
 def load_table(name: str) -> BlurTable:

@@ -6,15 +6,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..validation import number, real_tensor, show
+from ..validation import WHOLE_NUMBERS, number, real_tensor, show
 
 __all__ = ["DepthKind", "depth_from_values", "number_map"]
 
 DepthKind = Literal["z", "distance", "disparity", "inverse", "coc"]
-_WHOLE = (
-    *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
-    *(torch.int8, torch.int16, torch.int32, torch.int64),
-)
 KINDS: tuple[DepthKind, ...] = ("z", "distance", "disparity", "inverse", "coc")
 
 
@@ -105,7 +101,7 @@ def number_map(name: str, values: Tensor) -> None:
         ValueError: If it is not a tensor of real numbers, or empty.
     """
     # integers are what files hold; of the rest only what arithmetic works on
-    if isinstance(values, Tensor) and values.dtype in _WHOLE and values.layout == torch.strided:
+    if isinstance(values, Tensor) and values.dtype in WHOLE_NUMBERS and values.layout == torch.strided:
         values = values.double()
     real_tensor(name, values, "[B, 1, H, W]")
     if not values.numel():

@@ -15,6 +15,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ..validation import show
+from . import exr, png
+from .memory import free_bytes
 from .metadata import kept_metadata
 
 __all__ = ["Part", "PixelType", "existing", "first_line", "read_array", "read_parts"]
@@ -63,6 +65,8 @@ def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str)
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise ValueError(f"expected the path of {what}, got {show(path)}")
     path = Path(path)
+    if os.path.islink(os.path.realpath(path)):
+        raise OSError(f"{path}: is a link that leads back to itself")
     if path.suffix.lower() not in suffixes:
         raise ValueError(
             f"{path}: {path.suffix or 'no suffix'} is not {what} that can be read; use {' '.join(suffixes)}"
@@ -93,16 +97,23 @@ def _read_every_part(path: Path) -> list[Part]:
     """The parts of a file that OpenImageIO reads; other than EXR files have one."""
     import OpenImageIO as oiio
 
+    if path.suffix.lower() == ".png":
+        png.check(path)
+    elif path.suffix.lower() == ".exr":
+        exr.check(path)
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
         raise OSError(f"{path}: cannot be read ({first_line(oiio.geterror())})")
     parts: list[Part] = []
+    promised = 0
     try:
         while source.seek_subimage(len(parts), 0):
             spec = source.spec()
-            _check_size(path, spec.width, spec.height)
+            promised += _check_size(
+                path, spec.width, spec.height, spec.pixel_bytes(True) + 4 * spec.nchannels, promised
+            )
             if spec.deep:
                 raise ValueError(f"{path}: holds deep samples; flatten it to one sample a pixel first")
             values = source.read_image(spec.format)
@@ -148,7 +159,7 @@ def _read_pfm(path: Path) -> Part:
             width, height, scale = int(words[1]), int(words[2]), float(words[3])
         except (IndexError, KeyError, ValueError):
             raise OSError(f"{path}: is not a PFM file (its header should read 'PF' or 'Pf', size and scale)") from None
-        _check_size(path, width, height)
+        _check_size(path, width, height, 2 * 4 * channels)
         count = width * height * channels
         data = file.read(4 * count)
     if len(data) != 4 * count:
@@ -172,8 +183,11 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
     try:
         if path.suffix.lower() == ".npz":
             with zipfile.ZipFile(path) as archive:
-                if any(entry.file_size > 8 * MAX_PIXELS + 4096 for entry in archive.infolist()):
+                largest = max((entry.file_size for entry in archive.infolist()), default=0)
+                if largest > 8 * MAX_PIXELS + 4096:
                     raise ValueError(f"holds more than {MAX_PIXELS} pixels")
+                if 2 * largest > free_bytes():
+                    raise ValueError(f"holds {largest} bytes, more than there is memory for")
             with np.load(path, allow_pickle=False) as arrays:
                 if key is None and len(arrays.files) != 1:
                     raise ValueError(
@@ -184,6 +198,8 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
                 array = arrays[key or arrays.files[0]]
         else:
             array = np.load(path, allow_pickle=False, mmap_mode="r")
+        if not isinstance(array, np.ndarray):
+            raise ValueError("it is no array")
     except _BROKEN as error:
         raise ValueError(f"{path}: cannot be read as an array ({first_line(str(error))})") from None
     shape = array.shape
@@ -191,13 +207,32 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     if array.ndim != 2 or array.dtype.kind not in "fiu" or array.size == 0:
         raise ValueError(f"{path}: expected an array [H, W] of numbers, got {list(shape)} of {array.dtype}")
-    _check_size(path, array.shape[1], array.shape[0])
+    _check_size(path, array.shape[1], array.shape[0], array.dtype.itemsize + 4)
     return np.asarray(array)
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
+def _check_size(path: Path, width: int, height: int, pixel_bytes: int, others: int = 0) -> int:
+    """Refuse what a header promises if it is too much to read, or more than there is memory for.
+
+    Args:
+        path: The file.
+        width: In pixels.
+        height: In pixels.
+        pixel_bytes: What a pixel takes, as stored and as read.
+        others: Bytes that other parts of the file take.
+
+    Returns:
+        The bytes that it takes.
+    """
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise ValueError(f"{path}: its header claims {width} x {height} pixels; between 1 and {MAX_PIXELS} are read")
+    needed, free = width * height * pixel_bytes, free_bytes()
+    if needed + others > free:
+        raise ValueError(
+            f"{path}: its header claims {width} x {height} pixels, which take {(needed + others) / 2**30:.3g} GiB; "
+            f"{max(0.0, free) / 2**30:.3g} GiB of memory are free"
+        )
+    return needed
 
 
 def first_line(text: str) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..validation import real_tensor
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
 from .decode import PixelType, existing, first_line, read_array, read_parts
@@ -103,7 +104,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     source = parts[part]
-    array = source.values[..., indices].astype(np.float32)
+    array = _float32(source.values[..., indices])
     if not np.isfinite(array).all():
         bad = int((~np.isfinite(array)).any(axis=-1).sum())
         raise ValueError(f"{path}: {bad} pixels are not finite (NaN or inf); repair them before blurring spreads them")
@@ -111,11 +112,13 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     transfer = transfer or default_transfer(sample)
     pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]  # [H, W, C] -> [1, C, H, W]
     pixels = decode(pixels / source.white, transfer, names[-1] == "A", source.straight_alpha)
+    if not bool(torch.isfinite(pixels).all()):
+        raise ValueError(f"{path}: its light is beyond what float32 holds; scale it down")
     depth = None
     same_size = [p for p in parts if p.values.shape[:2] == source.values.shape[:2]]
     depth_place = depth_channel([(p.label, p.names) for p in same_size])
     if depth_place is not None:
-        depth = torch.from_numpy(same_size[depth_place[0]].values[..., depth_place[1]].astype(np.float32))[None, None]
+        depth = torch.from_numpy(_float32(same_size[depth_place[0]].values[..., depth_place[1]]))[None, None]
     return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window)
 
 
@@ -151,7 +154,8 @@ def write_image(
     if transfer is None:
         same_nature = (sample in ("half", "float")) == (picture.sample in ("half", "float"))
         transfer = picture.transfer if same_nature else default_transfer(sample)
-    pixels, names = picture.pixels.detach().cpu().float(), picture.channels
+    pixels = real_tensor("pixels", picture.pixels, "[1, C, H, W] in linear light").detach().cpu().float()
+    names = picture.channels
     if pixels.ndim != 4 or pixels.shape[0] != 1 or pixels.shape[1] != len(names):
         raise ValueError(f"{path}: pixels must be [1, {len(names)}, H, W] for {names}, got {list(pixels.shape)}")
     if picture.has_alpha and suffix not in _HOLDS_ALPHA:
@@ -218,7 +222,7 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
     """
     path = existing(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
     if path.suffix.lower() in (".npy", ".npz"):
-        return torch.from_numpy(read_array(path, channel).astype(np.float32))[None, None]
+        return torch.from_numpy(_float32(read_array(path, channel)))[None, None]
     parts = read_parts(path)
     planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
     listing = ", ".join(name for _, name, _ in planes)
@@ -226,7 +230,7 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
         if not chosen:
             raise ValueError(f"{path}: no channel {channel!r}; it has {listing}")
-        return torch.from_numpy(chosen[0].astype(np.float32))[None, None]
+        return torch.from_numpy(_float32(chosen[0]))[None, None]
     depth_place = depth_channel([(p.label, p.names) for p in parts])
     if depth_place is not None:
         plane = parts[depth_place[0]].values[..., depth_place[1]]
@@ -234,7 +238,13 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         plane = planes[0][2]
     else:
         raise ValueError(f"{path}: which of the channels {listing} is depth? name it (--depth-channel)")
-    return torch.from_numpy(plane.astype(np.float32))[None, None]
+    return torch.from_numpy(_float32(plane))[None, None]
+
+
+def _float32(values: np.ndarray) -> np.ndarray:
+    """Numbers in single precision; those beyond it become infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32)
 
 
 def _is_whole(path: Path) -> bool:
@@ -243,9 +253,7 @@ def _is_whole(path: Path) -> bool:
         read_parts(path)
     except (OSError, ValueError):
         return False
-    with path.open("rb") as file:  # a PNG is read without its last bytes as well
-        file.seek(-8, os.SEEK_END)
-        return path.suffix.lower() != ".png" or file.read() == b"IEND\xaeB`\x82"
+    return True
 
 
 def _reserve(path: Path, size: int) -> None:

@@ -4,21 +4,22 @@ import math
 import re
 from pathlib import Path
 
-from ..validation import number
+from ..validation import number, show
 
 __all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
 
 _PLACEHOLDER = re.compile(r"#+|%0?(\d*)d")
+_DIGITS = 18
 
 
 class FramePattern:
     """A file name with a place for the frame's number: ``####`` or ``%04d``, zero-padded to that many digits.
 
     Args:
-        path: The name; the number stands in its last component.
+        path: The name; the number stands in its last component, folders are called what they are called.
 
     Raises:
-        ValueError: If there is no place for a number, or more than one.
+        ValueError: If there is no place for a number, more than one, or one of more digits than a name can have.
 
     Example:
         >>> FramePattern("out/shot.####.exr").name(7)
@@ -28,19 +29,26 @@ class FramePattern:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         places = list(_PLACEHOLDER.finditer(self.path.name))
-        if len(places) != 1 or _PLACEHOLDER.search(str(self.path.parent)):
+        if len(places) != 1:
             raise ValueError(
                 f"{path}: expected one place for the frame number in the file's name, such as shot.####.exr"
             )
         place = places[0]
         self._before, self._after = self.path.name[: place.start()], self.path.name[place.end() :]
         text = place.group()
-        self._digits = len(text) if text.startswith("#") else int(place.group(1) or 1)
+        self._digits = len(text) if text.startswith("#") else int((place.group(1) or "1")[:9])
+        if self._digits > _DIGITS:
+            raise ValueError(f"{path}: the frame number must have at most {_DIGITS} digits, got {self._digits}")
 
     @staticmethod
     def matches(path: str | Path) -> bool:
-        """Whether a path has a place for a frame number."""
-        return _PLACEHOLDER.search(str(path)) is not None
+        """Whether a path names many files: it has a place for a frame number, and no file is called just that."""
+        return _PLACEHOLDER.search(Path(path).name) is not None and not Path(path).is_file()
+
+    @staticmethod
+    def is_padded(path: str | Path) -> bool:
+        """Whether a path has a place for a frame number of several digits: nobody calls a single file that."""
+        return re.search(r"##|%0?\d+d", Path(path).name) is not None
 
     def name(self, frame: int) -> Path:
         """The path of one frame."""
@@ -65,9 +73,9 @@ def parse_frames(text: str) -> tuple[int, int]:
         >>> parse_frames("10-24")
         (10, 24)
     """
-    match = re.fullmatch(r"\s*(\d+)(?:\s*-\s*(\d+))?\s*", text)
+    match = re.fullmatch(r"\s*(\d{1,18})(?:\s*-\s*(\d{1,18}))?\s*", text)
     if match is None:
-        raise ValueError(f"--frames expects first-last, such as 1-48, got {text!r}")
+        raise ValueError(f"--frames expects first-last, such as 1-48, got {show(text)}")
     first, last = int(match.group(1)), int(match.group(2) or match.group(1))
     if last < first:
         raise ValueError(f"--frames must not end before it starts, got {text!r}")

@@ -163,7 +163,7 @@ def render(
 
     Raises:
         MemoryError: If there is too little.
-        OverflowError: If the first surface's light is beyond 1e30, whose sums could overflow; scale it down.
+        OverflowError: If an image's light is beyond 2 to the 28th, whose powers could overflow; scale it down.
     """
     lights = [light.float().contiguous() for light, _, _ in surfaces]
     cocs = [coc.float().contiguous() for _, coc, _ in surfaces]
@@ -294,7 +294,7 @@ def _check(status: int) -> None:
     if status == _NO_MEMORY:
         raise MemoryError("there is too little memory to render this image")
     if status == _TOO_BRIGHT:
-        raise OverflowError("light beyond 1e30 is too bright for sums in float32")
+        raise OverflowError("light beyond 2 to the 28th is too bright for float32")
     if status == _CANCELLED:
         raise KeyboardInterrupt
 

@@ -8,12 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..validation import number, pixels_wide, real_tensor, show
+from ..validation import WHOLE_NUMBERS, floating, number, pixels_wide, real_tensor, show
 from . import psf, table_file
 
 __all__ = ["BlurTable"]
 
 UNITS = ("fraction", "mm", "relative")
+_COC_RANGE = (1e-9, 1e6)
+_WIDEST = 1e4  # times the circle of confusion; a blur that is not of the focus shows at small ones
+_STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
+_TRIED_PX = (0.5, 6.0)  # radii of the widest kernel tried
 
 
 class BlurTable:
@@ -99,6 +103,7 @@ class BlurTable:
         self._sides = {sign: self._side(sign) for sign in (-1, 1)}
         for sign in (-1, 1):
             self._sides[sign] = self._sides[sign] or self._sides[-sign]
+        self._try_kernels()
 
     @classmethod
     def disc(cls) -> "BlurTable":
@@ -315,6 +320,8 @@ class BlurTable:
             low = -1.0 if name == "b" else 0.0
             if bool((value < low).any()):
                 raise ValueError(f"params.{name} must be >= {low:g}, got {float(value.min()):g}")
+            if name == "m" and bool((value > _STEEPEST).any()):
+                raise ValueError(f"params.m must be <= {_STEEPEST:g}, got {float(value.max()):g}")
             if name == "values" and (value.shape[-1] < 2 or bool((value.sum(-1) == 0).any())):
                 raise ValueError("params.values must hold at least two values a node, not all of them 0")
             checked[name] = value
@@ -324,6 +331,28 @@ class BlurTable:
                 raise ValueError(f"params.{name} has {value.shape[0]} channels where other parameters have {channels}")
             checked[name] = value.expand(channels, *value.shape[1:]).contiguous()
         return checked
+
+    def _try_kernels(self) -> None:
+        """Refuse parameters whose kernels, at the nodes, between and beyond them, are no numbers or no lens's."""
+        largest = float(self.coc.abs().max())
+        low, high = _COC_RANGE
+        if not low <= largest <= high:
+            raise ValueError(f"coc must reach somewhere from {low:g} to {high:g} ({self.unit}), got {largest:g}")
+        places = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
+        tried = self.params(places * self._px_per_unit(1.0), 1.0)
+        widest = psf.support(self.family, tried) / self._px_per_unit(1.0)
+        if widest > _WIDEST * largest:
+            raise ValueError(
+                f"params must be lengths in the unit of coc, got such as reach to {widest:g} where coc is {largest:g}"
+            )
+        if widest == 0.0:
+            return
+        for pixels in _TRIED_PX:
+            factor = pixels / widest / self._px_per_unit(1.0)
+            lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in tried.items()}
+            if not bool(torch.isfinite(psf.pixel_kernels(self.family, lengths)).all()):
+                named = ", ".join(f"{name} up to {float(value.max()):g}" for name, value in self._params.items())
+                raise ValueError(f"params of {self.family} make kernels that are no numbers: {named}")
 
     def _per_node(self, name: str, value: Sequence[float] | Tensor | None) -> Tensor | None:
         if value is None:
@@ -371,7 +400,7 @@ def _numbers(name: str, value: Any) -> Tensor:
     """Finite numbers as a float64 tensor on the CPU, or a refusal by name."""
     try:
         numbers = torch.as_tensor(value)
-        if numbers.dtype == torch.bool or numbers.is_complex() or numbers.layout != torch.strided:
+        if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
             raise TypeError
         if not isinstance(value, Tensor):
             numbers = torch.as_tensor(value, dtype=torch.float64)  # a list would have come as float32

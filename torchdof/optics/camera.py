@@ -19,9 +19,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..validation import is_traced, pixels_wide, real_tensor, show, whole
+from ..validation import floating, is_traced, pixels_wide, real_tensor, show, whole
 
-__all__ = ["Camera"]
+__all__ = ["CAMERA_NUMBERS", "Camera"]
+
+CAMERA_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
 
 Number = float | Tensor
 
@@ -55,7 +57,7 @@ class Camera:
     focus_breathing: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm"):
+        for name in CAMERA_NUMBERS:
             value = getattr(self, name)
             _check_number(name, value)
         if not isinstance(self.focus_breathing, bool):
@@ -131,7 +133,7 @@ class Camera:
         Raises:
             ValueError: If the depth is not a floating-point tensor, or its batch does not fit the camera's.
         """
-        if not isinstance(depth, Tensor) or not depth.is_floating_point():
+        if not floating(depth):
             got = f"{depth.dtype} tensor" if isinstance(depth, Tensor) else type(depth).__name__
             raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
         if depth.layout != torch.strided:
@@ -251,7 +253,7 @@ def _show(value: Number) -> str:
 def _check_number(name: str, value: Number) -> None:
     """Refuse a number of the camera that is not positive, or neither a float nor a tensor ``[B]``."""
     if isinstance(value, Tensor):
-        if value.ndim > 1 or not value.is_floating_point() or value.layout != torch.strided or not value.numel():
+        if value.ndim > 1 or not floating(value) or value.layout != torch.strided or not value.numel():
             raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {show(value)}")
         if is_traced():
             return

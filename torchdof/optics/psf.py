@@ -34,7 +34,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import real_tensor, show
+from ..validation import WHOLE_NUMBERS, real_tensor, show
 from .kernel_cache import KernelCache
 
 __all__ = ["FAMILIES", "disc", "gaussian", "profile", "radial", "pixel_kernels", "ring", "softm", "support"]
@@ -51,8 +51,8 @@ FAMILIES: dict[str, tuple[str, ...]] = {
 LENGTHS = frozenset({"sigma", "r_c", "radius"})
 """Parameters that are lengths; the others are pure numbers."""
 
-_INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
 _SMALLEST = 1e-7  # px; a length below it is rendered as this, which is a kernel of one pixel to 1e-14
+_TILT_EXPONENT = 460.0  # of e: 1e200
 _CACHED_HALF_WIDTH = 64
 _LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
 _ALWAYS_WHOLE = 256  # px on each side of the centre; a kernel up to there is computed whole, whatever its window
@@ -290,7 +290,7 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
 def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
     """One parameter as a float64 tensor, or a refusal by name."""
     if isinstance(value, Tensor):
-        tensor = real_tensor(name, value.double() if value.dtype in _INTEGERS else value, "[...]")
+        tensor = real_tensor(name, value.double() if value.dtype in WHOLE_NUMBERS else value, "[...]")
         if not tensor.numel():
             raise ValueError(f"{name} must hold at least one number, got {show(value)}")
         return tensor.to(device, torch.float64)
@@ -314,7 +314,8 @@ def _reach(family: str, params: Mapping[str, Tensor]) -> Tensor:
 
 
 def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
-    return (1.0 + params["b"] * (r / params["radius"]) ** params["m"]).clamp_min(0.0)
+    farthest = torch.exp(_TILT_EXPONENT / params["m"].detach().clamp_min(1.0))  # a larger power would overflow
+    return (1.0 + params["b"] * torch.minimum(r / params["radius"], farthest) ** params["m"]).clamp_min(0.0)
 
 
 def _cells(family: str, lengths: Mapping[str, Tensor], half: int, whole: int) -> Tensor:

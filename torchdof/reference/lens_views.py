@@ -19,7 +19,7 @@ from torch import Tensor
 
 from .. import validation
 from ..optics.blur_table import BlurTable
-from ..optics.camera import Camera
+from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..render.matting import matte
 from .lens_samples import LensSamples
 
@@ -101,6 +101,7 @@ def lens_views(
         validation.image_and_depth(rgba, behind, values=True)
         placed.append((rgba, camera.coc_px(behind, width)))
     coc = camera.coc_px(depth, width)
+    validation.coc_of_lens(coc, depth, {name: getattr(camera, name) for name in CAMERA_NUMBERS})
     return lens_views_by_coc(image, coc, table=table, views=views, surfaces=placed, mixed_edges=mixed_edges)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..validation import show
+from ..validation import floating, show
 
 __all__ = ["Attention", "box_around", "weight_map"]
 
@@ -30,7 +30,7 @@ def weight_map(attention: Any, image: Tensor) -> Tensor:
     batch, _, height, width = image.shape
     if isinstance(attention, Tensor):
         fits = attention.ndim == 4 and attention.shape[0] in (1, batch) and attention.shape[1:] == (1, height, width)
-        if not fits or not attention.is_floating_point() or not bool(((attention >= 0) & (attention <= 1)).all()):
+        if not fits or not floating(attention) or not bool(((attention >= 0) & (attention <= 1)).all()):
             raise ValueError(
                 f"attention must be a map [{batch} or 1, 1, {height}, {width}] of floating point values from 0 to 1, "
                 f"or (x, y, radius) in pixels, got {attention.dtype} {list(attention.shape)}"

@@ -11,6 +11,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
 from ..options import Options
 from ..validation import is_traced
+from . import headroom
 from .plan import KERNELS_PER_PX, Blur, Plan, kernels_for
 
 __all__ = ["picture"]
@@ -83,20 +84,13 @@ def _render(
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
     )
-    try:
-        if not any(_is_huge(light) for light, _, _ in (surfaces if kind == "stack" else surfaces[1:])):
-            return render(surfaces)
-    except OverflowError:  # the image is
-        pass
-    return render([(light * 2.0**-60, coc, weight) for light, coc, weight in surfaces]) / 2.0**-60
-
-
-def _is_huge(light: Tensor) -> bool:
-    """Whether sums of this light could overflow."""
-    ends = torch.stack(torch.aminmax(light))
-    if not torch.isfinite(ends).all():
-        ends = light[torch.isfinite(light)]
-    return ends.numel() > 0 and float(ends.abs().max()) > 2.0**100
+    if kind != "background":
+        try:
+            return render(surfaces)  # the engine looks at one image's light itself; a stack's has room
+        except OverflowError:
+            pass
+    scale = float(headroom.factor(*(light[None] for light, _, _ in surfaces[:2])))
+    return render([(light * scale, coc, weight) for light, coc, weight in surfaces]) / scale
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:

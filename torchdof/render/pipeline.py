@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..options import NAMED, Options
 from ..validation import is_traced
-from . import compiled, composite, highlights
+from . import compiled, composite, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
 from .matting import matte
@@ -56,6 +56,8 @@ def blur(
         plan = Plan.all(max_coc_px, tolerance)
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
         plan = Plan.still(torch.cat(maps[1::2]), options.tolerance)
+    elif plan is not None and not is_traced():
+        plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
         return _render_item(plan, options, *maps).to(image.dtype)
     # each item has its own layers, as it would have alone
@@ -99,14 +101,15 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     light, coc = rgba.to(wide), coc_px.to(wide)
     order = torch.where(torch.isfinite(coc), coc, torch.inf).argsort(1)  # near to far
     cover = light[:, :, -1:].clamp(0.0, 1.0)
+    scale = headroom.factor(light.flatten(1, 2))  # here, for light over a tiny coverage is brighter still
     valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
-    light = torch.where(valid, light / cover.clamp_min(1e-12), 0.0)
+    light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
     moves = torch.is_grad_enabled() and coc.requires_grad
     plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), options.tolerance)
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
-    return _render_item(plan, options, light, coc, cover=cover).to(rgba.dtype)
+    return (_render_item(plan, options, light, coc, cover=cover) / scale).to(rgba.dtype)
 
 
 def _render_item(
@@ -142,6 +145,9 @@ def _render_item(
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
     coc = coc.clamp(low, high)
+    scale = headroom.factor(light, behind_light)
+    if not headroom.has_room(scale):
+        light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
     # what is a highlight; without occlusion it matters only where a light is too bright for a coarse layer
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
@@ -169,6 +175,7 @@ def _render_item(
         splats = highlights.splat(rays, shown, options.table, options.occlusion) if rays else None
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
+    out = out if headroom.has_room(scale) else out / scale
     return out if valid is None else torch.where(valid, out, image)
 
 

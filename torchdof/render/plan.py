@@ -10,6 +10,8 @@ from torch import Tensor
 
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
+from ..options import tolerance_of
+from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
@@ -45,16 +47,30 @@ class Plan:
 
     Args:
         nodes: Places of the layers on the blur axis (see :mod:`torchdof.render.layer_weights`), strictly increasing.
-        tolerance: What the plan was made for.
-        rays: Highlights are splatted (:mod:`torchdof.render.highlights`) where layers would not do; False leaves them
-            in their layers, as plans for every scene do.
+        tolerance: What the plan was made for, in [0, 1).
+        rays: Highlights are splatted (:mod:`torchdof.render.highlights`) where layers would not do, and layers are
+            added where a scene is blurred beyond them; False does neither, as plans for every scene.
         pixels: Share of the scene's pixels that each layer carries, where it was asked for.
+
+    Raises:
+        ValueError: If there are no nodes in order, or the tolerance is none.
     """
 
     nodes: tuple[float, ...]
     tolerance: float
     rays: bool = True
     pixels: tuple[float, ...] | None = dataclasses.field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if is_traced():  # its numbers are not to be looked at
+            return
+        nodes = self.nodes
+        plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in nodes)
+        if not plain or not nodes or any(low >= high for low, high in zip(nodes, nodes[1:], strict=False)):
+            raise ValueError(f"plan must hold layers as a tuple of strictly increasing numbers, got {show(nodes)}")
+        if isinstance(self.tolerance, str):  # names are for those who call a rendering
+            raise ValueError(f"tolerance of a plan must be a number in [0, 1), such as 1/255, got {self.tolerance!r}")
+        tolerance_of(self.tolerance)
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
@@ -95,6 +111,18 @@ class Plan:
         last = reach - 0.3 * layer_cocs.spacing(reach, tolerance)
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays=False)
+
+    def reaching(self, coc_px: Tensor) -> "Plan":
+        """This plan, with layers added outwards as far as a scene ``[B, 1, H, W]`` is blurred; itself if it reaches."""
+        ends = layer_cocs.ends(coc_px.detach())
+        if not self.rays or (self.nodes[0] <= ends[0] and ends[1] <= self.nodes[-1]):
+            return self
+        nodes = list(self.nodes)
+        for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
+            gap = 0.3 * layer_cocs.spacing(last, self.tolerance)
+            beyond = [sign * x for x in Plan.of_scene(coc_px, self.tolerance).nodes if sign * x > last]
+            nodes += [sign * x for x in beyond if x > last + gap or x == max(beyond)]
+        return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)
 
     def of_pixels(self, coc_px: Tensor) -> "Plan":
         """The same plan, told which share of a scene's pixels each layer carries: ``[B, 1, H, W]``."""

@@ -155,3 +155,19 @@ def test_wrong_numbers_are_refused(value: float) -> None:
         lens.with_stop(value)
     with pytest.raises(ValueError, match="wavelength_um must be in micrometres"):
         lens.indices(value)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["1e-300 5 1.5 20", "1e300 5 1.5 20", "50 1e300 1.5 20", "50 5 1.5 1e300", "50 5 1.5 1e-300", "50 5 1.5/1e-9 20"],
+)
+def test_numbers_that_are_finite_but_absurd_are_refused(tmp_path, line):
+    (tmp_path / "x.txt").write_text(f"{line}\n0 1 0 18\n-50 0 1 20\n")
+    with pytest.raises(ValueError, match=r"x\.txt: line 1, column "):
+        Lens.read(tmp_path / "x.txt")
+
+
+def test_a_prescription_of_endless_surfaces_is_refused(tmp_path):
+    (tmp_path / "x.txt").write_text("50 5 1.5 20\n" * 2000 + "0 1 0 18\n-50 0 1 20\n")
+    with pytest.raises(ValueError, match="line 1001: a lens has at most 1000 surfaces"):
+        Lens.read(tmp_path / "x.txt")

@@ -107,6 +107,41 @@ def test_wrong_manifests_are_refused_with_the_field(folder, before, after, error
     assert caught.value.file.endswith("capture.toml")
 
 
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("focus_m = 1e-300", "focus_m"),
+        ("focus_m = 1e30", "focus_m"),
+        ("focal_length_mm = 1e300", "focal_length_mm"),
+        ("f_number = 1e-30", "f_number"),
+        ("sensor_width_mm = 5e-324", "sensor_width_mm"),
+        ("exposure_s = 1e99", "exposure_s"),
+    ],
+)
+def test_numbers_that_are_finite_but_absurd_are_refused(folder, line, name):
+    lines = [old for old in (folder / "capture.toml").read_text().splitlines() if not old.startswith(name)]
+    (folder / "capture.toml").write_text("\n".join([line, *lines]))
+    with pytest.raises(p.ManifestError, match=rf"{name} must be a positive number, got .*; a camera's is"):
+        read_captures(folder)
+
+
+def test_a_root_holds_the_manifest_and_its_pictures(folder, tmp_path_factory):
+    outside = tmp_path_factory.mktemp("outside")
+    assert len(read_captures(folder, root=folder)) == len(read_captures(folder, root=folder.parent)) == 1
+    with pytest.raises(p.ManifestError, match="lies outside of"):
+        read_captures(folder, root=outside)
+    with pytest.raises(p.ManifestError, match="root must be a folder"):
+        read_captures(folder, root=folder / "nowhere")
+    (outside / "secret.png").write_bytes((folder / "0400mm.png").read_bytes())
+    (folder / "link.png").symlink_to(outside / "secret.png")
+    for name in ("link.png", f"{outside}/secret.png", f"../{outside.name}/secret.png"):
+        change(folder, 'file = "0400mm.png"', f'file = "{name}"')
+        assert "../" in name or len(read_captures(folder)) == 1  # without a root it is read
+        with pytest.raises(p.ManifestError, match=r"secret\.png' lies outside|link\.png' lies outside"):
+            read_captures(folder, root=folder)
+        change(folder, f'file = "{name}"', 'file = "0400mm.png"')
+
+
 def test_a_folder_without_manifest_or_shots_is_refused(tmp_path):
     with pytest.raises(p.ManifestError, match="no such manifest; write a capture.toml"):
         read_captures(tmp_path)

@@ -15,7 +15,7 @@ enum {
   TORCHDOF_OK = 0,
   TORCHDOF_NO_MEMORY = 1,
   TORCHDOF_CANCELLED = 2,
-  TORCHDOF_TOO_BRIGHT = 3,  // sums of the image's light could overflow: scale it down; other surfaces are not looked at
+  TORCHDOF_TOO_BRIGHT = 3,  // powers of the image's light could overflow: scale it down; other surfaces are not looked at
 };
 
 // What the given surfaces are.

@@ -125,9 +125,9 @@ void Job::take_scene() {
     light_least[i % channels] = std::min(light_least[i % channels], leasts[i]);
     light_most[i % channels] = std::max(light_most[i % channels], mosts[i]);
   }
-  constexpr float BRIGHTEST = 1.2676506e30f;  // 2 to the 100th
-  for (size_t i = 0; i < surfaces.blocks.size(); i++)
-    if (block_peak[i] > BRIGHTEST) throw TooBright();
+  constexpr float BRIGHTEST = 268435456.0f;  // 2 to the 28th: powers of light are summed
+  for (int c = 0; c < channels; c++)
+    if (scene.kind != TORCHDOF_STACK && std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
   if (std::count(beyond.begin(), beyond.end(), 1)) {
     const float *given = surfaces.coc;
     Buffer<float> within(area);

@@ -1,0 +1,89 @@
+"""Inputs made from others, by a seeded random generator: bytes and the structure that a checksum would protect."""
+
+import random
+import re
+import struct
+import zlib
+
+__all__ = ["mutated"]
+
+_WORDS = [b"", b"0", b"-1", b"1", b"nan", b"inf", b"-inf", b"1e308", b"-1e308", b"1e-320", b"9" * 400, b"null", b"true",
+          b'"x"', b"[]", b"{}", b"[[1]]", b"\x00", b"\xff\xfe", b"../x", b"/dev/null", b"/"]  # fmt: skip
+_NUMBERS = [0, 1, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1]
+_FLOATS = [0.0, -0.0, 1e-45, 1e-38, 1.0, 2e9, 2e19, 1e30, 3.4e38, -1.0, -1e30, float("inf"), float("nan"), 0.5, 64.0]
+_TOKEN = re.compile(rb'-?\d[\d.eE+-]*|"[^"]*"|[a-z_]+')
+
+
+def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random) -> bytes:
+    """A changed input: a few changes of bytes or, in what has a structure, of its tokens and chunks."""
+    made = content
+    for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
+        kinds = [_bytes, _bytes, _number, _cut, _splice, _repeat]
+        if suffix in (".json", ".toml", ".txt"):
+            kinds += [_token] * 12
+        elif suffix == ".scene":
+            kinds += [_float] * 12
+        made = rng.choice(kinds)(made, others, rng)
+    if suffix == ".png" and rng.random() < 0.8:
+        made = _with_checksums(made)
+    return made[: 2**18]
+
+
+def _bytes(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
+    made = bytearray(content or b"\0")
+    limit = len(made) if rng.random() < 0.5 else min(len(made), 400)  # mostly headers, where sizes and offsets are
+    for _ in range(rng.choice((1, 1, 2, 4))):
+        place = rng.randrange(limit)
+        made[place] = rng.choice((0, 255, 1 << rng.randrange(8) ^ made[place], rng.randrange(256)))
+    return bytes(made)
+
+
+def _number(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
+    form = rng.choice(("<I", ">I", "<H", ">H", "<Q"))
+    number = struct.pack(form, rng.choice(_NUMBERS) % 256 ** struct.calcsize(form))
+    place = rng.randrange(max(1, min(len(content), 1000)))
+    return content[:place] + number + content[place + len(number) :]
+
+
+def _cut(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
+    return content[: rng.randrange(len(content) + 1)]
+
+
+def _splice(content: bytes, others: list[bytes], rng: random.Random) -> bytes:
+    other = rng.choice(others)
+    return content[: rng.randrange(len(content) + 1)] + other[rng.randrange(len(other) + 1) :]
+
+
+def _repeat(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
+    start = rng.randrange(len(content) + 1)
+    end = min(len(content), start + rng.randrange(1, 64))
+    return content[:end] + content[start:end] * rng.choice((1, 2, 50)) + content[end:]
+
+
+def _token(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
+    tokens = list(_TOKEN.finditer(content))
+    if not tokens:
+        return content
+    token = rng.choice(tokens)
+    word = rng.choice([*_WORDS, rng.choice(tokens).group(), repr(rng.choice(_FLOATS)).encode()])
+    return content[: token.start()] + word + content[token.end() :]
+
+
+def _float(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
+    made = bytearray(content)
+    for _ in range(rng.choice((1, 3, 20))):
+        place = 5 + 4 * rng.randrange(max(1, (len(made) - 5) // 4))
+        made[place : place + 4] = struct.pack("<f", rng.choice(_FLOATS) if rng.random() < 0.6 else rng.gauss(0, 20))
+    return bytes(made)
+
+
+def _with_checksums(content: bytes) -> bytes:
+    """A PNG whose chunks have the checksums of what they hold now."""
+    made, place = bytearray(content), 8
+    while place + 12 <= len(made):
+        end = place + 12 + int.from_bytes(made[place : place + 4], "big")
+        if end > len(made):
+            break
+        made[end - 4 : end] = struct.pack(">I", zlib.crc32(made[place + 4 : end - 4]))
+        place = end
+    return bytes(made)

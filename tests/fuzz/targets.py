@@ -1,0 +1,298 @@
+"""What is fuzzed: every reader of a file, and the compiled engine; each with whole inputs to start from.
+
+A target takes a file and may refuse it with its own errors, in one sentence that names the file. Anything else is a
+finding: another exception, a crash, a line that a library prints, a picture that is not finite, too long or too large.
+"""
+
+import dataclasses
+import json
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import OpenImageIO as oiio
+import torch
+
+from torchdof import BlurTable, blur_by_coc
+from torchdof.depth import read_depth
+from torchdof.export import describe
+from torchdof.fit import FitError, read_captures
+from torchdof.fit.lens.lens import Lens
+from torchdof.io.images import Picture, read_image, read_values, write_image
+from torchdof.io.metadata import camera_facts
+
+REFUSED = (ValueError, OSError, FitError)
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """One thing that is fuzzed.
+
+    Args:
+        suffix: Of its files.
+        seeds: Writes whole files into a folder.
+        run: Takes a file; what it raises besides ``REFUSED`` is a finding.
+        named: Whether a refusal must name the file.
+    """
+
+    suffix: str
+    seeds: Callable[[Path], None]
+    run: Callable[[Path], None]
+    named: bool = True
+
+
+def _picture(channels: int = 3) -> Picture:
+    pixels = torch.linspace(0, 1, channels * 6 * 7).reshape(1, channels, 6, 7)
+    return Picture(pixels, ("R", "G", "B", "A")[:channels] if channels > 1 else ("Y",))
+
+
+def _image_seeds(suffix: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        for sample in {".png": ("8", "16"), ".exr": ("half", "float"), ".tif": ("8", "float")}.get(suffix, (None,)):
+            write_image(folder / f"rgb{sample}{suffix}", _picture(), sample=sample)  # type: ignore[arg-type]
+        if suffix not in (".hdr", ".jpg", ".pfm"):
+            write_image(folder / f"alpha{suffix}", _picture(4))
+        if suffix == ".exr":
+            _tiled(folder / "tiled.exr", levels="ONE_LEVEL")
+            _tiled(folder / "mipmap.exr", levels="MIPMAP_LEVELS")
+            _parts(folder / "parts.exr")
+            _window(folder / "window.exr")
+        if suffix == ".jpg":
+            tags = {
+                "Exif:FocalLength": ("float", 50.0),
+                "FNumber": ("float", 1.8),
+                "Exif:SubjectDistance": ("float", 2.0),
+            }
+            write_image(folder / "exif.jpg", dataclasses.replace(_picture(), metadata=tags))
+
+    return write
+
+
+def _spec(channels: tuple[str, ...] = ("R", "G", "B", "Z")) -> oiio.ImageSpec:
+    spec = oiio.ImageSpec(16, 16, len(channels), "half")
+    spec.channelnames = channels
+    return spec
+
+
+def _store(path: Path, specs: list[oiio.ImageSpec]) -> None:
+    output = oiio.ImageOutput.create(str(path))
+    assert output is not None and output.open(str(path), specs if len(specs) > 1 else specs[0])
+    for number, spec in enumerate(specs):
+        assert not number or output.open(str(path), spec, "AppendSubimage")
+        pixels = np.linspace(0.1, 1, spec.width * spec.height * spec.nchannels, dtype=np.float32)
+        assert output.write_image(pixels.reshape(spec.height, spec.width, spec.nchannels)), output.geterror()
+    output.close()
+
+
+def _tiled(path: Path, levels: str) -> None:
+    spec = _spec()
+    spec.tile_width = spec.tile_height = 16
+    if levels != "ONE_LEVEL":
+        spec.attribute("openexr:levelmode", 1)
+        spec.attribute("textureformat", "Plain Texture")
+    _store(path, [spec])
+
+
+def _parts(path: Path) -> None:
+    colour, depth = _spec(("R", "G", "B")), _spec(("Z",))
+    colour.attribute("name", "beauty")
+    depth.attribute("name", "depth")
+    _store(path, [colour, depth])
+
+
+def _window(path: Path) -> None:
+    spec = _spec()
+    spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = -3, -5, 0, 0, 8, 8
+    _store(path, [spec])
+
+
+def _read_picture(path: Path) -> None:
+    for read in (read_image, read_values):
+        try:
+            found = read(path)
+        except REFUSED as error:
+            assert path.name in str(error), f"not named: {error}"
+        else:
+            if isinstance(found, Picture):
+                assert torch.isfinite(found.pixels).all(), "pixels that are not finite"
+                camera_facts(found.metadata, found.pixels.shape[-1])
+
+
+def _array_seeds(suffix: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        for number, kind in enumerate(("<f4", ">f8", "<u2", "<f2")):
+            values = np.linspace(1, 2, 12).reshape(3, 4).astype(kind)
+            path = folder / f"{number}{suffix}"
+            if suffix == ".npy":
+                np.save(path, values)
+            elif number % 2:
+                np.savez_compressed(path, depth=values)
+            else:
+                np.savez(path, depth=values, mask=values > 1)
+
+    return write
+
+
+def _read_array(path: Path) -> None:
+    for fill in ("far", 3.0, None):
+        try:
+            depth = read_depth(path, fill=fill)  # type: ignore[arg-type]
+        except REFUSED as error:
+            assert path.name in str(error), f"not named: {error}"
+        else:
+            assert bool((depth > 0).all()), "a depth that is none"
+
+
+def _table_seeds(folder: Path) -> None:
+    for name in ("sato_j15", "wide_22mm_f4"):
+        BlurTable.load(name).save(folder / f"{name}.json")
+    soft = {"radius": [0.01, 0.02], "sigma": [0.003, 0.001], "b": [1.0, 0.0], "m": [2.0, 8.0]}
+    BlurTable("softm", [-0.01, 0.02], soft, unit="mm", sensor_width_mm=36.0).save(folder / "soft.json")
+
+
+def _read_table(path: Path) -> None:
+    table = BlurTable.load(path)
+    for width in (10, 640):
+        try:
+            kernels = table.kernels(torch.tensor([-5.0, -0.6, 0.0, 1.0, 9.0]), width, size=9)
+        except ValueError as error:
+            assert "at most" in str(error), f"read, and then: {error}"
+        else:
+            assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0, "kernels that are none"
+
+
+def _manifest_seeds(folder: Path) -> None:
+    (folder / "capture.toml").write_text(
+        'focus_m = 0.5\nsharp = "sharp.png"\nfocal_length_mm = 50.0\nf_number = 2.8\nsensor_width_mm = 36.0\n'
+        'transfer = "srgb"\ndark = "dark.png"\nexposure_s = 0.02\ndots = "one"\nname = "my lens"\n\n'
+        '[[shot]]\nfile = "near.png"\ndistance_m = 0.4\nexposure_s = 0.02\n\n'
+        '[[shot]]\nfile = "far.png"\ndistance_m = 0.9\n'
+    )
+
+
+def _read_manifest(path: Path) -> None:
+    read_captures(path, root=path.parent)
+
+
+def _lens_seeds(folder: Path) -> None:
+    for name in ("wide_22mm", "double_gauss_50mm", "telephoto_250mm"):
+        lens = Lens.read(name)
+        (folder / f"{name}.txt").write_text("\n".join([f"# source: {lens.source}", *lens.lines()]) + "\n")
+
+
+def _read_lens(path: Path) -> None:
+    lens = Lens.read(path)
+    try:
+        lens.paraxial()
+    except ValueError as error:
+        assert "lens" in str(error)
+
+
+def _onnx_seeds(folder: Path) -> None:
+    node = onnx.helper.make_node("Identity", ["image"], ["out"])
+    values = [onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in ("image", "out")]
+    model = onnx.helper.make_model(onnx.helper.make_graph([node], "g", values[:1], values[1:]))
+    facts: dict[str, Any] = {"options": {"tolerance": 0.1}, "camera": {"f_number": 2.0}, "width": None, "layers": 9}
+    for key, value in facts.items():
+        model.metadata_props.add(key=f"torchdof.{key}", value=json.dumps(value))
+    onnx.save_model(model, folder / "dof.onnx")
+
+
+def _read_onnx(path: Path) -> None:
+    describe(path)
+
+
+def _scene_seeds(folder: Path) -> None:
+    for seed in range(8):
+        random = np.random.default_rng(seed)
+        head = struct.pack("<5B", *random.integers(0, 256, 5))
+        numbers = random.normal(size=400).astype(np.float32)
+        (folder / f"{seed}.scene").write_bytes(head + numbers.tobytes())
+
+
+def scene_of(content: bytes) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Image, coc and options that the bytes of a file stand for: sizes and options, then numbers as they come."""
+    head = content[:5].ljust(5, b"\0")
+    height, width, channels = 1 + head[0] % 24, 1 + head[1] % 32, 1 + head[2] % 4
+    flags, scale = head[3], (1.0, 30.0, 300.0, 1e-3)[head[4] % 4]
+    numbers = np.frombuffer(content[5 : 5 + (len(content) - 5) // 4 * 4], np.float32)
+    if not len(numbers):
+        numbers = np.ones(1, np.float32)
+    needed = height * width * (channels + 1)
+    numbers = np.resize(numbers, needed)
+    image = torch.from_numpy(numbers[: height * width * channels].reshape(1, channels, height, width).copy())
+    coc = torch.from_numpy(numbers[height * width * channels :].reshape(1, 1, height, width).copy()) * scale
+    if flags & 16:  # planes rather than noise
+        coc = torch.round(coc / 8) * 8
+    if flags & 32:
+        image = image.abs()
+    occlusion = bool(flags & 1)
+    options = {
+        "occlusion": occlusion,
+        "border": "extend" if flags & 2 else "normalize",
+        "check": bool(flags & 4),
+        "normalize": occlusion or bool(flags & 8),
+        "tolerance": "preview" if flags & 64 else "final",
+        "table": BlurTable.gaussian() if flags & 128 else BlurTable.disc(),
+    }
+    return image, coc, options
+
+
+def _render(path: Path) -> None:
+    image, coc, options = scene_of(path.read_bytes())
+    pictures = []
+    for engine in ("torch", "native"):
+        os.environ["TORCHDOF_ENGINE"] = engine
+        try:
+            pictures.append(blur_by_coc(image, coc, **options))
+        except ValueError as error:
+            assert options["check"] and "finite" in str(error), f"refused: {error}"
+    if not pictures:
+        return
+    plain, compiled = pictures
+    good = torch.isfinite(image).all(1, keepdim=True) & torch.isfinite(coc)
+    light = torch.where(good, image, 0.0).abs().amax().double()
+    if not options["normalize"] and light > 1e37:  # a plain sum may be beyond what its type holds
+        return
+    for name, picture in (("plain", plain), ("compiled", compiled)):
+        assert bool(torch.isfinite(picture[good.expand_as(picture)]).all()), f"{name}: light that is not finite"
+        largest = torch.where(good, picture, 0.0).abs().amax().double()
+        assert not options["normalize"] or largest <= 1.5 * light, f"{name}: brighter than its light"
+    apart = torch.where(good, plain.double() - compiled.double(), 0.0).abs().amax()
+    assert float(apart) <= 1e-3 * float(light) + 1e-37, f"the engines differ by {float(apart / light):.2g}"
+
+
+TARGETS: dict[str, Target] = {
+    **{s[1:]: Target(s, _image_seeds(s), _read_picture) for s in (".png", ".exr", ".tif", ".jpg", ".hdr", ".pfm")},
+    **{suffix[1:]: Target(suffix, _array_seeds(suffix), _read_array) for suffix in (".npy", ".npz")},
+    "table": Target(".json", _table_seeds, _read_table),
+    "manifest": Target(".toml", _manifest_seeds, _read_manifest, named=False),  # a picture that is not there is named
+    "lens": Target(".txt", _lens_seeds, _read_lens),
+    "onnx": Target(".onnx", _onnx_seeds, _read_onnx),
+    "engines": Target(".scene", _scene_seeds, _render, named=False),
+}
+
+
+def finding(target: Target, path: Path) -> str | None:
+    """What is wrong with how a target takes a file; None if nothing is."""
+    try:
+        target.run(path)
+    except REFUSED as error:
+        if target.named and path.name not in str(error):
+            return f"refused without its name: {type(error).__name__}: {str(error)[:200]}"
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            raise
+        return f"{type(error).__name__}: {str(error)[:200]}"
+    return None
+
+
+def seeds(target: Target, folder: Path) -> Iterator[bytes]:
+    """The whole inputs of a target."""
+    target.seeds(folder)
+    for path in sorted(folder.iterdir()):
+        yield path.read_bytes()
