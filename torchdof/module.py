@@ -1,5 +1,7 @@
 """Depth of field as a module and as functions: configuration, checks, then one call of the pipeline."""
 
+import os
+import threading
 from collections.abc import Callable
 from typing import Any, Unpack
 
@@ -322,11 +324,26 @@ def _blur(
 
 def _rendered(render: Callable[..., Tensor], light: Tensor, *arguments: Any) -> Tensor:
     """What a function of the pipeline makes of light, with autocast off: it would convolve in half precision."""
+    if not validation.is_traced():
+        _has_rendered.set()
     device = light.device.type
     if not torch.is_autocast_enabled(device):
         return render(light, *arguments)
     with torch.autocast(device, enabled=False):
         return render(light, *arguments)
+
+
+_has_rendered = threading.Event()
+
+
+def _after_fork() -> None:
+    """In a forked child: PyTorch's threads (OpenMP) do not outlive a fork, and waiting for them would last for ever."""
+    if _has_rendered.is_set() and torch.get_num_threads() > 1:
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def _check_plan(plan: Plan | None) -> None:
