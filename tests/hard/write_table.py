@@ -34,9 +34,9 @@ module with the same layers in float64.
 Made by `python tests/hard/write_table.py docs/hard_cases.md` with PyTorch {torch} and onnxruntime {onnxruntime} on
 {machine}, {threads} threads. `pytest -m hard` holds every number to its limit (float32, float16, onnxruntime).
 
-Tried: {count} cases, {measured} errors measured. Beside them `pytest -m hard` takes {tests} tests of hostile arguments, files,
-light, gradients and command lines, those of Hypothesis with 50 to 100 examples each, and `make fuzz` changed files to
-every reader and scenes to both engines: see below.
+Tried: {count} cases, {measured} errors measured. Beside them `pytest -m hard` takes {tests} tests of hostile arguments,
+files, light, gradients and command lines, those of Hypothesis with 50 to 100 examples each, and `make fuzz` changed
+files to every reader and scenes to both engines: see below.
 """
 
 
