@@ -3,6 +3,8 @@
 # make sweep      run the hard tests at full length: whole frames instead of strips, up to twenty times as many examples
 # make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
+# make fuzz       changed files to every reader, and scenes to both engines, for an hour (SECONDS=3600); lists what it finds
+# make soak       1,000 renderings in one process, 8 threads, forked and spawned workers: memory and pictures stay the same
 # All need only Python 3.11 and make: the first run makes .venv and installs what constraints.txt pins.
 # Where there is a C++ compiler the engine is compiled too.
 
@@ -15,7 +17,7 @@ INSTALLED := $(VENV)/.installed
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
-.PHONY: demo test sweep install check wheel sanitize clean
+.PHONY: demo test sweep install check wheel sanitize fuzz soak clean
 
 demo: $(INSTALLED)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
@@ -43,6 +45,13 @@ wheel: $(INSTALLED)
 
 sanitize: $(INSTALLED)
 	tests/native/sanitize.sh $(BIN)/python
+
+SECONDS := 3600
+fuzz: $(INSTALLED)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/run.py --seconds $(SECONDS)
+
+soak: $(INSTALLED)
+	$(BIN)/python tests/hard/soak.py --renderings 1000
 
 $(INSTALLED): pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
 	@echo "installing into $(VENV); the first time this takes a minute or two"

@@ -1,5 +1,7 @@
 """Depth of field as a module and as functions: configuration, checks, then one call of the pipeline."""
 
+import os
+import threading
 from collections.abc import Callable
 from typing import Any, Unpack
 
@@ -331,6 +333,8 @@ def _blur(
 
 def _rendered(render: Callable[..., Tensor], light: Tensor, *arguments: Any) -> Tensor:
     """What a function of the pipeline makes of light, with autocast off: it would convolve in half precision."""
+    if not validation.is_traced():
+        _has_rendered.set()
     device = light.device.type
     if not torch.is_autocast_enabled(device):
         return render(light, *arguments)
@@ -344,6 +348,19 @@ def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
         return coc_px
     mended = -repair(image, -coc_px.detach(), _EDGE_PX, auto=options.depth_edges == "auto")
     return torch.where((mended != coc_px) & torch.isfinite(coc_px), mended, coc_px)
+
+
+_has_rendered = threading.Event()
+
+
+def _after_fork() -> None:
+    """In a forked child: PyTorch's threads (OpenMP) do not outlive a fork, and waiting for them would last for ever."""
+    if _has_rendered.is_set() and torch.get_num_threads() > 1:
+        torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def _check_plan(plan: Plan | None) -> None:

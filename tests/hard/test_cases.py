@@ -1,4 +1,4 @@
-"""Every hard case within its limit, in float32 and float16."""
+"""Every hard case within its limit, in float32 and float16, by both engines."""
 
 import importlib.util
 import sys
@@ -17,9 +17,11 @@ _spec.loader.exec_module(_module)
 pytestmark = pytest.mark.hard
 
 
+@pytest.mark.parametrize("engine", ["torch", "native"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16], ids=["float32", "float16"])
 @pytest.mark.parametrize("case", _module.CASES, ids=lambda case: f"{case.group}: {case.name}")
-def test_error_is_within_the_limit(case: Any, dtype: torch.dtype) -> None:
+def test_error_is_within_the_limit(case: Any, dtype: torch.dtype, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     assert case.measure(dtype) <= case.limit[dtype]
 
 

@@ -334,21 +334,25 @@ class BlurTable:
 
     def _try_kernels(self) -> None:
         """Refuse parameters whose kernels, at the nodes, between and beyond them, are no numbers or no lens's."""
-        largest = float(self.coc.abs().max())
         low, high = _COC_RANGE
-        if not low <= largest <= high:
-            raise ValueError(f"coc must reach somewhere from {low:g} to {high:g} ({self.unit}), got {largest:g}")
-        places = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
-        tried = self.params(places * self._px_per_unit(1.0), 1.0)
-        widest = psf.support(self.family, tried) / self._px_per_unit(1.0)
-        if widest > _WIDEST * largest:
-            raise ValueError(
-                f"params must be lengths in the unit of coc, got such as reach to {widest:g} where coc is {largest:g}"
-            )
+        per_px, widest = self._px_per_unit(1.0), 0.0
+        for side in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
+            largest = float(side.abs().max()) if len(side) else low
+            if not low <= largest <= high:
+                raise ValueError(f"coc must reach somewhere from {low:g} to {high:g} ({self.unit}), got {largest:g}")
+            reach = psf.support(self.family, self.params(side * per_px, 1.0)) / per_px if len(side) else 0.0
+            if reach > _WIDEST * largest:
+                raise ValueError(
+                    "params must be lengths in the unit of coc, got such as "
+                    f"reach to {reach:g} where coc is {largest:g}"
+                )
+            widest = max(widest, reach)
         if widest == 0.0:
             return
+        places = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
+        tried = self.params(places * per_px, 1.0)
         for pixels in _TRIED_PX:
-            factor = pixels / widest / self._px_per_unit(1.0)
+            factor = pixels / widest / per_px
             lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in tried.items()}
             if not bool(torch.isfinite(psf.pixel_kernels(self.family, lengths)).all()):
                 named = ", ".join(f"{name} up to {float(value.max()):g}" for name, value in self._params.items())

@@ -1,0 +1,136 @@
+"""Renders for long in one process and tells whether it grows: `make soak`, or `python tests/hard/soak.py --help`.
+
+Random sizes, cameras, tables and options; then several threads with a module each, and workers that are forked and
+spawned, while other libraries run threads of their own: OpenMP in PyTorch, TBB in OpenVINO.
+"""
+
+import argparse
+import gc
+import multiprocessing
+import os
+import random
+import sys
+import threading
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+
+from torchdof import BlurTable, Camera, DepthOfField
+from torchdof.render import compiled, plan
+
+TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15"), BlurTable.load("wide_22mm_f4")]
+
+
+def resident_mb() -> float:
+    """Memory that this process holds, without the kernels that it keeps on purpose, which are bounded."""
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    kept = plan._kernels.bytes + compiled._kernels.bytes
+    return (pages * os.sysconf("SC_PAGE_SIZE") - kept) / 2**20
+
+
+def rendering(seed: int) -> torch.Tensor:
+    """A picture of random size, camera, table and options."""
+    rng, draw = random.Random(seed), torch.Generator().manual_seed(seed)
+    height, width = rng.randint(1, 200), rng.randint(1, 260)
+    image = torch.rand(rng.choice((1, 1, 2)), 3, height, width, generator=draw)
+    image = image ** rng.choice((1, 8))  # with highlights
+    depth = 0.5 + 6.0 * torch.rand(1, 1, height, width, generator=draw).cumsum(-1) / width
+    camera = Camera(rng.uniform(20, 90), rng.uniform(1.2, 8), rng.uniform(0.4, 6), rng.uniform(5, 36))
+    dof = DepthOfField(
+        camera,
+        rng.choice(TABLES),
+        tolerance=rng.choice(("draft", "preview", "final")),
+        occlusion=rng.random() < 0.7,
+        border=rng.choice(("normalize", "extend")),
+        check=rng.random() < 0.7,
+    )
+    with torch.inference_mode():
+        return dof(image, depth)
+
+
+def same(pictures: list[torch.Tensor], truth: list[torch.Tensor]) -> bool:
+    """Whether pictures are those, but for rounding: PyTorch's sums depend on its number of threads."""
+    return len(pictures) == len(truth) and all(map(torch.allclose, pictures, truth))
+
+
+def grown(count: int, say: bool = False) -> tuple[float, float]:
+    """Memory in MB after a fifth of so many renderings, and after all of them: the larger of the last two fifths."""
+    sizes = []
+    for seed in range(count):
+        assert torch.isfinite(rendering(seed)).all(), f"seed {seed}"
+        if (seed + 1) % (count // 5) == 0:
+            sizes.append(resident_mb())
+            if say:
+                print(f"{seed + 1:6} renderings, {sizes[-1]:.1f} MB", flush=True)
+    return sizes[0], max(sizes[-2:])
+
+
+def in_threads(seeds: range, threads: int) -> list[torch.Tensor]:
+    """Pictures by several threads at once."""
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(rendering, seeds))
+
+
+def in_workers(seeds: range, kind: str) -> list[torch.Tensor]:
+    """Pictures by processes that are forked from this one, which has rendered before, or spawned."""
+    context = multiprocessing.get_context(kind)
+    with ProcessPoolExecutor(2, context) as pool:
+        return list(pool.map(rendering, seeds, timeout=300))
+
+
+class Busy:
+    """Other libraries' threads at work: OpenMP's in PyTorch, TBB's in OpenVINO."""
+
+    def __enter__(self) -> "Busy":
+        import openvino
+
+        x = openvino.opset13.parameter([64, 64])
+        core = openvino.Core()
+        network = core.compile_model(openvino.Model([openvino.opset13.matmul(x, x, False, False)], [x]), "CPU")
+        self.stop = threading.Event()
+
+        def openmp() -> None:
+            while not self.stop.wait(0.001):
+                torch.rand(300, 300) @ torch.rand(300, 300)
+
+        def tbb() -> None:
+            while not self.stop.wait(0.001):
+                network([torch.rand(64, 64).numpy()])
+
+        self.threads = [threading.Thread(target=work) for work in (openmp, tbb)]
+        for thread in self.threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop.set()
+        for thread in self.threads:
+            thread.join()
+
+
+def main() -> None:
+    """Soaks, and ends with an error if memory grew by 3 % or a picture differs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--renderings", type=int, default=1000)
+    parser.add_argument("--pictures", type=int, default=64, help="For threads and workers.")
+    arguments = parser.parse_args()
+    start = time.monotonic()
+    before, after = grown(arguments.renderings, say=True)
+    print(f"{before:.1f} to {after:.1f} MB: {after / before - 1:+.2%}")
+    seeds = range(arguments.pictures)
+    truth = [rendering(seed) for seed in seeds]
+    with Busy():
+        threads, spawned = in_threads(seeds, 8), in_workers(seeds, "spawn")
+    pictures = {"8 threads": threads, "spawned workers": spawned, "forked workers": in_workers(seeds, "fork")}
+    equal = {name: same(made, truth) for name, made in pictures.items()}
+    for name in equal:
+        print(f"{name}: {len(truth)} pictures {'are the same' if equal[name] else 'DIFFER'}")
+    print(f"{time.monotonic() - start:.0f} s")
+    sys.exit(0 if after <= 1.03 * before and all(equal.values()) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""Long use of one process: it does not grow, and threads and workers make the same pictures."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SOAK = Path(__file__).with_name("soak.py")
+
+
+def soaked(*arguments: str) -> list[str]:
+    run = subprocess.run([sys.executable, str(SOAK), *arguments], capture_output=True, text=True, timeout=3000)
+    assert run.returncode == 0, run.stdout + run.stderr
+    return run.stdout.splitlines()
+
+
+@pytest.mark.sweep
+def test_a_thousand_renderings_leave_memory_as_it_was_and_workers_make_the_same_pictures() -> None:
+    said = soaked("--renderings", "1000")
+    assert [line.partition(":")[0] for line in said if line.endswith("are the same")] == [
+        "8 threads",
+        "spawned workers",
+        "forked workers",
+    ]
+
+
+FORKED = """
+import os, signal, sys, torch
+os.environ["TORCHDOF_ENGINE"] = sys.argv[1]
+from torchdof import blur_by_coc
+signal.alarm(100)
+torch.set_num_threads(2)
+image, coc_px = torch.rand(1, 3, 200, 300), torch.linspace(-9.0, 9.0, 300).expand(1, 1, 200, 300)
+wanted = blur_by_coc(image, coc_px)
+child = os.fork()
+signal.alarm(100)
+if child == 0:
+    os._exit(0 if torch.allclose(blur_by_coc(image, coc_px), wanted) else 3)
+print(os.waitpid(child, 0)[1], torch.get_num_threads())
+"""
+
+
+@pytest.mark.hard
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no fork")
+@pytest.mark.parametrize("engine", ["torch", "native"])
+def test_a_forked_worker_renders_after_its_parent_has_by_many_threads(engine: str) -> None:
+    run = subprocess.run([sys.executable, "-c", FORKED, engine], capture_output=True, text=True, timeout=200)
+    assert run.stdout == "0 2\n", run.stdout + run.stderr
+
+
+@pytest.mark.hard
+def test_eight_threads_with_a_module_each_make_the_same_pictures() -> None:
+    spec = importlib.util.spec_from_file_location("torchdof_soak", SOAK)
+    assert spec is not None and spec.loader is not None
+    soak = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(soak)
+    truth = [soak.rendering(seed) for seed in range(12)]
+    assert soak.same(soak.in_threads(range(12), 8), truth)
