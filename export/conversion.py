@@ -42,6 +42,9 @@ def to_onnx(
     are free, from 1 upwards. A pixel whose depth is NaN, zero or negative passes through sharp and touches nothing
     else.
 
+    The graph takes the depth as it is given, whatever ``dof.depth_edges`` says: repairing edges looks at the whole
+    frame first, several times over. Call :func:`torchdof.depth.repair_edges` before it where the map is not exact.
+
     The graph has the layers of every radius up to ``dof.max_coc_px``. It renders tile by tile in an ONNX ``Loop`` and
     skips, by ``If``, layers that no pixel in or near a tile falls into: a frame in focus takes a fraction of the time
     of a blurred one (numbers in docs/embedding.md).

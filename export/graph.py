@@ -24,6 +24,8 @@ OUTPUT = "out"
 class Portable(nn.Module):
     """The module as its ONNX file computes it: all layers up to ``max_coc_px``, bad values passed through sharp.
 
+    It takes the depth as it is given.
+
     Called outside an export it renders the same thing with eager PyTorch, and that is what a file is verified against.
 
     Args:
@@ -48,7 +50,8 @@ class Portable(nn.Module):
                 )
         self.inputs, self.width = inputs, width
         self.dof = copy.copy(dof)
-        self.dof.options = dataclasses.replace(dof.options, table=pinned(dof.options.table, width), check=False)
+        table = pinned(dof.options.table, width)
+        self.dof.options = dataclasses.replace(dof.options, table=table, check=False, depth_edges="as given")
         self.eval()
 
     def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
     model.producer_name, model.producer_version = "torchdof", _version()
     model.doc_string = "Depth of field: an all-in-focus image and its depth in, the photograph of a real lens out."
     model.graph.name = "depth_of_field"
-    options = {k: v for k, v in dof.options.arguments().items() if k not in ("table", "check")}
+    options = {k: v for k, v in dof.options.arguments().items() if k not in ("table", "check", "depth_edges")}
     facts: dict[str, Any] = {
         "version": _version(),
         "inputs": {v.name: UNITS[v.name].format(channels=channels) for v in model.graph.input},

@@ -347,7 +347,7 @@ def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     if options.depth_edges == "as given":
         return coc_px
     mended = -repair(image, -coc_px.detach(), _EDGE_PX, auto=options.depth_edges == "auto")
-    return torch.where((mended != coc_px) & torch.isfinite(coc_px), mended, coc_px)
+    return torch.where(mended == coc_px, coc_px, mended) if coc_px.requires_grad else mended
 
 
 _has_rendered = threading.Event()

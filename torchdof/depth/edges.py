@@ -29,6 +29,7 @@ _STEP = 0.05  # part of its nearness by which a surface stands before another on
 _RINGS = 3  # pixels beside a step that may be on its wrong side
 _REACH = 5  # pixels around one that tell what the two surfaces look like
 _FALLOFF_PX = 2.5
+_ABRUPT = 0.3  # part of a step that lies between two neighbours
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a pixel as witness, by ring; beside an edge it may be wrong itself
 _RAMP_REACH = 6  # half the width of the widest ramp that is one, not a slope
 _SHALLOW = 0.03  # slope, of what lies between the surfaces around, from which on it belongs to a ramp
@@ -112,10 +113,6 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
     Returns:
         ``[B, 1, H, W]``, constant to autograd; where nothing is repaired, the given values themselves.
     """
-    if not validation.is_traced():
-        known = nearness.detach()[torch.isfinite(nearness)]
-        if not len(known) or bool((known.max() - known.min() <= torch.as_tensor(step)).all()):
-            return nearness.detach()  # one surface
     light, given = image.detach().float(), nearness.detach().float().expand(len(image), -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
@@ -126,7 +123,9 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
         mended = torch.stack([native.repair_edges(a, b[0], c[0], auto)[None] for a, b, c in items])
     else:
         mended = _repair(light, given, step, auto)
-    return torch.where(mended != given, mended.to(nearness.dtype), nearness.detach())
+    if nearness.dtype == torch.float32:
+        return mended
+    return torch.where(mended == given, nearness.detach(), mended.to(nearness.dtype))
 
 
 @torch.no_grad()
@@ -188,7 +187,7 @@ def _(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     """Ramps and steps, and the two surfaces that meet there."""
     high, low = torch.where(valid, nearness, -_NEVER), torch.where(valid, -nearness, -_NEVER)
-    slope, steepness = _slopes(nearness, valid)
+    slope, steepness, jump = _slopes(nearness, valid)
     span = _highest(high, _REACH) + _highest(low, _REACH)
     # a ramp ends, a slope goes on
     flattest = -_highest(-_mean(slope, 2), 8)
@@ -207,7 +206,8 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     ring = torch.full_like(nearness, _RINGS + 1, dtype=torch.long)
     beside, behind = nears[-1], fars[-1]
     for k in reversed(range(_RINGS)):
-        is_step = nears[k] + fars[k] > least
+        gap = nears[k] + fars[k]
+        is_step = (gap > least) & (_highest(jump, k + 1) > _ABRUPT * gap)
         ring = torch.where(is_step, k + 1, ring)
         beside, behind = torch.where(is_step, nears[k], beside), torch.where(is_step, fars[k], behind)
     near, far = torch.where(is_ramp, near, beside), -torch.where(is_ramp, far, behind)
@@ -409,12 +409,13 @@ def _regress(nearness: Tensor, cover: Tensor, chosen: Tensor) -> tuple[Tensor, T
     return mean_y - b * mean_x, b, fit
 
 
-def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Steepness by pixel where it goes on from one side to the other, 0 elsewhere and beside what is unknown.
 
-    The lesser of both sides, in the steeper of the two axes; and the mean of both, of both axes together.
+    The lesser of both sides, in the steeper of the two axes; and the mean of both, of both axes together. Third, by how
+    much the change on one side exceeds that slope.
     """
-    least, mean = [], []
+    least, mean, jump = [], [], []
     for dim in (-1, -2):
         known = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
         change = torch.where(known, nearness.diff(dim=dim), 0.0)
@@ -423,7 +424,8 @@ def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         goes_on = before * after > 0
         least.append(torch.where(goes_on, torch.minimum(before.abs(), after.abs()), 0.0))
         mean.append(torch.where(goes_on, 0.5 * (before + after), 0.0))
-    return torch.maximum(*least), torch.hypot(*mean)
+        jump.append(torch.maximum(before.abs(), after.abs()) - least[-1])
+    return torch.maximum(*least), torch.hypot(*mean), torch.maximum(*jump)
 
 
 def _highest(values: Tensor, reach: int) -> Tensor:

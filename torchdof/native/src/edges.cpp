@@ -12,7 +12,7 @@ namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
 constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
-constexpr float SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.05f, RELATED = 0.75f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.05f, RELATED = 0.75f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f;
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 16, BLUR_REACH = 9;
 constexpr int AREA = 64, HALO = 21;  // what a pixel shows depends on what is so far around it
 constexpr float NONE = 1e30f;
@@ -202,7 +202,7 @@ class Repair {
         least_step = std::min(least_step, step(i));
       }
     if (!(high - low > least_step)) return;
-    Plane value(size), up(size), down(size), slope(size), steep(size), a(size), b(size), rows(size);
+    Plane value(size), up(size), down(size), slope(size), steep(size), jump(size), a(size), b(size), rows(size);
     std::vector<uint8_t> ok(size), ramp(size);
     for (int y = 0; y < h; y++)
       for (int x = 0; x < w; x++) {
@@ -224,6 +224,7 @@ class Repair {
         const float sx = across ? std::min(std::fabs(x0), std::fabs(x1)) : 0.0f;
         const float sy = along ? std::min(std::fabs(y0), std::fabs(y1)) : 0.0f;
         slope[k] = std::max(sx, sy);
+        jump[k] = std::max(std::max(std::fabs(x0), std::fabs(x1)) - sx, std::max(std::fabs(y0), std::fabs(y1)) - sy);
         const float mx = across ? 0.5f * (x0 + x1) : 0.0f, my = along ? 0.5f * (y0 + y1) : 0.0f;
         steep[k] = std::sqrt(mx * mx + my * my);
       }
@@ -265,12 +266,14 @@ class Repair {
         }
     }
     // those at both sides of a step
-    Plane nears[RINGS], fars[RINGS];
+    Plane nears[RINGS], fars[RINGS], jumps[RINGS];
     for (int r = 0; r < RINGS; r++) {
       nears[r].resize(size);
       fars[r].resize(size);
       highest(up.data(), nears[r].data(), rows.data(), h, w, r + 1);
+      jumps[r].resize(size);
       highest(down.data(), fars[r].data(), rows.data(), h, w, r + 1);
+      highest(jump.data(), jumps[r].data(), rows.data(), h, w, r + 1);
     }
     const auto clamped = [&](int y, int x) {
       return value[(size_t)std::min(std::max(y, 0), h - 1) * w + std::min(std::max(x, 0), w - 1)];
@@ -282,7 +285,7 @@ class Repair {
         int ring = RINGS + 1;
         float near = nears[RINGS - 1][k], far = fars[RINGS - 1][k];
         for (int r = RINGS - 1; r >= 0; r--)
-          if (nears[r][k] + fars[r][k] > least) {
+          if (const float gap = nears[r][k] + fars[r][k]; gap > least && jumps[r][k] > ABRUPT * gap) {
             ring = r + 1;
             near = nears[r][k];
             far = fars[r][k];

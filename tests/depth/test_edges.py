@@ -1,0 +1,214 @@
+"""Edges of a depth map: exact ones stay, others go to where the image has them, in both engines alike."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof import Camera, DepthOfField, blur_by_coc, native
+from torchdof.depth import edges
+from torchdof.depth.edges import repair_edges
+from torchdof.reference.degraded import KINDS, degrade
+from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
+
+compiled = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Bars and a fence of different colours before a wall; the depth is exact."""
+    planes = [
+        Plane(6.0, waves(1, mean=(0.5, 0.4, 0.3))),
+        Plane(2.5, waves(2, mean=(0.1, 0.2, 0.35)), posts(41.0, 14.0, 0.15)),
+        Plane(1.2, waves(3, mean=(0.35, 0.1, 0.1)), posts(67.0, 9.0, -0.4, 11.0)),
+    ]
+    camera = Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.02, focus_m=6.0)
+    return plane_scene(planes, camera, (128, 192), samples=16)
+
+
+def wrong(depth: Tensor, exact: Tensor) -> float:
+    """Share of pixels whose depth is off by more than a tenth."""
+    return float(((depth / exact - 1).abs() > 0.1).float().mean())
+
+
+@pytest.mark.parametrize("kind", ["exact", "8 bit", "noise 1%"])
+def test_exact_edges_stay_bit_for_bit(scene: Scene, kind: str) -> None:
+    depth = degrade(scene.depth, kind)
+    assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
+
+
+@pytest.mark.parametrize(
+    ("kind", "left"),
+    [
+        ("half-res", 0.2),
+        ("quarter-res", 0.4),
+        ("shift 1px", 0.6),
+        ("near -1px", 0.25),
+        ("near -2px", 0.25),
+        ("near +1px", 0.25),
+        ("displaced", 0.6),
+        ("blur 1.5", 0.3),
+    ],
+)
+@pytest.mark.parametrize("how", ["auto", "repair"])
+def test_edges_go_to_where_the_image_has_them(scene: Scene, kind: str, left: float, how: edges.DepthEdges) -> None:
+    depth = degrade(scene.depth, kind)
+    assert wrong(repair_edges(scene.image, depth, how), scene.depth) < left * wrong(depth, scene.depth)
+
+
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"exact"}))
+def test_a_depth_map_that_the_image_knows_nothing_of_is_left_alone(scene: Scene, kind: str) -> None:
+    depth = degrade(scene.depth, kind)
+    assert torch.equal(repair_edges(torch.rand_like(scene.image), depth, "auto"), depth)
+
+
+@pytest.mark.parametrize("steepness", [0.02, 0.3, 1.0])
+@pytest.mark.parametrize("how", ["auto", "repair"])
+def test_a_slope_stays_a_slope(steepness: float, how: edges.DepthEdges) -> None:
+    x, y = torch.meshgrid(torch.arange(96.0), torch.arange(64.0), indexing="xy")
+    coc = (steepness * (x + 0.3 * y))[None, None]
+    image = waves(5)(x.double(), y.double()).float()[None]
+    assert torch.equal(-edges.repair(image, -coc, torch.tensor(1.0), how == "auto"), coc)
+
+
+def test_a_thin_structure_keeps_its_depth(scene: Scene) -> None:
+    fence = posts(23.0, 2.0, 0.2)
+    planes = [
+        Plane(6.0, waves(1, mean=(0.5, 0.5, 0.5), contrast=0.3)),
+        Plane(1.5, waves(2, mean=(0.1, 0.1, 0.05)), fence),
+    ]
+    thin = plane_scene(planes, scene.camera, (96, 160), samples=16)
+    bars = thin.depth < 3
+    for kind in ("half-res", "blur 1.5"):
+        given = degrade(thin.depth, kind)
+        mended = repair_edges(thin.image, given, "auto")
+        assert float((1 / given)[bars].mean()) < 0.48  # 1 / 1.5 m, spread over what is behind
+        assert 0.5 < float((1 / mended)[bars].mean()) < 0.75
+
+
+def test_a_lamp_whose_depth_was_averaged_away_gets_it_back() -> None:
+    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
+    image, depth = 0.2 + 0.02 * torch.rand(1, 3, 96, 128), torch.full((1, 1, 96, 128), 8.0)
+    for row in range(12, 96, 24):
+        for column in range(12, 128, 26):
+            lamp = (rows - row) ** 2 + (columns - column) ** 2 < 5
+            image[..., lamp], depth[..., lamp] = 200.0, 2.0
+    given = degrade(depth, "blur 1.5")
+    lamps = depth < 3
+    assert float((1 / given)[lamps].mean()) < 0.33
+    assert 0.4 < float((1 / repair_edges(image, given, "auto"))[lamps].mean()) < 0.6
+
+
+def test_the_brightness_of_the_image_changes_nothing(scene: Scene) -> None:
+    depth = degrade(scene.depth, "half-res")
+    torch.testing.assert_close(repair_edges(scene.image, depth), repair_edges(1024.0 * scene.image, depth))
+
+
+def test_pixels_without_depth_stay_and_touch_nothing(scene: Scene) -> None:
+    depth = degrade(scene.depth, "near -1px")
+    holes = torch.zeros_like(depth, dtype=torch.bool)
+    holes[..., 40:60, :30] = True
+    mended = repair_edges(scene.image, torch.where(holes, torch.nan, depth))
+    assert bool(mended.isnan()[holes].all())
+    assert not bool(mended.isnan()[~holes].any())
+    whole = repair_edges(scene.image, depth)
+    assert torch.equal(mended[..., 60:], whole[..., 60:])
+
+
+def test_infinite_depth_is_a_surface(scene: Scene) -> None:
+    depth = torch.where(scene.depth == 6.0, math.inf, scene.depth)
+    assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
+    given = degrade(depth, "near -1px")
+    mended = repair_edges(scene.image, given, "auto")
+    assert float((mended.isinf() != depth.isinf()).float().mean()) < 0.3 * float(
+        (given.isinf() != depth.isinf()).float().mean()
+    )
+
+
+def test_gradients_flow_to_what_is_not_repaired(scene: Scene) -> None:
+    depth = degrade(scene.depth, "near -1px").requires_grad_()
+    mended = repair_edges(scene.image, depth)
+    (gradient,) = torch.autograd.grad(mended.sum(), depth)
+    assert torch.equal(gradient, (mended == depth).float())
+
+
+def test_an_item_of_a_batch_is_repaired_as_it_is_alone(scene: Scene) -> None:
+    images = torch.cat([scene.image, torch.rand_like(scene.image)])
+    depth = degrade(scene.depth, "half-res")
+    together = repair_edges(images, depth, "auto")
+    assert torch.equal(together[:1], repair_edges(images[:1], depth, "auto"))
+    assert torch.equal(together[1:], depth)
+
+
+def test_the_renderer_repairs_as_its_option_says(scene: Scene) -> None:
+    depth = degrade(scene.depth, "half-res")
+    coc = scene.camera.coc_px(depth, 192)
+    mended = -edges.repair(scene.image, -coc, torch.tensor(1.0), True)
+    as_given = DepthOfField(scene.camera, depth_edges="as given")
+    assert torch.equal(as_given.coc_px(scene.image, depth), coc)
+    assert torch.equal(DepthOfField(scene.camera).coc_px(scene.image, depth), mended)
+    expected = blur_by_coc(scene.image, mended, depth_edges="as given")
+    assert torch.equal(DepthOfField(scene.camera)(scene.image, depth), expected)
+    assert torch.equal(blur_by_coc(scene.image, coc), expected)
+    assert not torch.equal(as_given(scene.image, depth), expected)
+
+
+@pytest.mark.parametrize("value", ["Auto", None, True, 1])
+def test_another_treatment_is_refused(scene: Scene, value: edges.DepthEdges) -> None:
+    refused = "must be 'auto', 'repair' or 'as given', got"
+    for call in (
+        lambda: repair_edges(scene.image, scene.depth, value),
+        lambda: DepthOfField(scene.camera, depth_edges=value),
+    ):
+        with pytest.raises(ValueError, match=refused):
+            call()
+
+
+@compiled
+@pytest.mark.parametrize("kind", sorted(KINDS))
+@pytest.mark.parametrize("auto", [True, False])
+def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
+    nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192)
+    nearness[..., 50:55, 60:70] = torch.nan
+    plain = edges._repair(scene.image, nearness, torch.tensor(1.0), auto)
+    fast = native.repair_edges(scene.image[0], nearness[0, 0], torch.tensor(1.0), auto)
+    same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3, equal_nan=True)
+    assert float(same.float().mean()) > 0.999  # where both surfaces are equally likely, rounding may decide
+
+
+@compiled
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 3), (65, 130)])
+def test_engines_agree_on_frames_of_any_size(size: tuple[int, int]) -> None:
+    image, nearness = torch.rand(1, 2, *size), 9 * torch.rand(1, 1, *size)
+    plain = edges._repair(image, nearness, torch.full_like(nearness, 0.5), False)
+    fast = native.repair_edges(image[0], nearness[0, 0], torch.full(size, 0.5), False)
+    same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3)
+    assert float(same.float().mean()) > 0.99
+
+
+@compiled
+def test_any_number_of_threads_gives_the_same_bits(scene: Scene) -> None:
+    nearness = -scene.camera.coc_px(degrade(scene.depth, "half-res"), 192)[0, 0]
+    threads = torch.get_num_threads()
+    try:
+        results = []
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            results.append(native.repair_edges(scene.image[0], nearness, torch.tensor(1.0), True))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0], results[2])
+
+
+def test_a_compiled_graph_holds_it_as_one_operator(scene: Scene) -> None:
+    coc = scene.camera.coc_px(degrade(scene.depth, "half-res"), 192)
+
+    @torch.compile(backend="eager", fullgraph=True)
+    def mend(image: Tensor, nearness: Tensor) -> Tensor:
+        return edges.repair(image, nearness, 1.0, True)
+
+    function: Callable[[Tensor, Tensor], Tensor] = mend
+    torch.testing.assert_close(function(scene.image, -coc), edges._repair(scene.image, -coc, torch.tensor(1.0), True))

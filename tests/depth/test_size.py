@@ -1,0 +1,59 @@
+"""Depth maps of another size than their image."""
+
+import pytest
+import torch
+
+from torchdof import Camera, DepthOfField
+from torchdof.depth import at_size_of
+
+
+def scene(height: int = 64, width: int = 96) -> tuple[torch.Tensor, torch.Tensor]:
+    """A dark square before a bright wall, with some noise."""
+    image, depth = 0.8 + 0.05 * torch.rand(1, 3, height, width), torch.full((1, 1, height, width), 5.0)
+    image[..., 17:47, 23:61] -= 0.7
+    depth[..., 17:47, 23:61] = 2.0
+    return image, depth
+
+
+def test_a_map_of_the_image_s_size_is_that_map() -> None:
+    image, depth = scene()
+    assert at_size_of(image, depth) is depth
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4])
+def test_a_smaller_map_gets_the_edges_of_the_image(factor: int) -> None:
+    image, depth = scene(48, 96)
+    small = depth[..., factor // 2 :: factor, factor // 2 :: factor]
+    assert float((at_size_of(image, small) != depth).float().mean()) < 0.02
+    assert torch.equal(at_size_of(image, small).unique(), torch.tensor([2.0, 5.0]))
+
+
+def test_a_larger_map_is_averaged() -> None:
+    image, depth = scene()
+    large = depth.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    torch.testing.assert_close(at_size_of(image, large), depth)
+
+
+def test_pixels_without_depth_touch_no_other() -> None:
+    image, depth = scene()
+    small = depth[..., 1::2, 1::2].clone()
+    small[..., :4, :4] = 0.0
+    sized = at_size_of(image, small)
+    assert bool(sized[..., :8, :8].isnan().all())
+    assert float(sized[~sized.isnan()].min()) > 1.9
+
+
+@pytest.mark.parametrize("size", [(64, 64), (32, 45), (33, 47), (32, 50)])
+def test_another_aspect_ratio_is_refused(size: tuple[int, int]) -> None:
+    image, _ = scene()
+    with pytest.raises(ValueError, match=f"depth is {size[1]} x {size[0]} pixels and the image 96 x 64.* crop one"):
+        at_size_of(image, torch.ones(1, 1, *size))
+
+
+def test_the_module_takes_a_smaller_map() -> None:
+    image, depth = scene()
+    dof = DepthOfField(Camera.from_fov(40.0, 0.05, 5.0))
+    small = depth[..., 1::2, 1::2]
+    assert torch.equal(dof(image, small), dof(image, at_size_of(image, small)))
+    with pytest.raises(ValueError, match=r"depth must be \[1, 1, 64, 96\].* got \[1, 1, 20, 48\]"):
+        dof(image, depth[..., :20, ::2])
