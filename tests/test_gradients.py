@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
 EVERY_WAY = pytest.mark.parametrize(
@@ -110,7 +111,7 @@ def test_gradients_with_a_plan_of_the_user(way: dict[str, Any]) -> None:
 
 
 @EVERY_WAY
-@pytest.mark.parametrize("where", ["focus plane", "layer nodes", "in focus", "half a pixel", "infinity"])
+@pytest.mark.parametrize("where", ["focus plane", "layer nodes", "in focus", "end of focus", "infinity"])
 def test_gradients_are_finite_where_the_picture_has_a_kink(way: dict[str, Any], where: str) -> None:
     image = torch.rand(1, 1, 5, 6, dtype=torch.float32, requires_grad=True)
     coc = torch.linspace(-3, 3, 30).reshape(1, 1, 5, 6)
@@ -121,8 +122,8 @@ def test_gradients_are_finite_where_the_picture_has_a_kink(way: dict[str, Any], 
         coc = torch.tensor(nodes).repeat(30)[:30].reshape(1, 1, 5, 6)
     elif where == "in focus":
         coc = torch.zeros(1, 1, 5, 6)
-    elif where == "half a pixel":
-        coc = 0.5 * coc.sign()
+    elif where == "end of focus":
+        coc = from_blur_axis(1e-12) * coc.sign()
     if where == "infinity":
         depth = torch.full((1, 1, 5, 6), math.inf)
         depth[..., 3:] = 2.0

@@ -59,8 +59,8 @@ def fit_pair(
 
     The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
     moved and magnified) + background`. Exposure, stray light, displacement and magnification are fitted, so they do
-    not bias the kernel. The kernel is pixel-integrated and acts on the picture's pixels, as in rendering: it is what
-    turns *this* sharp picture into *this* blurred one (a pixel's own blur, 1/12 px^2 of variance, is already in both).
+    not bias the kernel. The kernel is what the fitted PSF does to a picture made of pixels, as in rendering
+    (`torchdof.optics.psf`): a pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
     convolved with the kernel, so its widths depend on the dot. Use it to compare with the paper.

@@ -107,11 +107,16 @@ class IdealDot:
 
 
 def point_source(shape: tuple[int, ...], dot: Dot) -> PictureOfDot:
-    """A point of light at the pixel nearest to a blurred dot's centre."""
-    from scipy.ndimage import spline_filter
+    """A point of light at the pixel nearest to a blurred dot's centre, blurred as the integral over a pixel is.
+
+    Kernels hold the optical blur alone; the pixel's own, a variance of 1/12 px^2 along each axis, is the source's.
+    """
+    from scipy.ndimage import convolve1d, spline_filter
 
     x, y = int(round(dot.x)), int(round(dot.y))
     picture = np.zeros(shape)
     picture[y, x] = 1.0
+    for axis in (0, 1):
+        picture = convolve1d(picture, np.array([1.0, 22.0, 1.0]) / 24.0, axis)
     point = Dot(float(x), float(y), 0.0, 1.0, 0.0, 1.0, 0.0, 1.0)
     return PictureOfDot(point, 0.0, 4.0, spline_filter(picture, order=3))

@@ -1,7 +1,7 @@
 """A camera that photographs a white dot, sharp and defocused, with everything that goes wrong in a real one.
 
-The dot is drawn with anti-aliased edges; the blur is the renderer's own: the pixel-integrated kernel applied to the
-sharp picture's pixels. Both pictures are in linear light.
+The dot is drawn with anti-aliased edges; the blur is the renderer's own: its kernel applied to the sharp picture's
+pixels. Both pictures are in linear light.
 """
 
 from __future__ import annotations
