@@ -1,4 +1,4 @@
-"""Where the layers of a scene are laid: at its planes, and close together where it meets the frame's border."""
+"""Where the layers of a scene are laid: close together where it meets the frame's border, and smoothly."""
 
 import pytest
 import torch
@@ -8,41 +8,24 @@ from torchdof.render import layer_cocs
 from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
-WIDE = 2.7 / 255  # a tolerance for which layers lie 2 px apart where these planes are
-
 
 def coc_at(x: torch.Tensor) -> torch.Tensor:
     """Coc of places on the blur axis."""
     return torch.tensor([from_blur_axis(place) for place in x.flatten().tolist()]).reshape(x.shape)
 
 
-def test_planes_are_found_where_they_lie_and_slopes_are_none() -> None:
-    x = torch.linspace(-10, 10, 256).repeat(1, 1, 256, 1)  # a slope: no place holds more than others
-    assert layer_cocs.plane_nodes(coc_at(x), WIDE) == []
-    x[..., 20:60] = 3.3
-    x[..., 100:180] = -7.77
-    assert layer_cocs.plane_nodes(coc_at(x), WIDE) == pytest.approx([-7.77, 3.3])  # the larger one first
-
-
-def test_a_plane_that_is_no_flatter_than_what_is_around_it_is_none() -> None:
-    x = torch.full((1, 1, 64, 64), 5.0)
-    x[..., ::2, :] += torch.linspace(-0.9, 0.9, 64)  # half of the pixels, spread over the spacing
-    assert layer_cocs.plane_nodes(coc_at(x), WIDE) == pytest.approx([5.0])
-    assert layer_cocs.plane_nodes(coc_at(x[..., 1:, :][..., ::2, :]), WIDE) == pytest.approx([5.0])
-    assert layer_cocs.plane_nodes(coc_at(x[..., ::2, :]), WIDE) == []
-
-
-def test_a_plane_at_a_layer_is_exact() -> None:
-    image = torch.rand(1, 3, 96, 128, generator=torch.Generator().manual_seed(0))
-    coc = torch.zeros(1, 1, 96, 128)
-    coc[..., 8:88, 20:60] = 5.123  # between layers, were they laid by the spacing alone
-    coc[..., 8:88, 80:110] = -8.7
-    coc[..., 40:48, 112:120], coc[..., 40:48, 2:10] = 11.0, -11.0
-    plan = Plan.of_scene(coc, 1 / 255)
-    assert {5.123, -8.7} <= {round(c, 3) for c in plan.coc_px}
-    exact = torchdof.blur_by_coc(image, coc, tolerance=0)
-    loose = torchdof.blur_by_coc(image, coc, tolerance=1 / 255)
-    torch.testing.assert_close(loose[..., 30:50, 10:110], exact[..., 30:50, 10:110], rtol=0, atol=4 / 255)
+@pytest.mark.parametrize("tolerance", [0.0, 1 / 255, 4 / 255])
+def test_layers_move_smoothly_with_the_ends_of_a_scene(tolerance: float) -> None:
+    """Where the number of layers changes, the one more lies on another."""
+    before: list[float] = []
+    for far in torch.linspace(1.0, 9.0, 4001, dtype=torch.float64).tolist():
+        plan = Plan.of_scene(torch.tensor([-2.2, far], dtype=torch.float64).reshape(1, 1, 1, 2), tolerance)
+        nodes = list(plan.nodes)
+        if before:  # by 2e-3 px
+            farthest = max(min(abs(x - y) for y in before) for x in nodes)
+            assert farthest < 0.01, f"at {far}: {before} to {nodes}"
+        before = nodes
+    assert len(before) > 4
 
 
 @pytest.mark.parametrize("times", [1, 3], ids=["12 px", "36 px"])

@@ -1,9 +1,10 @@
-"""Where the layers of a scene are put on the blur axis: at its ends, its planes and its borders, and in between.
+"""Where the layers of a scene are put on the blur axis: at its ends and at the coc of its border, and in between.
 
 Distances are those of :mod:`torchdof.render.layer_weights`' blur axis.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -11,14 +12,14 @@ from torch import Tensor
 
 from .layer_weights import blur_axis
 
-__all__ = ["border_nodes", "ends", "finest", "on_axis", "plane_nodes", "spaced_nodes", "spacing"]
+__all__ = ["border_nodes", "ends", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
 
 _FINEST = 0.5
 _FINEST_PARTS = 40.0
 _WIDE = _FINEST * _FINEST_PARTS  # from which on the finest distance grows
-_SAMPLES = 2**16  # pixels that tell where planes are
 _SPACING = 0.25  # px near focus at a tolerance of 1/255; measured, as the next two: errors stay below the tolerance
 _SPACING_POWER = 0.8  # of the tolerance
+_NEAR = 0.3  # of the spacing: so near to a fixed node there is no other; at twice as far one is where it would be
 _LOOSE = 4.0  # of 255: from there on by its square root, lest a picture consists of two layers
 
 
@@ -51,6 +52,13 @@ def spaced_nodes(low: float, high: float, tolerance: float) -> tuple[float, ...]
     return tuple(sorted(nodes))
 
 
+def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
+    """A node between fixed ones: moved towards one that comes near, and in the end onto it."""
+    near = min(fixed, key=lambda other: abs(node - other))
+    room = abs(node - near) / spacing(node, tolerance)
+    return near + (node - near) * min(max((room - _NEAR) / _NEAR, 0.0), 1.0)
+
+
 def ends(coc_px: Tensor) -> tuple[float, float]:
     """Nearest and farthest place of the pixels ``[B, 1, H, W]``."""
     both = torch.stack(torch.aminmax(coc_px))
@@ -58,16 +66,6 @@ def ends(coc_px: Tensor) -> tuple[float, float]:
         both = torch.stack(torch.aminmax(torch.where(coc_px.isnan(), 0.0, coc_px)))
     low, high = on_axis(both, max(coc_px.shape[-2:])).tolist()
     return low, high
-
-
-def plane_nodes(coc_px: Tensor, tolerance: float) -> list[float]:
-    """Places at which many pixels lie and few around them: planes that face the camera, and distant backgrounds.
-
-    Few may lie as far around as the next layer would be at this tolerance.
-    """
-    step = max(1, math.isqrt(coc_px.numel() // _SAMPLES))
-    x = on_axis(coc_px[..., ::step, ::step], max(coc_px.shape[-2:]))
-    return _crowded(x.flatten(), width=0.2, least_share=0.01, tolerance=tolerance)
 
 
 def border_nodes(coc_px: Tensor) -> list[float]:
@@ -80,31 +78,21 @@ def border_nodes(coc_px: Tensor) -> list[float]:
     return _crowded(on_axis(border, max(coc_px.shape[-2:])).flatten(), width=1.0, least_share=0.03)
 
 
-def _crowded(x: Tensor, width: float, least_share: float, tolerance: float | None = None) -> list[float]:
+def _crowded(x: Tensor, width: float, least_share: float) -> list[float]:
     """Places at which at least so large a share of all places ``[n]`` lies, and 16, the most crowded first.
 
-    What counts as one place is ``width`` finest distances wide, three bins of the histogram. With a tolerance, half of
-    what lies within a layer's spacing of such a place must lie at it.
+    What counts as one place is ``width`` finest distances wide, three bins of the histogram.
     """
     bins = torch.round(_in_finest(x) * (3.0 / width)).long()
     first = int(bins.min())
-    counts = torch.bincount(bins - first)
-    sums = functional.pad(counts.cumsum(0), (1, 0)).tolist()
-
-    def count_within(i: int, reach: int) -> int:
-        return int(sums[min(i + reach + 1, len(counts))] - sums[max(i - reach, 0)])
-
+    counts = functional.pad(torch.bincount(bins - first), (1, 1))
+    crowds = (counts[:-2] + counts[1:-1] + counts[2:]).tolist()
     places: list[float] = []
     least = max(least_share * len(x), 16)
-    crowds = {i: count_within(i, 1) for i in range(len(counts))}
-    for i, count in sorted(crowds.items(), key=lambda item: -item[1]):
+    for i, count in sorted(enumerate(crowds), key=lambda item: -item[1]):
         if count < least:
             break
         place = _from_finest((first + i) * width / 3.0)
-        if tolerance is not None:
-            reach = round(1.5 * spacing(place, tolerance) / (finest(place) * width))
-            if 2 * count < count_within(i, reach):
-                continue
         if all(abs(place - other) > 0.6 * finest(place) for other in places):
             # one that occurs: its pixels then lie in no other layer
             places.append(float(x[(bins - first - i).abs() <= 1].median()))

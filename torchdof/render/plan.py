@@ -82,21 +82,18 @@ class Plan:
         low, high = layer_cocs.ends(coc_px)
         if high <= low:
             return cls((low,), tolerance)
-        nodes = [low, high]
-
-        def add(node: float, gap: float) -> None:
-            if low < node < high and min(abs(node - other) for other in nodes) > gap:
-                nodes.append(node)
-
-        for plane in layer_cocs.plane_nodes(coc_px, tolerance):
-            add(plane, 0.2 * layer_cocs.finest(plane))
+        fixed = [low, high]
         for border in layer_cocs.border_nodes(coc_px):
             finest = layer_cocs.finest(border)
             if layer_cocs.spacing(border, tolerance) > 2.5 * finest:
                 for node in (border, border - finest, border + finest):
-                    add(node, 0.6 * finest)
+                    if low < node < high and min(abs(node - other) for other in fixed) > 0.6 * finest:
+                        fixed.append(node)
+        # those in between make room for these smoothly: a picture must not jump when a scene moves
+        nodes = {*fixed}
         for node in layer_cocs.spaced_nodes(low, high, tolerance):
-            add(node, 0.0 if node == 0.0 else 0.3 * layer_cocs.spacing(node, tolerance))
+            if low < node < high:
+                nodes.add(node if node == 0.0 else layer_cocs.slid(node, fixed, tolerance))
         return cls(tuple(sorted(nodes)), tolerance)
 
     @classmethod
