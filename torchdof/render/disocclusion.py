@@ -17,9 +17,11 @@ __all__ = ["BEHIND_STEP", "HIDDEN_WEIGHT", "behind_size", "fill_hidden"]
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample against 1 of a visible one."""
 
-_BEHIND_PX = 2.0  # a hidden surface lies at least so much farther, in coc
-_FALL = 0.7  # weight of a level of the pyramid against the finer one before
+_BEHIND_PX = 1.0  # a hidden surface lies about so much farther, in coc: from half a pixel less to half a pixel more
+_FALL = 0.35  # weight of a level of the pyramid against the finer one before
 _FINE_LEVELS = 2  # of the pyramid that each pixel looks at; the coarser ones are looked at from cells as large as these
+_SURE = 0.1  # weight of what a level shows from which on it has a whole vote
+_CERTAIN = 0.01  # votes from which on a hidden sample has all of its weight
 _TOLD_APART = 3  # level of the pyramid whose pixels are told apart when looking for those that may hide something
 
 BEHIND_STEP = 2**_FINE_LEVELS
@@ -30,7 +32,7 @@ class _Level:
     """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
 
     ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
-    pixel looks so far.
+    pixel looks so far, and wholly from twice of it.
     """
 
     def __init__(self, values: Tensor, step: int, vote: float | None, least_px: float) -> None:
@@ -50,10 +52,15 @@ class _Level:
         corner_weights = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
         for corner, corner_weight in zip(corners, corner_weights, strict=True):
             sample = self.flat.index_select(1, corner)
-            weight = corner_weight * sample[-1] * (sample[-2] > coc_px + _BEHIND_PX)
+            weight = corner_weight * sample[-1] * _is_behind(sample[-2] - coc_px)
             summed, total = summed + sample[:-1] * weight, total + weight
         total = torch.where(total > 1e-4, total, 0.0)
         return summed / total.clamp_min(1e-4), total
+
+
+def _is_behind(distance_px: Tensor) -> Tensor:
+    """How surely a surface that is so much farther, in coc, is another one."""
+    return (distance_px - _BEHIND_PX + 0.5).clamp(0.0, 1.0)
 
 
 def behind_size(size: int, levels: int) -> int:
@@ -138,7 +145,7 @@ def fill_hidden(
     return (
         pixels.put(other_light, hiding, seen[:-1]),
         pixels.put(other_coc_px, hiding, seen[-1]),
-        pixels.put(other_weight, hiding, torch.full_like(seen[-1], HIDDEN_WEIGHT)),
+        pixels.put(other_weight, hiding, HIDDEN_WEIGHT * (total[shown] / _CERTAIN).clamp(max=1.0)),
         behind,
     )
 
@@ -146,7 +153,7 @@ def fill_hidden(
 def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """One step of the pyramid: of each four children, the mean of those that are farthest."""
     farthest = functional.interpolate(functional.max_pool2d(coc_px.detach(), 2), scale_factor=2.0, mode="nearest")
-    counts = weight * (coc_px > farthest - _BEHIND_PX)
+    counts = weight * (1.0 - _is_behind(farthest - coc_px))
     total = downsampled(counts, 2)
     known = total.clamp_min(1e-9)
     coc_px = torch.where(total > 0, downsampled(coc_px * counts, 2) / known, -NEVER_PX)
@@ -167,7 +174,7 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
             around = functional.max_pool2d(around, 2 ** (coarsest - level))
         elif level > coarsest:
             around = functional.interpolate(around, scale_factor=float(2 ** (level - coarsest)), mode="nearest")
-        may_hide = may_hide | ((around > _BEHIND_PX - near) & (blur >= _least_px(level)))
+        may_hide = may_hide | ((around > _BEHIND_PX - 0.5 - near) & (blur >= _least_px(level)))
     return functional.interpolate(may_hide.to(near.dtype), scale_factor=float(2**coarsest), mode="nearest") > 0
 
 
@@ -182,19 +189,19 @@ def _search(
     seen = coc_px.new_zeros(levels[0].flat.shape[0] - 1, 1)
     for level in levels:
         behind, weight = level.behind(item, row, column, coc_px)
-        vote = weight if level.vote is None else torch.where(weight > 0, level.vote, 0.0)
-        vote = torch.where(level.least_px <= coc_px.abs(), vote, 0.0)
+        vote = weight if level.vote is None else level.vote * (weight / _SURE).clamp(max=1.0)
+        vote = vote * (coc_px.abs() / level.least_px - 1.0).clamp(0.0, 1.0)
         if farthest:
             apart = behind[-1] - seen[-1]
-            vote = torch.where((total > 0) & (apart < -_BEHIND_PX), 0.0, vote)
-            total = torch.where((vote > 0) & (apart > _BEHIND_PX), 0.0, total)
+            vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
+            total = total * (1.0 - (vote / 1e-3).clamp(max=1.0) * _is_behind(apart))
         total = total + vote
         seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
     return total, seen
 
 
 def _least_px(level: int) -> float:
-    """Blur from which on a pixel looks as far as this level."""
+    """Blur above which a pixel begins to look as far as this level."""
     return 2.0 ** (level - 2)
 
 

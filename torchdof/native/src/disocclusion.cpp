@@ -6,30 +6,34 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float BEHIND_PX = 2.0f;  // a hidden surface lies at least so much farther, in coc
-constexpr float FALL = 0.7f;       // weight of a level of the pyramid against the finer one before
+constexpr float BEHIND_PX = 1.0f;  // a hidden surface lies about so much farther, in coc
+constexpr float FALL = 0.35f;      // weight of a level of the pyramid against the finer one before
 constexpr int CELL_LEVEL = 3;      // of the pyramid, in whose pixels it is told which may hide something
 constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones are looked at from cells of STEP pixels
 constexpr int STEP = 1 << FINE_LEVELS;
+constexpr float SURE = 0.1f;      // weight of what a level shows from which on it has a whole vote
+constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight
 constexpr float MIXED = 0.05f;  // least share of a second surface that the pyramid takes
 
 // Farthest surfaces, at every step-th pixel: light of each channel, coc, weight, and what fills the stride.
 struct Level {
   int height, width, step, stride, channels;
   float vote;  // weight against other levels; 0: it is in the weights
-  float least_px;  // blur from which on a pixel looks so far
+  float least_px;  // blur from which on a pixel looks so far, and wholly from twice of it
   Buffer<float> values;
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
 
+// How surely a surface that is so much farther, in coc, is another one.
+inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND_PX - 0.5f)); }
+
 // Of four children the mean of those that are farthest.
 void farthest(const float *const *child, int channels, int stride, float *out) {
   float most = child[0][channels];
   for (int i = 1; i < 4; i++) most = std::max(most, child[i][channels]);
-  most -= BEHIND_PX;
   float total = 0, counts[4];
-  for (int i = 0; i < 4; i++) total += counts[i] = child[i][channels] > most ? child[i][channels + 1] : 0.0f;
+  for (int i = 0; i < 4; i++) total += counts[i] = child[i][channels + 1] * (1.0f - is_behind(most - child[i][channels]));
   total *= 0.25f;
   const float each = 0.25f / std::max(total, 1e-9f);
   for (int i = 0; i < 4; i++) counts[i] *= each;
@@ -63,7 +67,7 @@ float behind(const Level &level, float row, float column, float here, f8 *seen) 
   const float *corner[4] = {first, first + beside, first + below, first + below + beside};
   const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
   float total = 0, counts[4];
-  for (int k = 0; k < 4; k++) total += counts[k] = corner[k][C] > here + BEHIND_PX ? share[k] * corner[k][C + 1] : 0.0f;
+  for (int k = 0; k < 4; k++) total += counts[k] = share[k] * corner[k][C + 1] * is_behind(corner[k][C] - here);
   for (int i = 0; i < count; i++) seen[i] = f8{};
   if (!(total > 1e-4f)) return 0;
   const float each = 1.0f / total;
@@ -81,13 +85,14 @@ float look(const Level *const *levels, int n, float row, float column, float her
   for (int i = 0; i < F8 * count; i++) out[i] = 0;
   for (int l = 0; l < n; l++) {
     const Level &level = *levels[l];
-    if (level.least_px > std::fabs(here)) continue;
+    const float looked = clamp01(std::fabs(here) / level.least_px - 1.0f);
+    if (!(looked > 0)) continue;
     const float any = behind<VECTORS>(level, row, column, here, b);
-    float vote = any > 0 ? (level.vote > 0 ? level.vote : any) : 0.0f;
+    float vote = looked * (level.vote > 0 ? level.vote * std::min(any / SURE, 1.0f) : any);
     if (farthest) {
       const float apart = ((const float *)b)[C] - out[C];
-      if (total > 0 && apart < -BEHIND_PX) vote = 0;
-      if (vote > 0 && apart > BEHIND_PX) total = 0;
+      if (total > 0) vote *= 1.0f - is_behind(-apart);
+      total *= 1.0f - std::min(vote / 1e-3f, 1.0f) * is_behind(apart);
     }
     total += vote;
     if (!(vote > 0)) continue;
@@ -230,11 +235,11 @@ class Filling {
     auto child = [&](const float *of, int i, int x) { return of[(i / 2) * line + 2 * x + i % 2]; };
     for (int x = 0; x < n / 2; x++) {
       const float a = child(coc, 0, x), b = child(coc, 1, x), c = child(coc, 2, x), d = child(coc, 3, x);
-      const float most = std::max(std::max(a, b), std::max(c, d)) - BEHIND_PX;
-      counts[0][x] = a > most ? child(weight, 0, x) : 0.0f;
-      counts[1][x] = b > most ? child(weight, 1, x) : 0.0f;
-      counts[2][x] = c > most ? child(weight, 2, x) : 0.0f;
-      counts[3][x] = d > most ? child(weight, 3, x) : 0.0f;
+      const float most = std::max(std::max(a, b), std::max(c, d));
+      counts[0][x] = child(weight, 0, x) * (1.0f - is_behind(most - a));
+      counts[1][x] = child(weight, 1, x) * (1.0f - is_behind(most - b));
+      counts[2][x] = child(weight, 2, x) * (1.0f - is_behind(most - c));
+      counts[3][x] = child(weight, 3, x) * (1.0f - is_behind(most - d));
       total[x] = 0.25f * ((counts[0][x] + counts[1][x]) + (counts[2][x] + counts[3][x]));
       each[x] = 0.25f / std::max(total[x], 1e-9f);
     }
@@ -267,14 +272,14 @@ class Filling {
       found_[cell] = fine_[cell] = 0;
       for (int i = 0; i < job_.levels; i++) {
         const Level &l = pyramid_[i];
-        if (blur_[cell] < l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
+        if (blur_[cell] <= l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
         const int size = i + 1 <= coarsest_ ? 1 << (coarsest_ - i - 1) : 1;
         const int y0 = i + 1 <= coarsest_ ? row * size : row >> (i + 1 - coarsest_);
         const int x0 = i + 1 <= coarsest_ ? column * size : column >> (i + 1 - coarsest_);
         float most = -NEVER;
         for (int y = std::max(0, y0 - 1); y <= std::min(l.height - 1, y0 + size); y++)
           for (int x = std::max(0, x0 - 1); x <= std::min(l.width - 1, x0 + size); x++) most = std::max(most, l.coc(y, x));
-        if (most > near_[cell] + BEHIND_PX) {
+        if (most > near_[cell] + BEHIND_PX - 0.5f) {
           found_[cell] = 1;
           if (i < FINE_LEVELS) fine_[cell] = 1;
         }
@@ -363,7 +368,7 @@ class Filling {
             const int within = y % BLOCK * BLOCK + x % BLOCK;
             for (int c = 0; c < C; c++) b.other[c * BLOCK_PIXELS + within] = seen[c];
             b.coc[within] = seen[C];
-            b.weight[within] = s_.valid ? HIDDEN_WEIGHT * s_.valid[(size_t)y * W + x] : HIDDEN_WEIGHT;
+            b.weight[within] = HIDDEN_WEIGHT * std::min(total / CERTAIN, 1.0f) * (s_.valid ? s_.valid[(size_t)y * W + x] : 1.0f);
           }
     });
   }
