@@ -21,7 +21,7 @@ _BEHIND_PX = 1.0  # a hidden surface lies about so much farther, in coc: from ha
 _FALL = 0.35  # weight of a level of the pyramid against the finer one before
 _FINE_LEVELS = 2  # of the pyramid that each pixel looks at; the coarser ones are looked at from cells as large as these
 _SURE = 0.1  # weight of what a level shows from which on it has a whole vote
-_CERTAIN = 0.01  # votes from which on a hidden sample has all of its weight
+_CERTAIN = 0.01  # votes from which on a hidden sample has all of its weight, or a farther one counts alone
 _TOLD_APART = 3  # level of the pyramid whose pixels are told apart when looking for those that may hide something
 
 BEHIND_STEP = 2**_FINE_LEVELS
@@ -189,12 +189,12 @@ def _search(
     seen = coc_px.new_zeros(levels[0].flat.shape[0] - 1, 1)
     for level in levels:
         behind, weight = level.behind(item, row, column, coc_px)
-        vote = weight if level.vote is None else level.vote * (weight / _SURE).clamp(max=1.0)
-        vote = vote * (coc_px.abs() / level.least_px - 1.0).clamp(0.0, 1.0)
+        looked = (coc_px.abs() / level.least_px - 1.0).clamp(0.0, 1.0)
+        vote = looked * (weight if level.vote is None else level.vote * (weight / _SURE).clamp(max=1.0))
         if farthest:
             apart = behind[-1] - seen[-1]
             vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
-            total = total * (1.0 - (vote / 1e-3).clamp(max=1.0) * _is_behind(apart))
+            total = total * (1.0 - (looked * weight / _CERTAIN).clamp(max=1.0) * _is_behind(apart))
         total = total + vote
         seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
     return total, seen

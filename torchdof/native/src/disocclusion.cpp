@@ -12,7 +12,7 @@ constexpr int CELL_LEVEL = 3;      // of the pyramid, in whose pixels it is told
 constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones are looked at from cells of STEP pixels
 constexpr int STEP = 1 << FINE_LEVELS;
 constexpr float SURE = 0.1f;      // weight of what a level shows from which on it has a whole vote
-constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight
+constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight, or a farther one counts alone
 constexpr float MIXED = 0.05f;  // least share of a second surface that the pyramid takes
 
 // Farthest surfaces, at every step-th pixel: light of each channel, coc, weight, and what fills the stride.
@@ -92,7 +92,7 @@ float look(const Level *const *levels, int n, float row, float column, float her
     if (farthest) {
       const float apart = ((const float *)b)[C] - out[C];
       if (total > 0) vote *= 1.0f - is_behind(-apart);
-      total *= 1.0f - std::min(vote / 1e-3f, 1.0f) * is_behind(apart);
+      total *= 1.0f - std::min(looked * any / CERTAIN, 1.0f) * is_behind(apart);
     }
     total += vote;
     if (!(vote > 0)) continue;
