@@ -10,8 +10,7 @@ from torch import Tensor
 
 from ..validation import is_traced
 from .border import continued
-from .disocclusion import BEHIND_STEP, behind_size, fill_hidden
-from .downsampling import upsampled
+from .disocclusion import behind_pixels, behind_size, fill_hidden
 from .layer_weights import blur_axis, eased, weight_at_or_behind
 from .matting import emitters_behind, matte
 from .plan import Blur
@@ -179,8 +178,7 @@ def framed(
         x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
     if behind is not None:
-        behind = upsampled(behind, BEHIND_STEP)[..., : size[0], : size[1]]
-        behind = functional.pad(behind, beyond, mode="replicate")
+        behind = functional.pad(behind_pixels(behind, size), beyond, mode="replicate")
     return Frame(placed, nodes, behind, margin, (height, width), size, occlusion, stacked)
 
 

@@ -889,7 +889,7 @@ class Composite {
     if (!(least < 1.0f - COVERED)) return;
     const int h = job_.behind_height, w = job_.behind_width;
     for (int y = 0; y < rows; y++) {
-      const float at_y = std::max((y0 + y + 0.5f) / BEHIND_STEP - 0.5f, 0.0f);
+      const float at_y = (y0 + y - 0.5f * (H_ - 1)) / BEHIND_STEP + 0.5f * (h - 1);  // both have one centre
       const int top = std::min((int)at_y, h - 1), bottom = std::min(top + 1, h - 1);
       const float down = at_y - top;
       for (int c = 0; c < C_; c++) {
@@ -899,7 +899,7 @@ class Composite {
         for (int x = 0; x < columns; x++) {
           const float uncovered = 1.0f - cover[x];
           if (!(uncovered > COVERED)) continue;
-          const float at_x = std::max((x0 + x + 0.5f) / BEHIND_STEP - 0.5f, 0.0f);
+          const float at_x = (x0 + x - 0.5f * (W_ - 1)) / BEHIND_STEP + 0.5f * (w - 1);
           const int left = std::min((int)at_x, w - 1), right = std::min(left + 1, w - 1);
           const float across = at_x - left;
           const float u = upper[left] + across * (upper[right] - upper[left]), v = lower[left] + across * (lower[right] - lower[left]);

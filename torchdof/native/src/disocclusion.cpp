@@ -6,30 +6,37 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float BEHIND_PX = 2.0f;  // a hidden surface lies at least so much farther, in coc
-constexpr float FALL = 0.7f;       // weight of a level of the pyramid against the finer one before
+constexpr float BEHIND_PX = 1.0f;  // a hidden surface lies about so much farther, in coc
+constexpr float FALL = 0.35f;      // weight of a level of the pyramid against the finer one before
 constexpr int CELL_LEVEL = 3;      // of the pyramid, in whose pixels it is told which may hide something
 constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones are looked at from cells of STEP pixels
 constexpr int STEP = 1 << FINE_LEVELS;
+constexpr float SURE = 0.1f;      // weight of what a level shows from which on it has a whole vote
+constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight, or a farther one counts alone
 constexpr float MIXED = 0.05f;  // least share of a second surface that the pyramid takes
 
 // Farthest surfaces, at every step-th pixel: light of each channel, coc, weight, and what fills the stride.
 struct Level {
   int height, width, step, stride, channels;
   float vote;  // weight against other levels; 0: it is in the weights
-  float least_px;  // blur from which on a pixel looks so far
+  float least_px;  // blur from which on a pixel looks so far, and wholly from twice of it
   Buffer<float> values;
+  float centre_y, centre_x;  // of the image, in its pixels; the map has the same centre
+  float place_y(float y) const { return (y - centre_y) / step + 0.5f * (height - 1); }
+  float place_x(float x) const { return (x - centre_x) / step + 0.5f * (width - 1); }
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
+
+// How surely a surface that is so much farther, in coc, is another one.
+inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND_PX - 0.5f)); }
 
 // Of four children the mean of those that are farthest.
 void farthest(const float *const *child, int channels, int stride, float *out) {
   float most = child[0][channels];
   for (int i = 1; i < 4; i++) most = std::max(most, child[i][channels]);
-  most -= BEHIND_PX;
   float total = 0, counts[4];
-  for (int i = 0; i < 4; i++) total += counts[i] = child[i][channels] > most ? child[i][channels + 1] : 0.0f;
+  for (int i = 0; i < 4; i++) total += counts[i] = child[i][channels + 1] * (1.0f - is_behind(most - child[i][channels]));
   total *= 0.25f;
   const float each = 0.25f / std::max(total, 1e-9f);
   for (int i = 0; i < 4; i++) counts[i] *= each;
@@ -55,15 +62,14 @@ float behind(const Level &level, float row, float column, float here, f8 *seen) 
   const int count = VECTORS ? VECTORS : level.stride / F8, C = level.channels;
   int y, x;
   float down, right;
-  const float per_step = 1.0f / level.step;
-  between((row + 0.5f) * per_step - 0.5f, level.height, y, down);
-  between((column + 0.5f) * per_step - 0.5f, level.width, x, right);
+  between(level.place_y(row), level.height, y, down);
+  between(level.place_x(column), level.width, x, right);
   const float *first = level.at(y, x);
   const size_t below = level.height > 1 ? (size_t)level.width * level.stride : 0, beside = level.width > 1 ? level.stride : 0;
   const float *corner[4] = {first, first + beside, first + below, first + below + beside};
   const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
   float total = 0, counts[4];
-  for (int k = 0; k < 4; k++) total += counts[k] = corner[k][C] > here + BEHIND_PX ? share[k] * corner[k][C + 1] : 0.0f;
+  for (int k = 0; k < 4; k++) total += counts[k] = share[k] * corner[k][C + 1] * is_behind(corner[k][C] - here);
   for (int i = 0; i < count; i++) seen[i] = f8{};
   if (!(total > 1e-4f)) return 0;
   const float each = 1.0f / total;
@@ -81,13 +87,14 @@ float look(const Level *const *levels, int n, float row, float column, float her
   for (int i = 0; i < F8 * count; i++) out[i] = 0;
   for (int l = 0; l < n; l++) {
     const Level &level = *levels[l];
-    if (level.least_px > std::fabs(here)) continue;
+    const float looked = clamp01(std::fabs(here) / level.least_px - 1.0f);
+    if (!(looked > 0)) continue;
     const float any = behind<VECTORS>(level, row, column, here, b);
-    float vote = any > 0 ? (level.vote > 0 ? level.vote : any) : 0.0f;
+    float vote = looked * (level.vote > 0 ? level.vote * std::min(any / SURE, 1.0f) : any);
     if (farthest) {
       const float apart = ((const float *)b)[C] - out[C];
-      if (total > 0 && apart < -BEHIND_PX) vote = 0;
-      if (vote > 0 && apart > BEHIND_PX) total = 0;
+      if (total > 0) vote *= 1.0f - is_behind(-apart);
+      total *= 1.0f - std::min(looked * any / CERTAIN, 1.0f) * is_behind(apart);
     }
     total += vote;
     if (!(vote > 0)) continue;
@@ -110,8 +117,8 @@ class Filling {
     area_width_ = (job_.width + 2 * step - 1) / step * step;
     coarsest_ = std::min(levels, CELL_LEVEL);
     cell_ = 1 << coarsest_;
-    cell_rows_ = area_height_ / cell_;
-    cell_columns_ = area_width_ / cell_;
+    cell_rows_ = ceil_div(job_.height, cell_);
+    cell_columns_ = ceil_div(job_.width, cell_);
     pyramid_.resize(levels);
     for (int i = 0; i < levels; i++) {
       Level &l = pyramid_[i];
@@ -120,6 +127,7 @@ class Filling {
       l.step = 2 << i;
       l.stride = stride_;
       l.channels = C_;
+      centre(l);
       l.vote = (float)std::pow((double)FALL, i + 1);
       l.least_px = (float)std::pow(2.0, i - 1);
       l.values = Buffer<float>((size_t)l.height * l.width * stride_);
@@ -128,7 +136,8 @@ class Filling {
     blur_.resize(near_.size());
     found_.resize(near_.size());
     fine_.resize(near_.size());
-    job_.parallel(area_height_ / BLOCK + (area_height_ % BLOCK != 0), [&](int band, int) { finest(band); });
+    tell_cells();
+    job_.parallel(ceil_div(pyramid_[0].height, BLOCK / 2), [&](int band, int) { finest(band); });
     for (int i = 1; i < levels; i++) {
       const int bands = ceil_div(pyramid_[i].height, 8);
       if (i == 1)
@@ -141,29 +150,56 @@ class Filling {
   }
 
  private:
-  // First level of the pyramid: one band of rows of the image, and its cells.
-  void finest(int band) {
-    const int H = job_.height, W = job_.width, C = C_, y_end = std::min(area_height_, (band + 1) * BLOCK);
-    const Level &level = pyramid_[0];
-    std::vector<float> rows((size_t)2 * (C + 2) * BLOCK);
-    for (int bx = 0; bx * BLOCK < area_width_; bx++) {
-      const int x0 = bx * BLOCK, x_end = std::min(area_width_, x0 + BLOCK);
-      const bool inside = y_end <= H && x_end <= W && y_end == (band + 1) * BLOCK && x_end == x0 + BLOCK;
-      const int which = std::min(band, s_.block_rows - 1) * s_.block_columns + std::min(bx, s_.block_columns - 1);
-      const float limit = least_threshold(job_, which / s_.block_columns * BLOCK, which % s_.block_columns * BLOCK);
-      const bool own = s_.has_block(which), bright = own || job_.block_peak[which] > limit;
-      const float low = job_.block_low[which], high = job_.block_high[which];
-      for (int y = band * BLOCK; y < y_end; y += cell_)
-        for (int x = x0; x < x_end; x += cell_) {
-          const size_t cell = (size_t)(y / cell_) * cell_columns_ + x / cell_;
-          near_[cell] = low;  // none too far: it only tells where to look
-          blur_[cell] = std::max(std::fabs(low), std::fabs(high));
-        }
-      for (int y = band * BLOCK; y < y_end; y += 2) {
-        for (int i = 0; i < 2; i++)
-          pixels(std::min(y + i, H - 1), x0, x_end - x0, inside, bright, limit, rows.data() + (size_t)i * (C + 2) * BLOCK);
-        farthest_of_rows(rows.data(), x_end - x0, level.at(y / 2, x0 / 2));
+  void centre(Level &level) const {
+    level.centre_y = 0.5f * (job_.height - 1);
+    level.centre_x = 0.5f * (job_.width - 1);
+  }
+
+  // The first pixel that the first sample of a map covers, half of it where the image's size is odd.
+  static int first_pixel(int size, int samples, int step) { return floor_half((size - 1) - step * (samples - 1) - step + 1); }
+  static int floor_half(int a) { return a >= 0 ? a / 2 : -((1 - a) / 2); }
+
+  // Nearest coc and largest blur of each cell.
+  void tell_cells() {
+    for (int row = 0; row < cell_rows_; row++)
+      for (int column = 0; column < cell_columns_; column++) {
+        const size_t cell = (size_t)row * cell_columns_ + column, block = (size_t)(row * cell_ / BLOCK) * s_.block_columns + column * cell_ / BLOCK;
+        const float low = job_.block_low[block], high = job_.block_high[block];
+        near_[cell] = low;  // none too far: it only tells where to look
+        blur_[cell] = std::max(std::fabs(low), std::fabs(high));
       }
+  }
+
+  // First level of the pyramid: a band of its rows.
+  void finest(int band) {
+    const int H = job_.height, W = job_.width, planes = C_ + 2;
+    const Level &level = pyramid_[0];
+    const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2), across = 2 * level.width + 1;
+    const size_t line = (size_t)planes * across;
+    std::vector<float> memory(3 * line), block((size_t)planes * BLOCK);
+    int held[3] = {-1, -1, -1};
+    auto row_of = [&](int y) {  // planes of a row, continued to both sides, from pixel `left` on
+      y = std::clamp(y, 0, H - 1);
+      float *row = memory.data() + y % 3 * line;
+      if (held[y % 3] == y) return row;
+      held[y % 3] = y;
+      for (int x0 = 0; x0 < W; x0 += BLOCK) {
+        const int n = std::min(BLOCK, W - x0), which = y / BLOCK * s_.block_columns + x0 / BLOCK;
+        const float limit = least_threshold(job_, y / BLOCK * BLOCK, x0);
+        pixels(y, x0, n, n == BLOCK, s_.has_block(which) || job_.block_peak[which] > limit, limit, block.data());
+        for (int k = 0; k < planes; k++) memcpy(row + (size_t)k * across + x0 - left, &block[(size_t)k * BLOCK], n * sizeof(float));
+      }
+      for (int k = 0; k < planes; k++) {
+        float *plane = row + (size_t)k * across;
+        std::fill(plane, plane - left, plane[-left]);
+        std::fill(plane + W - left, plane + across, plane[W - 1 - left]);
+      }
+      return row;
+    };
+    for (int y = band * BLOCK / 2; y < std::min(level.height, (band + 1) * BLOCK / 2); y++) {
+      const float *rows[3];
+      for (int i = 0; i < 2 + H % 2; i++) rows[i] = row_of(top + 2 * y + i);
+      farthest_of_rows(rows, across, level.at(y, 0));
     }
   }
 
@@ -219,34 +255,44 @@ class Filling {
     }
   }
 
-  // Of the four pixels of two rows that are one in the first level, the mean of those that are farthest.
-  void farthest_of_rows(const float *rows, int n, float *out) const {
-    constexpr int HALF = BLOCK / 2;
-    const int C = C_;
-    const size_t plane = BLOCK, line = (size_t)(C + 2) * BLOCK;
-    float counts[4][HALF], each[HALF], total[HALF];
-    const float *coc = rows + C * plane, *weight = coc + plane;
-    auto child = [&](const float *of, int i, int x) { return of[(i / 2) * line + 2 * x + i % 2]; };
-    for (int x = 0; x < n / 2; x++) {
-      const float a = child(coc, 0, x), b = child(coc, 1, x), c = child(coc, 2, x), d = child(coc, 3, x);
-      const float most = std::max(std::max(a, b), std::max(c, d)) - BEHIND_PX;
-      counts[0][x] = a > most ? child(weight, 0, x) : 0.0f;
-      counts[1][x] = b > most ? child(weight, 1, x) : 0.0f;
-      counts[2][x] = c > most ? child(weight, 2, x) : 0.0f;
-      counts[3][x] = d > most ? child(weight, 3, x) : 0.0f;
-      total[x] = 0.25f * ((counts[0][x] + counts[1][x]) + (counts[2][x] + counts[3][x]));
-      each[x] = 0.25f / std::max(total[x], 1e-9f);
-    }
-    for (int k = 0; k <= C; k++) {
-      const float *of = rows + k * plane;
-      for (int x = 0; x < n / 2; x++)
-        out[x * stride_ + k] = each[x] * ((child(of, 0, x) * counts[0][x] + child(of, 1, x) * counts[1][x]) +
-                                          (child(of, 2, x) * counts[2][x] + child(of, 3, x) * counts[3][x]));
-    }
-    for (int x = 0; x < n / 2; x++) {
-      if (!(total[x] > 0)) out[x * stride_ + C] = -NEVER;
-      out[x * stride_ + C + 1] = total[x];
-      for (int k = C + 2; k < stride_; k++) out[x * stride_ + k] = 0;
+  // Of the pixels of rows that are one in the first level, the mean of those that are farthest: of two, or, where the
+  // image's size is odd, of two halves and the one between.
+  void farthest_of_rows(const float *const *rows, size_t across, float *out) const {
+    constexpr int STRIP = 32;
+    const int C = C_, H = job_.height, W = job_.width, ny = 2 + H % 2, nx = 2 + W % 2, width = pyramid_[0].width;
+    float counts[9][STRIP], most[STRIP], each[STRIP], total[STRIP];
+    for (int x0 = 0; x0 < width; x0 += STRIP) {
+      const int n = std::min(STRIP, width - x0);
+      auto child = [&](int j, int plane) { return rows[j / nx] + plane * across + 2 * x0 + j % nx; };
+      for (int x = 0; x < n; x++) most[x] = -NEVER;
+      for (int j = 0; j < ny * nx; j++) {
+        const float *coc = child(j, C);
+        for (int x = 0; x < n; x++) most[x] = std::max(most[x], coc[2 * x]);
+      }
+      for (int x = 0; x < n; x++) total[x] = 0;
+      for (int j = 0; j < ny * nx; j++) {
+        const float *coc = child(j, C), *weight = child(j, C + 1);
+        const float share = 0.25f * (ny == 3 && j / nx != 1 ? 0.5f : 1.0f) * (nx == 3 && j % nx != 1 ? 0.5f : 1.0f);
+        for (int x = 0; x < n; x++) {
+          counts[j][x] = share * weight[2 * x] * (1.0f - is_behind(most[x] - coc[2 * x]));
+          total[x] += counts[j][x];
+        }
+      }
+      for (int x = 0; x < n; x++) each[x] = 1.0f / std::max(total[x], 1e-9f);
+      float *to = out + (size_t)x0 * stride_;
+      for (int k = 0; k <= C; k++) {
+        float sum[STRIP] = {};
+        for (int j = 0; j < ny * nx; j++) {
+          const float *of = child(j, k);
+          for (int x = 0; x < n; x++) sum[x] += of[2 * x] * counts[j][x];
+        }
+        for (int x = 0; x < n; x++) to[x * stride_ + k] = each[x] * sum[x];
+      }
+      for (int x = 0; x < n; x++) {
+        if (!(total[x] > 0)) to[x * stride_ + C] = -NEVER;
+        to[x * stride_ + C + 1] = total[x];
+        for (int k = C + 2; k < stride_; k++) to[x * stride_ + k] = 0;
+      }
     }
   }
 
@@ -266,14 +312,14 @@ class Filling {
       found_[cell] = fine_[cell] = 0;
       for (int i = 0; i < job_.levels; i++) {
         const Level &l = pyramid_[i];
-        if (blur_[cell] < l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
-        const int size = i + 1 <= coarsest_ ? 1 << (coarsest_ - i - 1) : 1;
-        const int y0 = i + 1 <= coarsest_ ? row * size : row >> (i + 1 - coarsest_);
-        const int x0 = i + 1 <= coarsest_ ? column * size : column >> (i + 1 - coarsest_);
+        if (blur_[cell] <= l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
+        // what its pixels look at, and the centres of samples that they share with other cells
+        const int y0 = (int)l.place_y(row * cell_) - 1, y1 = (int)l.place_y(row * cell_ + cell_ - 1) + 2;
+        const int x0 = (int)l.place_x(column * cell_) - 1, x1 = (int)l.place_x(column * cell_ + cell_ - 1) + 2;
         float most = -NEVER;
-        for (int y = std::max(0, y0 - 1); y <= std::min(l.height - 1, y0 + size); y++)
-          for (int x = std::max(0, x0 - 1); x <= std::min(l.width - 1, x0 + size); x++) most = std::max(most, l.coc(y, x));
-        if (most > near_[cell] + BEHIND_PX) {
+        for (int y = std::max(0, y0); y <= std::min(l.height - 1, y1); y++)
+          for (int x = std::max(0, x0); x <= std::min(l.width - 1, x1); x++) most = std::max(most, l.coc(y, x));
+        if (most > near_[cell] + BEHIND_PX - 0.5f) {
           found_[cell] = 1;
           if (i < FINE_LEVELS) fine_[cell] = 1;
         }
@@ -291,6 +337,7 @@ class Filling {
   void fill() {
     const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
     const int rows = area_height_ / STEP, columns = area_width_ / STEP;
+    const int first_y = first_pixel(H, rows, STEP), first_x = first_pixel(W, columns, STEP);
     job_.behind_height = rows;
     job_.behind_width = columns;
     job_.behind.resize((size_t)C * rows * columns);
@@ -300,6 +347,7 @@ class Filling {
     together.step = STEP;
     together.stride = stride_;
     together.channels = C;
+    centre(together);
     together.vote = 0;
     together.least_px = levels > FINE_LEVELS ? pyramid_[FINE_LEVELS].least_px : 0;
     if (levels > FINE_LEVELS) together.values = Buffer<float>((size_t)rows * columns * stride_);
@@ -313,16 +361,22 @@ class Filling {
         const size_t at = (size_t)row * columns + column;
         const float *shown = base.at(row, column);
         if (levels > FINE_LEVELS) memset(together.values.data() + at * stride_, 0, stride_ * sizeof(float));
-        if (found_[(size_t)(row * STEP / cell_) * cell_columns_ + column * STEP / cell_]) {
-          bool any = false;
+        const int top = first_y + row * STEP, left = first_x + column * STEP;
+        const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + STEP - 1 + H % 2, 0, H - 1);
+        const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + STEP - 1 + W % 2, 0, W - 1);
+        bool any = false;
+        for (int r = y0 / cell_; r <= y1 / cell_; r++)
+          for (int c = x0 / cell_; c <= x1 / cell_; c++) any |= found_[(size_t)r * cell_columns_ + c];
+        if (any) {
+          any = false;
           float near = NEVER;
-          for (int y = row * STEP; y < std::min(H, row * STEP + STEP); y++)
-            for (int x = column * STEP; x < std::min(W, column * STEP + STEP); x++) {
+          for (int y = y0; y <= y1; y++)
+            for (int x = x0; x <= x1; x++) {
               near = std::min(near, s_.coc[(size_t)y * W + x]);
               any = any || wanted(y, x);
             }
           if (any) {
-            const float y = row * STEP + 0.5f * (STEP - 1), x = column * STEP + 0.5f * (STEP - 1);
+            const float y = (row - 0.5f * (rows - 1)) * STEP + 0.5f * (H - 1), x = (column - 0.5f * (columns - 1)) * STEP + 0.5f * (W - 1);
             if (levels > FINE_LEVELS) {
               float *to = together.at(row, column);
               const float total = look<VECTORS>(every.data() + FINE_LEVELS, levels - FINE_LEVELS, y, x, near, false, to, sample.data());
@@ -362,7 +416,7 @@ class Filling {
             const int within = y % BLOCK * BLOCK + x % BLOCK;
             for (int c = 0; c < C; c++) b.other[c * BLOCK_PIXELS + within] = seen[c];
             b.coc[within] = seen[C];
-            b.weight[within] = s_.valid ? HIDDEN_WEIGHT * s_.valid[(size_t)y * W + x] : HIDDEN_WEIGHT;
+            b.weight[within] = HIDDEN_WEIGHT * std::min(total / CERTAIN, 1.0f) * (s_.valid ? s_.valid[(size_t)y * W + x] : 1.0f);
           }
     });
   }
