@@ -1,4 +1,5 @@
 import csv
+import dataclasses
 import math
 import shutil
 from pathlib import Path
@@ -36,20 +37,21 @@ def test_ikoma_leaves_a_scene_in_focus_alone() -> None:
     torch.testing.assert_close(out, image, rtol=1e-6, atol=1e-6)
 
 
-def test_a_score_leaves_the_margin_out() -> None:
+def test_a_score_tells_the_inner_frame_apart() -> None:
     truth = torch.full((1, 3, 40, 50), 0.5)
     image = truth.clone()
     image[..., :3, :] = 0.9
-    scene = Scene("flat", truth, truth[:, :1], CAMERA, truth)
-    assert accuracy.score("a", image, scene, margin_px=3).psnr_linear == math.inf
-    assert accuracy.score("a", image, scene, margin_px=2).psnr_linear < 40
     known = truth[:, :1] == 0.5
     known[..., :2, :] = False
-    whole, partly = accuracy.score("a", image, scene, 1), accuracy.score("a", image, scene, 1, known)
-    assert math.isnan(whole.psnr_known)
-    assert partly.psnr_known > partly.psnr_display > 20
-    with pytest.raises(ValueError, match="leaves too little of 50 x 40"):
-        accuracy.score("a", image, scene, margin_px=20)
+    scene = Scene("flat", truth, truth[:, :1], CAMERA, truth, margin_px=3)
+    score = accuracy.score("a", image, scene, known)
+    assert score.psnr_inner == math.inf and score.psnr_known > score.psnr_display > 20
+    wider = dataclasses.replace(scene, margin_px=2)
+    assert accuracy.score("a", image, wider).psnr_inner < 40 and math.isnan(
+        accuracy.score("a", image, wider).psnr_known
+    )
+    nothing_left = dataclasses.replace(scene, margin_px=20)
+    assert math.isnan(accuracy.score("a", image, nothing_left).psnr_inner)
 
 
 def test_bench_writes_a_table_and_a_picture(tmp_path: Path) -> None:
@@ -69,7 +71,7 @@ def test_bench_writes_a_table_and_a_picture(tmp_path: Path) -> None:
     assert float(rows["untouched"]["psnr_display"]) == pytest.approx(score.psnr_display, rel=1e-5)
     assert float(rows["torchdof"]["psnr_display"]) > float(rows["untouched"]["psnr_display"]) + 10
     assert f"| room/1 | {score.psnr_display:.2f} |" in (out / "accuracy.md").read_text()
-    assert read_image(out / "accuracy.png").pixels.shape == (1, 3, 2 * 128, 8 * 128)
+    assert read_image(out / "accuracy.png").pixels.shape == (1, 3, 2 * 128, 9 * 128)
 
 
 def test_bench_without_scenes_writes_nothing(tmp_path: Path) -> None:

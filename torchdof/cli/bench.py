@@ -86,14 +86,6 @@ def bench(
             rich_help_panel=_ACCURACY,
         ),
     ] = None,
-    inner: Annotated[
-        bool,
-        typer.Option(
-            "--inner",
-            help="Leave out the border that light from outside the frame reaches.",
-            rich_help_panel=_ACCURACY,
-        ),
-    ] = False,
     degrade: Annotated[
         bool,
         typer.Option(
@@ -138,15 +130,15 @@ def bench(
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
         if not degrade and peer:
             raise ValueError("--peer goes with --degrade")
-        if degrade and (views or inner):
-            raise ValueError("--degrade compares whole frames without the reference; leave --views and --inner out")
+        if degrade and views:
+            raise ValueError("--degrade compares without the reference; leave --views out")
         if degrade:
             compare_degraded(truth, out, peer or [])
         else:
-            compare_with_truth(truth, out, views, inner)
+            compare_with_truth(truth, out, views)
         return
-    if views or inner or degrade or peer:
-        raise ValueError("--views, --inner, --degrade and --peer compare with a truth; name its folder with --truth")
+    if views or degrade or peer:
+        raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
     how = RenderSettings(
         focus=None if focus_m is None else [(0, focus_m)],
         f_number=f_number,
