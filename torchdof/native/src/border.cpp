@@ -14,6 +14,11 @@ Border border_of(const Job &job, int farthest) {
   if (border.dark_) return border;
   while (farthest >> border.levels_) border.levels_++;
   border.levels_++;
+  for (int distance = 0, level = 0; distance <= farthest; distance++) {
+    while (2 << level <= distance) level++;
+    border.level_of_.push_back(level);
+    border.part_of_.push_back((float)distance / (1 << level) - 1.0f);
+  }
   for (auto side : {Border::TOP, Border::BOTTOM, Border::LEFT, Border::RIGHT})
     {
     border.means_[side].resize(border.start(side, s.count, 0, 0));
@@ -64,11 +69,9 @@ void Border::continue_row(int surface, int channel, int y, int x, int n, float *
     return;
   }
   const int far = y < 0 ? -y : y - height_ + 1;
-  int level = 0;
-  while (2 << level <= far) level++;
-  const float part = (float)far / (1 << level) - 1.0f;
+  const float part = part_of_[far];
   const Side side = y < 0 ? TOP : BOTTOM;
-  const float *nearer = means_[side].data() + start(side, surface, channel, level) + x, *farther = nearer + length(side);
+  const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[far]) + x, *farther = nearer + length(side);
   const float *share = shares_[side].data() + (size_t)surface * length(side) + x;
   for (int i = 0; i < n; i++) row[i] = 0.5f * (row[i] * share[i] + nearer[i] + part * (farther[i] - nearer[i]));
 }

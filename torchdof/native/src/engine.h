@@ -216,7 +216,8 @@ class Border {
       from_column = mean(side, surface, channel, across, at_y);
       share = shares_[side][(size_t)surface * height_ + at_y];
     }
-    return 0.5f * (nearest * share + (from_row * far + from_column * across) / (far + across));
+    const float on = !across ? from_row : !far ? from_column : (from_row * far + from_column * across) / (far + across);
+    return 0.5f * (nearest * share + on);
   }
   // The same of n pixels above or below the frame.
   void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
@@ -229,13 +230,13 @@ class Border {
     return ((size_t)(surface * channels_ + channel) * levels_ + level) * length(side);
   }
   float mean(Side side, int surface, int channel, int distance, int at) const {
-    int level = 0;
-    while (2 << level <= distance) level++;
-    const float part = (float)distance / (1 << level) - 1.0f;
-    const float *nearer = means_[side].data() + start(side, surface, channel, level) + at, *farther = nearer + length(side);
+    const float part = part_of_[distance];
+    const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[distance]) + at, *farther = nearer + length(side);
     return *nearer + part * (*farther - *nearer);
   }
   int height_ = 0, width_ = 0, channels_ = 0, levels_ = 0;
+  std::vector<int> level_of_;   // of each distance, and how far it lies on the way to the next one
+  std::vector<float> part_of_;
   bool dark_ = false;  // nothing comes from there
   std::vector<float> shares_[4];  // of each side, [surfaces, length]: of the light there, what is no highlight's
   std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; level l is that of 2^l pixels
