@@ -71,13 +71,15 @@ def _distances(like: Tensor, reach: int) -> Tensor:
 def _beyond(line: Tensor, weight: Tensor, reach: int, farthest: int) -> Tensor:
     """What follows on a line ``[B, C, n]`` at the border, nearest first: ``[B, C, reach, n]``."""
     # means for distances that are powers of two; between them linear
+    at = torch.arange(line.shape[-1], device=line.device)
+    sums = functional.pad(torch.cat([line * weight, weight], 1).double().cumsum(-1), (1, 0))  # of what comes before
     means = []
     for level in range(farthest.bit_length() + 1):
         half = _WIDTH * 2**level
-        summed, total = (
-            functional.avg_pool1d(t, 2 * half + 1, stride=1, padding=half) for t in (line * weight, weight)
-        )
-        means.append(summed / torch.where(total > 0, total, 1.0))
+        start, stop = (at - half).clamp_min(0), (at + (half + 1)).clamp_max(line.shape[-1])
+        window = sums.index_select(-1, stop) - sums.index_select(-1, start)
+        total = window[:, -1:]
+        means.append((window[:, :-1] / torch.where(total > 0, total, 1.0)).to(line.dtype))
     distance = torch.arange(1, reach + 1, device=line.device)
     powers = torch.tensor([2**level for level in range(1, len(means))], device=line.device)
     level = (distance[:, None] >= powers).sum(1)
