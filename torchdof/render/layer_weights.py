@@ -23,7 +23,7 @@ SHARP_PX = 0.5
 """Radius of the circle of confusion up to which a pixel counts as in focus."""
 
 
-_FOOT = 0.1  # share up to which an eased ramp rises by its square
+_FOOT = 0.15  # share up to which an eased ramp rises by its square
 
 
 def blur_axis(coc_px: Tensor) -> Tensor:
