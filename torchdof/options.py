@@ -43,8 +43,9 @@ class Options:
     Args:
         table: Blur measured from a lens; None takes the ideal disc.
         tolerance: Accepted RMS difference, display-encoded, from the same rendering with exact kernels, dense layers
-            and full resolution. 0 asks for that rendering itself; ``"draft"`` is 8/255, ``"preview"`` 4/255 and
-            ``"final"`` 1/255.
+            and full resolution. 0 asks for that rendering itself, whose kernels are interpolated between layers half a
+            pixel apart: where depth is noise, 1 to 2.5/255 RMS from a scatter of each pixel's own kernel. ``"draft"``
+            is 8/255, ``"preview"`` 4/255 and ``"final"`` 1/255.
         occlusion: True composites layers far to near, so that blurred foregrounds cover what is behind and sharp ones
             are not bled upon. False is the paper's own algorithm: every pixel's light accumulates.
         normalize: With ``occlusion=False`` only: False leaves the plain sum that the paper accumulates.

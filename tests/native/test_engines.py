@@ -78,6 +78,10 @@ def random_map(kind: str, shape: tuple[int, int, int], radius: float) -> Tensor:
         return functional.interpolate(((torch.rand(3) * 2 - 1) * radius)[regions], size=(height, width))
     if kind == "noise":
         return (torch.rand(items, 1, height, width) * 2 - 1) * radius
+    if kind == "quarters":  # on the very edge of many decisions
+        regions = torch.randint(-4, 5, (items, 1, height // 8 + 1, width // 8 + 1)) * 0.25
+        regions = (regions * radius * 4).round() / 4
+        return regions.repeat_interleave(8, -1).repeat_interleave(8, -2)[..., :height, :width].contiguous()
     if kind == "slope":
         return torch.linspace(-radius, radius, height)[:, None].expand(items, 1, height, width).clone()
     coarse = torch.rand(items, 1, 3, 4) * 2 - 1
@@ -151,6 +155,19 @@ def test_engines_agree_before_a_known_background(lamps: float, check: bool, by_b
         behind[0, 1, 10:20, 30:50] = torch.nan
         behind_coc[1, :, 40:50, 30:50] = torch.inf
     options = {"background": behind, "background_coc_px": behind_coc, "check": check}
+    assert_same_picture(by_both(Scene(image, coc, options).blurred), image)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("way", ["accumulated", "background"])
+def test_engines_agree_on_the_very_edge_of_decisions(way: str, seed: int, by_both: Any) -> None:
+    torch.manual_seed(seed)
+    shape = (1, 30 + 11 * seed, 90 - 7 * seed)
+    image, coc = torch.rand(1, 3, *shape[1:]), random_map("quarters", shape, (2.0, 5.0, 9.0)[seed % 3])
+    image = torch.where(torch.rand(1, 1, *shape[1:]) < 0.004 * (way == "accumulated"), 100.0 * image, image)
+    options: dict[str, Any] = {"table": TABLES[seed % 3], "occlusion": way == "background"}
+    if way == "background":
+        options |= {"background": torch.rand(image.shape), "background_coc_px": coc + (0.0, 0.5, 2.0)[seed // 2]}
     assert_same_picture(by_both(Scene(image, coc, options).blurred), image)
 
 

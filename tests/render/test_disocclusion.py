@@ -79,6 +79,6 @@ def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, in
             Surface(light, coc, torch.full_like(coc, cover)),
             Surface(light, coc + 9.0, torch.full_like(coc, 1 - cover)),
         ]
-        frame = framed(surfaces, cells, (0.0, 1.0), blurs, stacked=False)
+        frame = framed(surfaces, cells, (0.0, 1.0), blurs, occlusion=True, stacked=False)
         shown = over(frame, blurs, convolve)
         torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)

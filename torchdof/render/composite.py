@@ -18,7 +18,7 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
-_KNOWN = 0.001  # share of scattered weight from which on a layer is known in full
+_KNOWN = 0.002  # share of scattered weight from which on a layer is known in full
 
 
 def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:

@@ -26,7 +26,7 @@ _SQUARE_PX = 0.5  # coc around which the axis goes over from the square to the c
 _IN_FOCUS = 2e-4  # where focus ends: a coc of 0.01 px
 
 
-_FOOT = 0.1  # share up to which an eased ramp rises by its square
+_FOOT = 0.15  # share up to which an eased ramp rises by its square
 
 
 def blur_axis(coc_px: Tensor) -> Tensor:

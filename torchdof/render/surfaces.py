@@ -18,7 +18,7 @@ from .plan import Blur
 __all__ = ["Frame", "Placed", "Surface", "framed", "surfaces_of_image"]
 
 
-_HAIR = 0.03
+_HAIR = 0.06
 """Share of a surface up to which, in a layer, it does not yet hide what is known behind it."""
 
 

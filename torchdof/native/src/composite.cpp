@@ -8,10 +8,10 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing is known
-constexpr float KNOWN = 1e-3f;    // and from which on a layer is known in full
-constexpr float FOOT = 0.1f;      // share up to which a ramp between layers rises by its square,
+constexpr float KNOWN = 2e-3f;    // and from which on a layer is known in full
+constexpr float FOOT = 0.15f;     // share up to which a ramp between layers rises by its square,
 constexpr float SLOPE = 1 / (1 - FOOT / 2);  // and how it goes on
-constexpr float HAIR = 0.03f;     // share of a surface up to which it does not yet hide what is known behind it
+constexpr float HAIR = 0.06f;     // share of a surface up to which it does not yet hide what is known behind it
 constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
