@@ -33,7 +33,7 @@ def distance_m(coc: float, focal: float, f_number: float, focus_m: float) -> flo
 
 
 def traced_kernel(spot: Spot, loops: ModuleType) -> np.ndarray:
-    """The spot of a fan turned about the axis, counted in eighths of a pixel, seen by pixels: no kernel code, no fit."""
+    """The spot of a fan turned about the axis, in eighths of a pixel, as pixels see it: no kernel code, no fit."""
     fine = 8
     r = np.repeat(spot.r / PIXEL, 128)
     turn = 2 * math.pi * (np.arange(len(r)) * (math.sqrt(5) - 1) / 2)
