@@ -102,29 +102,33 @@ def disc_by_columns(radius: float, size: int) -> Tensor:
 
 
 def interpolated(profile: Callable[[Tensor], Tensor], reach: float, size: int, samples: int = 200) -> Tensor:
-    """Isotropic profile of so large a reach, sampled finely and seen by the interpolator of each pixel.
-
-    The interpolator is the cubic spline through a single 1 among 0s, at most twice the hat of linear interpolation in
-    effect; what is negative is taken from the four neighbours in proportion to their light.
-    """
-    knots = np.arange(-40, 41)
-    cardinal = CubicSpline(knots, (knots == 0).astype(float), bc_type="natural")
+    """Kernel of so many pixels of an isotropic profile of so large a reach, sampled finely."""
     places = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples * 2 * reach - reach
-    light = profile(torch.hypot(places[:, None], places[None, :]))
+    return seen_by_pixels(profile(torch.hypot(places[:, None], places[None, :])), places, size)
+
+
+def seen_by_pixels(light: Tensor, places: Tensor, size: int) -> Tensor:
+    """Kernel `[size, size]` of a PSF's light `[n, n]` at places `[n]` along each axis, by the interpolator of pixels.
+
+    That is the cubic spline through a single 1 among 0s, at most twice the hat of linear interpolation in effect; what
+    is negative is taken from the four neighbours in proportion to their light.
+    """
+    knots = np.arange(-60, 61)
+    cardinal = CubicSpline(knots, (knots == 0).astype(float), bc_type="natural")
     half = size // 2 + 2
     away = torch.arange(-half, half + 1, dtype=torch.float64)[:, None] - places
     spline, hat = torch.from_numpy(cardinal(away.numpy())), (1 - away.abs()).clamp_min(0.0)
-    kernel = torch.minimum(spline @ light @ spline.T, 2 * hat @ light @ hat.T)
-    settled = kernel.clamp_min(0.0)
+    kernel = torch.minimum(spline @ light @ spline.T, 2 * hat @ light @ hat.T).tolist()
+    settled = [[max(value, 0.0) for value in row] for row in kernel]
     for row in range(1, 2 * half):
         for column in range(1, 2 * half):
-            owed = -float(kernel[row, column])
+            owed = -kernel[row][column]
             givers = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
-            wealth = sum(max(float(kernel[giver]), 0.0) for giver in givers)
-            for giver in givers if owed > 0 and wealth > 0 else []:
-                settled[giver] -= owed * max(float(kernel[giver]), 0.0) / wealth
-    settled = settled.clamp_min(0.0)[2:-2, 2:-2]
-    return settled / settled.sum()
+            wealth = sum(max(kernel[y][x], 0.0) for y, x in givers)
+            for y, x in givers if owed > 0 and wealth > 0 else []:
+                settled[y][x] -= owed * max(kernel[y][x], 0.0) / wealth
+    inner = torch.tensor(settled, dtype=torch.float64).clamp_min(0.0)[2:-2, 2:-2]
+    return inner / inner.sum()
 
 
 PERIOD = 32  # pixels

@@ -214,8 +214,18 @@ def _size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     index = [solution.names.index(n) for n in shape]
     covariance = solution.covariance[np.ix_(index, index)]
     known = np.isfinite(np.diag(covariance))
-    variance = slope[known] @ covariance[np.ix_(known, known)] @ slope[known]
-    return float(rms[0]), float(np.sqrt(max(variance, 0.0))) if known.any() else np.inf
+    if known.all():
+        return float(rms[0]), float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+    # parameters trade with each other without limit; their size may be known all the same
+    numbers = np.array([solution.params.get(n, solution.moves.get(n, 0.0)) for n in solution.names])
+    jacobian = pair._jacobian(solution.family, solution.names, numbers)[:, index]
+    _, values, right = np.linalg.svd(jacobian, full_matrices=False)
+    seen = values > 1e-6 * values.max()
+    along = right @ slope
+    if not seen.any() or np.abs(along[~seen]).sum() > 0.1 * np.abs(along).sum():
+        return float(rms[0]), np.inf
+    noise = np.sqrt(solution.squares / pair.values.size)
+    return float(rms[0]), float(noise * np.linalg.norm(along[seen] / values[seen]))
 
 
 def _size(pair: Forward) -> str:

@@ -182,11 +182,12 @@ def _(dtype: torch.dtype) -> float:
     return max(error(blur_by_coc(image, _on_node(offset)), truth) for offset in (-1, 1))
 
 
-@case("depth", "a hair to either side of where focus ends", "in focus", float32=2e-4)
+@case("depth", "a hair to either side of where focus ends", "the image itself, and convolution with the disc")
 def _(dtype: torch.dtype) -> float:
     image = texture(dtype)
-    end = from_blur_axis(1e-12)
-    return max(error(blur_by_coc(image, whole(c)), image) for c in (0.9999 * end, 1.0001 * end, -end, -1.0001 * end))
+    inside, outside = 0.9999 * from_blur_axis(1e-12), 1.0001 * from_blur_axis(1e-12)
+    left = max(error(blur_by_coc(image, whole(c)), image) for c in (inside, -inside))
+    return max(left, *(error(blur_by_coc(image, whole(c)), convolved(image, c)) for c in (outside, -outside)))
 
 
 @case("depth", "focus exactly at one pixel's depth", "float64")

@@ -1,6 +1,7 @@
 import math
 import re
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -31,14 +32,17 @@ def distance_m(coc: float, focal: float, f_number: float, focus_m: float) -> flo
     return 1.0 / dioptres if dioptres > 1e-9 else math.inf
 
 
-def traced_kernel(spot: Spot, least: int = 1) -> np.ndarray:
-    """The spot of a fan turned about the axis and counted in pixels: no kernel code, no fit."""
+def traced_kernel(spot: Spot, loops: ModuleType) -> np.ndarray:
+    """The spot of a fan turned about the axis, in eighths of a pixel, as pixels see it: no kernel code, no fit."""
+    fine = 8
     r = np.repeat(spot.r / PIXEL, 128)
     turn = 2 * math.pi * (np.arange(len(r)) * (math.sqrt(5) - 1) / 2)
-    size = max(least, 2 * math.ceil(r.max() + 0.5) + 1)
-    x, y = (np.floor(r * wave(turn) + size / 2).astype(int) for wave in (np.cos, np.sin))
-    counted = np.bincount(y * size + x, np.repeat(spot.weight, 128), size * size).reshape(size, size)
-    return counted / counted.sum()
+    size = 2 * math.ceil(r.max()) + 1
+    n = size * fine
+    x, y = (np.floor(r * wave(turn) * fine + n / 2).astype(int) for wave in (np.cos, np.sin))
+    counted = np.bincount(y * n + x, np.repeat(spot.weight, 128), n * n).reshape(n, n)
+    places = (torch.arange(n, dtype=torch.float64) + 0.5) / fine - size / 2
+    return np.asarray(loops.seen_by_pixels(torch.from_numpy(counted), places, size))
 
 
 def interpolated(table: BlurTable, coc_px: float) -> np.ndarray:
@@ -52,7 +56,14 @@ def between(table: BlurTable, share: float = 0.5) -> np.ndarray:
 
 
 def psnr(
-    table: BlurTable, places: np.ndarray, lens: Lens, f_number: float, focus_m: float, *, shown: bool
+    loops: ModuleType,
+    table: BlurTable,
+    places: np.ndarray,
+    lens: Lens,
+    f_number: float,
+    focus_m: float,
+    *,
+    shown: bool,
 ) -> np.ndarray:
     """PSNR at signed coc in mm: of what the table shows, or of its kernels without the fade below a pixel."""
     focal, stopped = lens.paraxial().focal_length, lens.with_f_number(f_number)
@@ -60,7 +71,7 @@ def psnr(
     found = []
     for coc in places:
         z_m = distance_m(coc, focal, f_number, focus_m)
-        truth = traced_kernel(point_spread(stopped, z_m, sensor, meridional=True, rays=4_000))
+        truth = traced_kernel(point_spread(stopped, z_m, sensor, meridional=True, rays=4_000), loops)
         px = coc / PIXEL
         made = table.kernels(torch.tensor([px]), WIDTH)[0, 0].numpy() if shown else interpolated(table, px)
         found.append(natural_psnr(made, truth))
@@ -68,25 +79,25 @@ def psnr(
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_table_matches_traced_spots_between_its_nodes(name: str) -> None:
+def test_shipped_table_matches_traced_spots_between_its_nodes(name: str, loops: ModuleType) -> None:
     lens, f_number, focus_m, nodes, wanted = SHIPPED[name]
     table = BlurTable.load(name)
     assert len(table.coc) == nodes
     places = between(table)
     blurred = places[np.abs(places) >= PIXEL]
-    shown = psnr(table, blurred, Lens.read(lens), f_number, focus_m, shown=True)
-    plain = psnr(table, places, Lens.read(lens), f_number, focus_m, shown=False)
+    shown = psnr(loops, table, blurred, Lens.read(lens), f_number, focus_m, shown=True)
+    plain = psnr(loops, table, places, Lens.read(lens), f_number, focus_m, shown=False)
     print(f"{name}: {shown.min():.1f} dB (median {np.median(shown):.1f}), with focus {plain.min():.1f} dB")
     assert shown.min() >= wanted
     assert plain.min() >= 50.0
 
 
 @pytest.mark.parametrize("share", [0.15, 1 / 3, 2 / 3, 0.85])
-def test_match_is_no_special_property_of_the_midpoints(share: float) -> None:
+def test_match_is_no_special_property_of_the_midpoints(share: float, loops: ModuleType) -> None:
     # the fit saw spots at 1/4, 1/2 and 3/4 of each interval
     table = BlurTable.load("double_gauss_50mm_f2")
     lens = Lens.read("double_gauss_50mm")
-    assert psnr(table, between(table, share), lens, 2.0, 2.0, shown=False).min() >= 50.0
+    assert psnr(loops, table, between(table, share), lens, 2.0, 2.0, shown=False).min() >= 50.0
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -120,14 +131,14 @@ def test_kernels_change_smoothly_with_depth() -> None:
     assert float((steps[1:-1] / neighbours.clamp_min(1e-3)).max()) < 3.0
 
 
-def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch: pytest.MonkeyPatch, loops: ModuleType) -> None:
     lens = Lens.read("double_gauss_50mm")
     found = {}
     for sweeps in (0, 6):
         monkeypatch.setattr("torchdof.fit.lens.nodes._SWEEPS", sweeps)
         table = small(lens, f_number=4.0, nodes=9, points=33)
         places = between(table)
-        found[sweeps] = psnr(table, places[np.abs(places) > PIXEL], lens, 4.0, 2.0, shown=True)
+        found[sweeps] = psnr(loops, table, places[np.abs(places) > PIXEL], lens, 4.0, 2.0, shown=True)
     assert found[6].min() > found[0].min() + 3.0
 
 
@@ -188,12 +199,12 @@ def test_off_axis_table_states_its_asymmetry() -> None:
 
 
 @pytest.mark.parametrize(("family", "wanted"), [("softm", 55.0), ("disc", 40.0), ("gaussian", 25.0), ("ring", 35.0)])
-def test_named_shapes_follow_a_stopped_down_lens(family: str, wanted: float) -> None:
+def test_named_shapes_follow_a_stopped_down_lens(family: str, wanted: float, loops: ModuleType) -> None:
     lens = Lens.read("double_gauss_50mm")
     table = small(lens, f_number=4.0, family=family, rays=1_000)
     assert table.family == family
     ends = table.coc.numpy()[[0, -1]]
-    assert psnr(table, ends, lens, 4.0, 2.0, shown=True).min() > wanted
+    assert psnr(loops, table, ends, lens, 4.0, 2.0, shown=True).min() > wanted
 
 
 def test_command_in_the_provenance_makes_the_table_again() -> None:
