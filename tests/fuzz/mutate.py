@@ -32,7 +32,7 @@ def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random
 def _bytes(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
     made = bytearray(content or b"\0")
     limit = len(made) if rng.random() < 0.5 else min(len(made), 400)  # mostly headers, where sizes and offsets are
-    for _ in range(rng.choice((1, 1, 2, 4))):
+    for _change in range(rng.choice((1, 1, 2, 4))):
         place = rng.randrange(limit)
         made[place] = rng.choice((0, 255, 1 << rng.randrange(8) ^ made[place], rng.randrange(256)))
     return bytes(made)
@@ -71,7 +71,7 @@ def _token(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
 
 def _float(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
     made = bytearray(content)
-    for _ in range(rng.choice((1, 3, 20))):
+    for _change in range(rng.choice((1, 3, 20))):
         place = 5 + 4 * rng.randrange(max(1, (len(made) - 5) // 4))
         made[place : place + 4] = struct.pack("<f", rng.choice(_FLOATS) if rng.random() < 0.6 else rng.gauss(0, 20))
     return bytes(made)

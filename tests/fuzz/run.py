@@ -16,10 +16,11 @@ import sys
 import tempfile
 import time
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import ModuleType
 
-_LONGEST_S = 30.0  # for one input
+_LONGEST_S = 120.0  # for one input, on a busy machine
 _MEMORY = 6 * 2**30
 
 
@@ -59,37 +60,42 @@ def work(pipe: Connection, folder: str) -> None:
 
 
 class Worker:
-    """The process in which targets run."""
+    """The process in which targets run; it is started when it is needed."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.process, self.pipe = folder, None, None
+        self.folder = folder
+        self.running: tuple[SpawnProcess, Connection] | None = None
 
     def run(self, name: str, path: Path) -> str | None:
         """What is wrong with how a target takes a file."""
-        if self.process is None:
-            self.pipe, end = multiprocessing.Pipe()
-            self.process = multiprocessing.get_context("spawn").Process(target=work, args=(end, str(self.folder)))
-            self.process.start()
-            end.close()
-            self.pipe.recv()
+        process, pipe = self.running or self._start()
         try:
-            self.pipe.send((name, str(path)))
-            if not self.pipe.poll(_LONGEST_S):
+            pipe.send((name, str(path)))
+            if not pipe.poll(_LONGEST_S):
                 self.stop()
                 return f"takes longer than {_LONGEST_S:g} s"
-            return self.pipe.recv()
+            answer: str | None = pipe.recv()
+            return answer
         except (EOFError, OSError):
-            self.process.join()
-            code = self.process.exitcode
-            self.stop()
-            return f"ends the process with {code}"
+            process.join()
+            self.running = None
+            return f"ends the process with {process.exitcode}"
+
+    def _start(self) -> tuple[SpawnProcess, Connection]:
+        pipe, end = multiprocessing.Pipe()
+        process = multiprocessing.get_context("spawn").Process(target=work, args=(end, str(self.folder)))
+        process.start()
+        end.close()
+        pipe.recv()
+        self.running = process, pipe
+        return self.running
 
     def stop(self) -> None:
         """End the process."""
-        if self.process is not None:
-            self.process.kill()
-            self.process.join()
-        self.process = None
+        if self.running is not None:
+            self.running[0].kill()
+            self.running[0].join()
+        self.running = None
 
 
 def main() -> None:

@@ -140,7 +140,7 @@ def _array_seeds(suffix: str) -> Callable[[Path], None]:
 def _read_array(path: Path) -> None:
     for fill in ("far", 3.0, None):
         try:
-            depth = read_depth(path, fill=fill)  # type: ignore[arg-type]
+            depth = read_depth(path, fill=fill)
         except REFUSED as error:
             assert path.name in str(error), f"not named: {error}"
         else:

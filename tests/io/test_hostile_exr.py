@@ -31,7 +31,7 @@ def values_of(spec: oiio.ImageSpec) -> np.ndarray:
 
 def store(path: Path, *specs: oiio.ImageSpec) -> None:
     output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), specs if len(specs) > 1 else specs[0]), output.geterror()
+    assert output is not None and output.open(str(path), specs if len(specs) > 1 else specs[0])
     for number, spec in enumerate(specs):
         assert not number or output.open(str(path), spec, "AppendSubimage")
         assert output.write_image(values_of(spec)), output.geterror()

@@ -430,6 +430,13 @@ def test_tables_without_kernels_are_refused_on_load(
         BlurTable.load(path)
 
 
+def test_a_table_of_endless_nodes_is_refused() -> None:
+    coc = torch.arange(1, 5001, dtype=torch.float64) / 5000
+    with pytest.raises(ValueError, match="coc must be at most 4096 nodes, got 5000"):
+        BlurTable("disc", coc, {"radius": coc}, unit="fraction")
+    assert BlurTable("disc", coc[:300], {"radius": coc[:300]}, unit="fraction").channels == 1
+
+
 @pytest.mark.parametrize(("m", "sigma"), [(2.0, 0.003), (8.0, 0.003), (100.0, 0.0005), (100.0, 0.003)])
 @pytest.mark.parametrize("coc", [0.0, 1e-6, 0.3, 0.8, 3.0, 40.0])
 def test_steep_tilts_have_kernels_at_any_blur(m: float, sigma: float, coc: float) -> None:

@@ -1,6 +1,7 @@
 """Blur tables: signed circle of confusion to kernel parameters, as measured from a camera or a lens."""
 
 import hashlib
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,9 +15,11 @@ from . import psf, table_file
 __all__ = ["BlurTable"]
 
 UNITS = ("fraction", "mm", "relative")
+_MOST_NODES = 4096
 _COC_RANGE = (1e-9, 1e6)
 _WIDEST = 1e4  # times the circle of confusion; a blur that is not of the focus shows at small ones
 _STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
+_TRIED_AT_ONCE = 64
 _TRIED_PX = (0.5, 6.0)  # radii of the widest kernel tried
 
 
@@ -81,6 +84,8 @@ class BlurTable:
             raise ValueError(
                 f"coc must be strictly increasing signed numbers, one a node and not only 0, got {_short(self.coc)}"
             )
+        if len(self.coc) > _MOST_NODES:
+            raise ValueError(f"coc must be at most {_MOST_NODES} nodes, got {len(self.coc)}")
         if unit == "relative" and max(int((self.coc > 0).sum()), int((self.coc < 0).sum())) > 1:
             raise ValueError(
                 f"unit 'relative' takes one node on each side of focus at most, got {len(self.coc)}; "
@@ -351,9 +356,10 @@ class BlurTable:
             return
         places = torch.cat([self.coc, (self.coc[1:] + self.coc[:-1]) / 2, 2.0 * self.coc[[0, -1]]])
         tried = self.params(places * per_px, 1.0)
-        for pixels in _TRIED_PX:
+        for pixels, start in itertools.product(_TRIED_PX, range(0, len(places), _TRIED_AT_ONCE)):
+            some = {name: value[:, start : start + _TRIED_AT_ONCE] for name, value in tried.items()}
             factor = pixels / widest / per_px
-            lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in tried.items()}
+            lengths = {name: value * factor if name in psf.LENGTHS else value for name, value in some.items()}
             if not bool(torch.isfinite(psf.pixel_kernels(self.family, lengths)).all()):
                 named = ", ".join(f"{name} up to {float(value.max()):g}" for name, value in self._params.items())
                 raise ValueError(f"params of {self.family} make kernels that are no numbers: {named}")
