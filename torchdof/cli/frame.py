@@ -98,13 +98,13 @@ def render_frame(
     remarks: list[str] = []
     if settings.depth_kind == "coc":
         camera, coc_px = None, values
-        said.say(image, coc_doubts(coc_px))
+        said.say(depth or image, coc_doubts(coc_px))
     else:
         camera, remarks = settings.camera(picture.metadata, width, frame)
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
-        said.say(image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
+        said.say(depth or image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
         parts.append(
             f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
             f"{camera.sensor_width_mm:.4g} mm"

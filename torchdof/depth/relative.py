@@ -58,7 +58,7 @@ def from_relative(
 
     Example:
         >>> from_relative(torch.tensor([[[[0, 128, 255]]]], dtype=torch.uint8), near_m=1.0, far_m=5.0)
-        tensor([[[[5.0000, 1.6624, 1.0000]]]])
+        tensor([[[[5.0000, 1.6623, 1.0000]]]])
     """
     if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
         raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")
