@@ -36,9 +36,9 @@ class Doubt:
     """What looks like a mistake.
 
     Args:
-        name: "focus": nothing is in focus, or the focus is far from all depth; "far": everything is so far that nothing is blurred; "bits": whole numbers
-            as files of 8 bits hold; "blur": blur that no lens makes; "range": relative depth of a sequence without the
-            range of its values.
+        name: "focus": nothing is in focus, or the focus is far from all depth; "far": everything is so far that nothing
+            is blurred; "bits": whole numbers as files of 8 bits hold; "blur": blur that no lens makes; "range":
+            relative depth of a sequence without the range of its values.
         message: What is the case, the likely mistake and what mends it.
     """
 
