@@ -196,12 +196,13 @@ def read_metres(
     if values.shape[-2:] != picture.pixels.shape[-2:]:
         (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
         raise ValueError(f"{name}: depth is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
-    if settings.depth_kind == "relative" and settings.near_m is not None and settings.far_m is not None:
+    kind = settings.depth_kind
+    if kind == "relative":
         try:
             return from_relative(
                 values,
-                settings.near_m,
-                settings.far_m,
+                settings.near_m or 0.0,  # the settings refuse to be without
+                settings.far_m or 0.0,
                 settings.relative_kind or "disparity",
                 value_range=settings.value_range,
                 unknown=settings.depth_unknown,
@@ -209,7 +210,7 @@ def read_metres(
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
     fov_x_deg = settings.fov_x_deg
-    if settings.depth_kind == "distance" and fov_x_deg is None:
+    if kind == "distance" and fov_x_deg is None:
         facts = camera_facts(picture.metadata, values.shape[-1])
         focal_mm = settings.focal_length_mm or facts.get("focal_length_mm")
         sensor_mm = settings.sensor_width_mm or facts.get("sensor_width_mm")
@@ -218,7 +219,7 @@ def read_metres(
         fov_x_deg = 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
     return depth_from_values(
         values,
-        settings.depth_kind,
+        kind,
         scale=settings.depth_scale,
         offset=settings.depth_offset,
         unknown=settings.depth_unknown,
