@@ -190,12 +190,12 @@ def test_unit_mistake_is_one_warning_a_sequence_and_an_error_where_strict(scene:
     arguments = ["render", "shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "3", *LENS]
     told = CliRunner().invoke(app, arguments)
     assert told.exit_code == 0 and len(list(scene.glob("out.*"))) == 3
-    assert told.stderr.startswith("warning: shot.0001.exr: nothing is in focus") and told.stderr.count("\n") == 1
+    assert told.stderr.startswith("warning: depth.0001.npy: nothing is in focus") and told.stderr.count("\n") == 1
     assert "is it millimetres (--depth-scale 0.001)" in told.stderr
     for path in scene.glob("out.*"):
         path.unlink()
     message = run(*arguments[1:], "--strict", code=2)
-    assert message.startswith("error: shot.0001.exr: nothing is in focus") and list(scene.glob("out.*")) == []
+    assert message.startswith("error: depth.0001.npy: nothing is in focus") and list(scene.glob("out.*")) == []
     assert CliRunner().invoke(app, [*arguments, "--depth-scale", "0.001", "--focus-m", "2"]).stderr == ""
 
 

@@ -55,7 +55,7 @@ def test_an_edge_that_the_image_does_not_show_is_unclear() -> None:
 
 
 def test_a_slope_is_no_edge() -> None:
-    depth = torch.linspace(1.0, 8.0, 60).expand(1, 1, 20, 60)
+    depth = 1 / torch.linspace(1.0, 0.125, 60).expand(1, 1, 20, 60)
     assert sum(inspect_depth(torch.rand(1, 3, 20, 60), depth, Camera()).counts) == 0
 
 

@@ -88,6 +88,14 @@ def test_unit_mistakes_are_named_with_what_mends_them(
         check(metres * factor, Camera(focus_m=focus_m), strict=True)
 
 
+def test_units_are_told_on_maps_so_small_that_nothing_is_blurred_by_a_pixel() -> None:
+    small = field(1.0, 6.0)[..., :48, :64]
+    for factor, says in ((1000.0, "millimetres"), (100.0, "centimetres"), (0.001, "1000 times too small")):
+        with pytest.warns(DepthWarning, match=says):
+            check(small * factor, Camera(focus_m=2.0))
+    check(small, Camera(focus_m=2.0), strict=True)
+
+
 def test_whole_millimetres_are_told_whatever_the_focus(metres: torch.Tensor) -> None:
     with pytest.warns(DepthWarning, match="millimetres"):
         check((metres * 1000).round(), Camera(focus_m=INF))

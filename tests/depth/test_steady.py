@@ -187,7 +187,7 @@ def test_holes_take_what_was_there_and_infinity_stays() -> None:
 
 
 def test_items_of_a_batch_do_not_know_each_other() -> None:
-    one, other = ([(i, as_estimated(z, t)) for t, (i, z) in enumerate(shot(4, **k))] for k in ({}, {"pan_px": 1.5}))
+    one, other = ([(i, as_estimated(z, t)) for t, (i, z) in enumerate(shot(4, pan_px=p))] for p in (0.0, 1.5))
     both = [(torch.cat([a[0], b[0]]), torch.cat([a[1], b[1]])) for a, b in zip(one, other, strict=True)]
     alone = steadied(other)
     for together, single in zip(steadied(both), alone, strict=True):

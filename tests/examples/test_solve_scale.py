@@ -15,7 +15,7 @@ def test_gradient_descent_finds_the_blur_and_with_the_lens_known_metres(
     tmp_path: Path, known: list[str], metres: bool
 ) -> None:
     scene = ROOT / "tests" / "data" / "scenes" / "room"
-    command = [sys.executable, ROOT / "examples" / "solve_scale.py", "--scene", scene, "--out", tmp_path]
+    command = [sys.executable, str(ROOT / "examples" / "solve_scale.py"), "--scene", str(scene), "--out", str(tmp_path)]
     run = subprocess.run([*command, "--known", *known], capture_output=True, text=True, timeout=300, check=False)
     assert run.returncode == 0, run.stderr
     rows = {line.split()[0]: [float(x) for x in line.split()[1:]] for line in re.findall(r"  \w+ +[\d. ]+", run.stdout)}

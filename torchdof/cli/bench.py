@@ -193,6 +193,8 @@ def from_files(image: Path, depth: Path | None, how: RenderSettings) -> BenchSce
     values = picture.depth if depth is None else read_values(depth, how.depth_channel)
     if values is None:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: torchdof bench IMAGE DEPTH")
+    if how.depth_kind == "relative":
+        raise ValueError("torchdof bench takes depth whose scale is known; --depth-kind relative is for render")
     values = depth_from_values(values, how.depth_kind, scale=how.depth_scale, offset=how.depth_offset)
     values, _ = resolve_holes(values, str(depth or image), how.fill)
     light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels

@@ -98,14 +98,14 @@ def render_frame(
     remarks: list[str] = []
     if settings.depth_kind == "coc":
         camera, coc_px = None, values
-        said.say(image, coc_doubts(coc_px))
+        said.say(depth or image, coc_doubts(coc_px))
     else:
         camera, remarks = settings.camera(picture.metadata, width, frame)
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
         coc_of_lens(coc_px, values, settings.stated(camera))
-        said.say(image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
+        said.say(depth or image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
         parts.append(
             f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
             f"{camera.sensor_width_mm:.4g} mm"
@@ -196,16 +196,17 @@ def read_metres(
             f"{image}: has no depth channel; name a depth file after it: torchdof render IMAGE DEPTH -o OUT"
         )
     name = str(depth if depth is not None else image)
+    kind = settings.depth_kind
     (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
-    if settings.depth_kind == "coc" and (h, w) != (ih, iw):
+    if kind == "coc" and (h, w) != (ih, iw):
         raise ValueError(f"{name}: coc is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
     try:
         same_aspect(picture.pixels, values)
-        if settings.depth_kind == "relative" and settings.near_m is not None and settings.far_m is not None:
+        if kind == "relative":
             metres = from_relative(
                 values,
-                settings.near_m,
-                settings.far_m,
+                settings.near_m or 0.0,  # the settings refuse to be without
+                settings.far_m or 0.0,
                 settings.relative_kind or "disparity",
                 value_range=settings.value_range,
                 unknown=settings.depth_unknown,
@@ -214,7 +215,7 @@ def read_metres(
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
     fov_x_deg = settings.fov_x_deg
-    if settings.depth_kind == "distance" and fov_x_deg is None:
+    if kind == "distance" and fov_x_deg is None:
         facts = camera_facts(picture.metadata, iw)
         focal_mm = settings.focal_length_mm or facts.get("focal_length_mm")
         sensor_mm = settings.sensor_width_mm or facts.get("sensor_width_mm")
@@ -223,10 +224,10 @@ def read_metres(
         fov_x_deg = 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
     metres = depth_from_values(
         values,
-        settings.depth_kind,
+        kind,
         scale=settings.depth_scale,
         offset=settings.depth_offset,
         unknown=settings.depth_unknown,
         fov_x_deg=fov_x_deg,
     )
-    return metres if settings.depth_kind == "coc" else at_size_of(picture.pixels, metres)
+    return metres if kind == "coc" else at_size_of(picture.pixels, metres)

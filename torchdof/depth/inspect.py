@@ -187,16 +187,14 @@ def _kinds(inverse: Tensor, shown: Tensor) -> Tensor:
     slope = torch.maximum(at(steps, -_REACH), at(steps, _REACH))
     is_edge = (jump - 2 * _REACH * slope > _JUMP * torch.maximum(left, right)) & (step >= around.amax(0)) & (step > 0)
     is_step = step >= _STEP * jump
-    mean_left, mean_right = (
-        torch.stack([at(shown, k) for k in places]).mean(0) for places in ((-4, -3, -2), (3, 4, 5))
-    )
-    spread = sum(
-        torch.stack([(at(shown, k) - mean).abs() for k in places]).mean(0).amax(1, keepdim=True)
-        for places, mean in (((-4, -3, -2), mean_left), ((3, 4, 5), mean_right))
-    )
+    side_left, side_right = (torch.stack([at(shown, k) for k in places]) for places in ((-4, -3, -2), (3, 4, 5)))
+    mean_left, mean_right = side_left.mean(0), side_right.mean(0)
+    spread = (side_left - mean_left).abs().mean(0) + (side_right - mean_right).abs().mean(0)
     across = mean_right - mean_left
     contrast = across.square().sum(1, keepdim=True)
-    is_told = contrast.sqrt() > torch.maximum(torch.full_like(contrast, _CONTRAST), _SPREADS * spread)
+    is_told = contrast.sqrt() > torch.maximum(
+        torch.full_like(contrast, _CONTRAST), _SPREADS * spread.amax(1, keepdim=True)
+    )
     share_left, share_right = (
         ((at(shown, k) - mean_left) * across).sum(1, keepdim=True) / contrast.clamp(min=1e-12) for k in (0, 1)
     )

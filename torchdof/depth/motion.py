@@ -28,9 +28,9 @@ def motion_between(frame: Tensor, before: Tensor, changed: Tensor) -> Tensor:
     batch, _, height, width = frame.shape
     if float(changed.float().mean()) <= _STILL:
         return frame.new_zeros(batch, 2, height, width)
-    levels = [tuple(_halved(picture.mean(1, keepdim=True)) for picture in (frame, before))]
+    levels = [(_halved(frame.mean(1, keepdim=True)), _halved(before.mean(1, keepdim=True)))]
     while min(levels[-1][0].shape[-2:]) >= 2 * _COARSEST_PX and len(levels) < _LEVELS:
-        levels.append(tuple(_halved(picture) for picture in levels[-1]))
+        levels.append((_halved(levels[-1][0]), _halved(levels[-1][1])))
     flow = levels[-1][0].new_zeros(batch, 2, *levels[-1][0].shape[-2:])
     for depth, (now, then) in enumerate(reversed(levels)):
         if depth:

@@ -58,7 +58,7 @@ def from_relative(
 
     Example:
         >>> from_relative(torch.tensor([[[[0, 128, 255]]]], dtype=torch.uint8), near_m=1.0, far_m=5.0)
-        tensor([[[[5.0000, 1.6624, 1.0000]]]])
+        tensor([[[[5.0000, 1.6623, 1.0000]]]])
     """
     if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
         raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")
@@ -144,8 +144,9 @@ def solve_scale(
 
     Example:
         >>> values = torch.tensor([[[[1.0, 2.0, 4.0]]]])
-        >>> solve_scale(values, [(0.5, 0.5, 4.0), (2.5, 0.5, 1.0)], patch=1)
-        Scale(kind='disparity', scale=4.0, offset=0.0, residual=0.0)
+        >>> scale = solve_scale(values, [(0.5, 0.5, 4.0), (2.5, 0.5, 1.0)], patch=1)
+        >>> round(scale.scale, 6), round(abs(scale.offset), 6)
+        (4.0, 0.0)
     """
     if not isinstance(kind, str) or kind not in RELATIVE_KINDS:
         raise ValueError(f"the kind of relative depth must be one of {', '.join(RELATIVE_KINDS)}, got {show(kind)}")

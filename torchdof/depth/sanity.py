@@ -21,6 +21,7 @@ __all__ = ["DepthWarning", "Doubt", "check", "coc_doubts", "depth_doubts"]
 _FACTORS = (0.001, 0.01, 1000.0, 100.0)  # millimetres and centimetres; and what was taken for such and is none
 _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # what counts as in focus: the larger of both
 _NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
+_FAR_OFF = 30.0  # times that the focus may be nearer or farther than all depth where the blur tells nothing
 _FAR_M, _HAND_M = 500.0, 0.1
 _LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # a real macro lens reaches half the frame's width
 _WIDEST_F_NUMBER = 0.5  # of an aplanatic lens in air
@@ -35,9 +36,9 @@ class Doubt:
     """What looks like a mistake.
 
     Args:
-        name: "focus": nothing is in focus; "far": everything is so far that nothing is blurred; "bits": whole numbers
-            as files of 8 bits hold; "blur": blur that no lens makes; "range": relative depth of a sequence without the
-            range of its values.
+        name: "focus": nothing is in focus, or the focus is far from all depth; "far": everything is so far that nothing
+            is blurred; "bits": whole numbers as files of 8 bits hold; "blur": blur that no lens makes; "range":
+            relative depth of a sequence without the range of its values.
         message: What is the case, the likely mistake and what mends it.
     """
 
@@ -61,10 +62,11 @@ def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
 
     Example:
         >>> millimetres = torch.linspace(800.0, 5000.0, 96).expand(1, 1, 64, 96)
-        >>> check(millimetres, Camera(focus_m=2.0), strict=True)  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        ValueError: nothing is in focus: the focus at 2 m is nearer than all depth (800 to 5000 m), ...
+        >>> try:
+        ...     check(millimetres, Camera(focus_m=2.0), strict=True)
+        ... except ValueError as error:
+        ...     print(str(error).partition("?")[0])
+        the focus at 2 m is nearer than all depth (800 to 5000 m); is it millimetres (--depth-scale 0.001)
     """
     for doubt in depth_doubts(depth, camera):
         if strict:
@@ -140,9 +142,15 @@ def _doubts(depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"]
     near, far = float(finite.min()), float(finite.max())
     extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
     of_bits = far <= 65535 and _whole_numbers(finite)
-    sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
-    if float(coc_px.min()) > sharp_px:
-        return [Doubt("focus", _nothing_sharp(near, far, extent, focus_m, of_bits, kind, scale))]
+    sharp_px, largest = max(_SHARP_PX, _SHARP_WIDTHS * width), float(coc_px.max())
+    is_wide_open = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
+    is_too_blurred = is_wide_open or _share_at(coc_px, 0.99) > _LARGEST_WIDTHS * width
+    is_sharp = float(coc_px.min()) <= sharp_px
+    factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
+    is_far_off = factor is not None and not near / _FAR_OFF <= focus_m <= far * _FAR_OFF
+    if (not is_sharp and not (is_too_blurred and near <= focus_m <= far)) or is_far_off:
+        told = _out_of_focus(near, far, extent, focus_m, of_bits, factor, kind, scale)
+        return [Doubt("focus", told if is_sharp else f"nothing is in focus: {told}")]
     found = []
     if of_bits and far <= 255 and far - near >= 64:
         found.append(
@@ -150,33 +158,28 @@ def _doubts(depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"]
                 "bits", f"all depth is whole numbers {extent}, as files of 8 bits hold; if it is relative, {_RELATIVE}"
             )
         )
-    elif _share_at(finite, 0.05) > _FAR_M and float(coc_px.max()) <= sharp_px and (of_bits or focus_m < math.inf):
+    elif _share_at(finite, 0.05) > _FAR_M and largest <= sharp_px and (of_bits or focus_m < math.inf):
         unit = _advice(0.001, scale)
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
         found.append(Doubt("far", message))
-    largest = float(coc_px.max())
-    too_wide = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
-    if too_wide or _share_at(coc_px, 0.99) > _LARGEST_WIDTHS * width:
+    if is_too_blurred:
         found.append(Doubt("blur", _too_blurred(largest, width, far, extent, camera)))
     return found
 
 
-def _nothing_sharp(
+def _out_of_focus(
     near: float,
     far: float,
     extent: str,
     focus_m: float,
     of_bits: bool,
+    factor: float | None,
     kind: DepthKind | Literal["relative"],
     scale: float | None,
 ) -> str:
-    """What to say where nothing is in focus."""
+    """What to say where the focus lies beside all depth."""
     if near <= focus_m <= far:
-        return (
-            f"nothing is in focus: no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something "
-            "with --focus-at X,Y"
-        )
-    factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
+        return f"no pixel lies near the focus at {focus_m:.4g} m, all {extent}; focus on something with --focus-at X,Y"
     side, hints = "nearer" if focus_m < near else "farther", []
     if kind in ("disparity", "inverse"):
         hints.append(
@@ -194,7 +197,7 @@ def _nothing_sharp(
     if far < _HAND_M:
         hints.append("all of it lies within a hand's breadth")
     hints.append("if the depth is right, focus with --focus-m METRES or --focus-at X,Y")
-    return f"nothing is in focus: the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
+    return f"the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
 
 
 def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Camera) -> str:
