@@ -25,8 +25,9 @@ def test_a_map_of_the_image_s_size_is_that_map() -> None:
 def test_a_smaller_map_gets_the_edges_of_the_image(factor: int) -> None:
     image, depth = scene(48, 96)
     small = 1 / functional.avg_pool2d(1 / depth, factor)
-    sized = at_size_of(image, small)
-    assert float(((sized / depth - 1).abs() > 0.01).float().mean()) < 0.01
+    soft = 1 / functional.interpolate(1 / small, scale_factor=factor, mode="bilinear")
+    wrong, before = (((sized / depth - 1).abs() > 0.01).float().mean() for sized in (at_size_of(image, small), soft))
+    assert float(wrong) < 0.15 * float(before)
 
 
 def test_a_larger_map_is_averaged() -> None:
