@@ -37,7 +37,7 @@ _TAPS = 2**21  # rays splatted together
 
 
 class Highlights(NamedTuple):
-    """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.render.pixels`), and their coc."""
+    """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.pixels`), and their coc."""
 
     pixels: Tensor
     light: Tensor
