@@ -81,11 +81,10 @@ def test_a_thin_structure_keeps_its_depth(scene: Scene) -> None:
     ]
     thin = plane_scene(planes, scene.camera, (96, 160), samples=16)
     bars = thin.depth < 3
-    for kind in ("half-res", "blur 1.5"):
-        given = degrade(thin.depth, kind)
-        mended = repair_edges(thin.image, given, "auto")
-        assert float((1 / given)[bars].mean()) < 0.48  # 1 / 1.5 m, spread over what is behind
-        assert 0.5 < float((1 / mended)[bars].mean()) < 0.75
+    given = degrade(thin.depth, "half-res")
+    mended = repair_edges(thin.image, given, "auto")
+    assert float((1 / given)[bars].mean()) < 0.48  # 1 / 1.5 m, spread over what is behind
+    assert 0.55 < float((1 / mended)[bars].mean()) < 0.7
 
 
 def test_a_lamp_whose_depth_was_averaged_away_gets_it_back() -> None:

@@ -25,7 +25,7 @@ __all__ = ["DepthEdges", "repair", "repair_edges"]
 DepthEdges = Literal["auto", "repair", "as given"]
 """What is done to depth edges before rendering: repaired where the map proves inexact, or all of them, or nothing."""
 
-_STEP = 0.05  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
+_STEP = 0.1  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
 _RINGS = 3  # pixels beside a step that may be on its wrong side
 _REACH = 5  # pixels around one that tell what the two surfaces look like
 _FALLOFF_PX = 2.5
@@ -43,7 +43,7 @@ _BLUR_REACH = 9
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
 _EXACT = 0.05  # share of wrong pixels up to which a map's steps count as exact
 _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
-_RELATED = 0.75  # share of clear cases in which colours must agree with a map to be heard on it
+_RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
 _SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
 _BLOCK = 16
 _CHUNK = 40_000
@@ -242,7 +242,8 @@ def _judge(
     """
     colour = light.sqrt()
     offsets = torch.arange(-_REACH, _REACH + 1, device=light.device, dtype=light.dtype)
-    falloff = torch.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * _FALLOFF_PX**2)).flatten()[:, None]
+    apart = offsets[:, None] ** 2 + offsets**2  # a pixel is no witness of its own
+    falloff = torch.where(apart > 0, torch.exp(-apart / (2 * _FALLOFF_PX**2)), 0.0).flatten()[:, None]
     parts = [edge_pixels] if validation.is_traced() else edge_pixels.split(_CHUNK)
     judged = []
     for part in parts:
@@ -291,17 +292,21 @@ def _judge(
     said = torch.where(said.isnan(), 0.0, said)
     score = (_SHARPNESS * tells * (alike * said).sum(0) / alike.sum(0).clamp_min(1e-12)).clamp(-6.0, 6.0)
     evidence = (2.0 * tells * said.abs().amax(0) - 1.0).clamp(0.0, 1.0)
+    # from the ends of a wide ramp only one of the surfaces is in sight
+    known = _highest(pixels.put(torch.zeros_like(nearness), edge_pixels, evidence), 3)
+    evidence = pixels.pick(known, edge_pixels)[0]
     return score, evidence, near, far
 
 
 def _is_related(nearness: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:
     """Whether what an item's colours say agrees with its map where that is hardly in doubt, ``[B, 1, 1, 1]``.
 
-    That is some pixels from steps, and at the ends of ramps. An image that knows nothing of the depth agrees by half.
+    That is as far from steps as they are looked at, and at the ends of ramps. An image that knows nothing of the depth
+    agrees by half.
     """
     level = pixels.pick((nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12), sampled)[0]
     is_ramp, ring = pixels.pick(edges.is_ramp, sampled)[0], pixels.pick(edges.ring, sampled)[0]
-    clear = torch.where(is_ramp, (level - 0.5).abs() > 0.3, ring > 1)
+    clear = torch.where(is_ramp, (level - 0.5).abs() > 0.3, ring == _RINGS)
     weight = (0.5 * score.abs()).clamp(max=1.0) * clear
     agrees = ((score > 0) == (level > 0.5)).to(score.dtype)
     item = sampled // nearness[0].numel()

@@ -246,7 +246,12 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> T
         ctypes.pointer(cancelled),
         out.data_ptr(),
     )
-    _interruptible(lambda: _check(_engine().torchdof_repair_edges(ctypes.byref(scene))), cancelled)
+    memory = (light, nearness, step, out)
+
+    def run(held: object = memory) -> None:  # as long as this runs, whatever interrupts the caller
+        _check(_engine().torchdof_repair_edges(ctypes.byref(scene)))
+
+    _interruptible(run, cancelled)
     return out
 
 

@@ -12,7 +12,7 @@ namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
 constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.05f, RELATED = 0.75f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f;
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 16, BLUR_REACH = 9;
 constexpr int AREA = 64, HALO = 21;  // what a pixel shows depends on what is so far around it
 constexpr float NONE = 1e30f;
@@ -327,6 +327,7 @@ class Repair {
     float falloff[WINDOW];
     for (int v = -REACH; v <= REACH; v++)
       for (int u = -REACH; u <= REACH; u++) falloff[(v + REACH) * SIDE + u + REACH] = std::exp(-(float)(v * v + u * u) / 12.5f);
+    falloff[WINDOW / 2] = 0.0f;  // none is its own witness
     const int chunk = 512;
     parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
       std::vector<float> colours(2 * WINDOW * channels_), means(2 * channels_);
@@ -430,6 +431,17 @@ class Repair {
         evidence[k] = clamp01(2.0f * judged[k].tells * strongest - 1.0f);
       }
     });
+    // from the ends of a wide ramp only one of the surfaces is in sight
+    parallel(height_, [&](int y) { std::fill(said.data() + (size_t)y * width_, said.data() + (size_t)(y + 1) * width_, 0.0f); });
+    for (size_t k = 0; k < pixels.size(); k++) said[pixels[k]] = evidence[k];
+    parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
+      for (size_t k = (size_t)part * chunk; k < std::min(pixels.size(), (size_t)(part + 1) * chunk); k++) {
+        const int i = pixels[k], y = i / width_, x = i % width_;
+        for (int v = std::max(0, y - 3); v <= std::min(height_ - 1, y + 3); v++)
+          for (int u = std::max(0, x - 3); u <= std::min(width_ - 1, x + 3); u++)
+            evidence[k] = std::max(evidence[k], said[(size_t)v * width_ + u]);
+      }
+    });
   }
 
   // Whether what colours say agrees with the map where that is hardly in doubt.
@@ -438,7 +450,7 @@ class Repair {
     for (size_t k = 0; k < pixels.size(); k++) {
       const size_t i = pixels[k];
       const float score = judged[k].score, level = (given_[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f);
-      if (ramp_[i] ? std::fabs(level - 0.5f) <= 0.3f : kind_[i] / 4 % RINGS == 0) continue;
+      if (ramp_[i] ? std::fabs(level - 0.5f) <= 0.3f : kind_[i] / 4 % RINGS != RINGS - 1) continue;
       const float weight = std::min(0.5f * std::fabs(score), 1.0f);
       total += weight;
       if ((score > 0) == (level > 0.5f)) agreed += weight;

@@ -1,0 +1,35 @@
+"""The demo's pictures, of stereo depth: how many pixels stick out of what is blurred."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as functional
+
+from torchdof.depth.reading import read_depth
+from torchdof.io.images import read_image
+from torchdof.optics.camera import Camera
+from torchdof.reference.metrics import display
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "examples" / "data" / "motorcycle"
+MOST = {"near": 625, "middle": 1030, "far": 455}
+"""Pixels that may differ from the median of their 3 x 3 by more than 8/255 where the blur is wider than 2 px."""
+
+
+def test_few_pixels_stick_out_of_what_is_blurred(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["demo.py", "--data", str(DATA), "--out", str(tmp_path)])
+    demo = runpy.run_path(str(ROOT / "examples" / "demo.py"), run_name="__main__")
+    scale, offset = demo["BASELINE_M"] * demo["FOCAL_PX"], demo["DISPARITY_OFFSET_PX"]
+    depth = read_depth(DATA / "motorcycle_disp.npz", kind="disparity", scale=scale, offset=offset, fill="far")
+    width = depth.shape[-1]
+    fov_x_deg = float(torch.rad2deg(2 * torch.atan(torch.tensor(width / 2 / demo["FOCAL_PX"]))))
+    for name, focus_m in demo["FOCUS_M"].items():
+        shown = display(read_image(tmp_path / f"{name}.png").pixels).mean(1, keepdim=True)
+        around = functional.unfold(functional.pad(shown, (1,) * 4, mode="replicate"), 3)
+        median = around.median(1).values.view_as(shown)
+        coc_px = Camera.from_fov(fov_x_deg, demo["APERTURE_RADIUS_M"], focus_m).coc_px(depth, width)
+        outliers = int((((shown - median).abs() > 8 / 255) & (coc_px.abs() > 2)).sum())
+        assert outliers <= MOST[name], f"{name}: {outliers}"
