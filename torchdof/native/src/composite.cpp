@@ -12,10 +12,6 @@ constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alo
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
 
-inline float axis(float coc, float low, float high) { return clamp(coc - clamp(coc, -0.5f, 0.5f), low, high); }
-inline vec axis(vec coc, float low, float high) {
-  return least(most(coc - least(most(coc, all(-0.5f)), all(0.5f)), all(low)), all(high));
-}
 inline bool any_positive(vec v) {
   typedef long long wide __attribute__((vector_size(LANES * 4)));
   const wide bits = (wide)(v > vec{});
@@ -32,18 +28,11 @@ struct Run {
   std::vector<uint8_t> used;                                   // tiles with anything in them
 };
 
-// Parts of blocks of pixels that lie between two nodes: for each its place in the window, the node before, and
-// 2 (channels + 2) sums: share, seen share and light; and these times how far between the nodes each pixel lies.
-struct Pieces {
-  std::vector<int> at, node, order;
-  std::vector<float> values;  // of more pieces than there are
-  int count = 0;
-  float *add(int place, int after, int stride) {
-    if ((size_t)(count + 1) * stride > values.size()) values.resize(std::max<size_t>(values.size() * 2, 4096 * stride));
-    at.push_back(place);
-    node.push_back(after);
-    return values.data() + (size_t)count++ * stride;
-  }
+// Pieces of blocks in a window: where each lies in it, its node and values. Those of node i are order[start[i]] to
+// order[start[i + 1]].
+struct WindowPieces {
+  std::vector<int> at, node, start, order;
+  std::vector<const float *> values;
 };
 
 // Planes of a window, `pitch` values a row.
@@ -52,14 +41,14 @@ struct Scratch {
   std::vector<float *> light, coc, weight;  // of each surface (light: [surfaces, channels])
   float *known;
   std::vector<float *> term;    // what a layer spreads: light, share, room, seen
-  std::vector<float *> spread;  // the same spread: light, then share, room and seen of each colour
   std::vector<float *> canvas;  // light and coverage of a tile
+  float *traced;                // light of rays in a tile
   std::vector<float *> mine;    // a row of each surface's share
   float *rest;                  // what lies wholly behind a coarse layer
-  std::vector<uint32_t> rows, every;
+  std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for 16 columns
   std::vector<const float *> pointers;
   std::vector<uint64_t> layers;
-  Pieces pieces;
+  WindowPieces pieces;
 };
 
 }  // namespace
@@ -73,8 +62,8 @@ class Composite {
     H_ = job_.height, W_ = job_.width, C_ = job_.channels, E_ = job_.colours, N_ = (int)layers_.size();
     over_ = job_.scene.occlusion;
     extend_ = job_.scene.extend;
-    low_ = (float)layers_.front().node;
-    high_ = (float)layers_.back().node;
+    index_.low = (float)layers_.front().node;
+    index_.high = (float)layers_.back().node;
     int half = 0;
     for (int k = 0; k < N_; k++) {
       const Layer &l = layers_[k];
@@ -106,6 +95,12 @@ class Composite {
       run.used.assign(run.tile_rows * run.tile_columns, 0);
       run.canvas = Buffer<float>((size_t)(C_ + E_) * run.rows * run.columns);
       for (int t = 0; t < run.tile_rows * run.tile_columns; t++) coarse.push_back({r, t});
+      if (s_.independent || downsampled(run.scale)) continue;
+      int margin = 0;
+      for (const Run &same : runs_)
+        if (same.scale == run.scale) margin = std::max(margin, same.half + 1);
+      downsampled_.emplace_back(new Downsampled(job_, run.scale, margin));
+      downsampled_.back()->take(job_, index_);
     }
     job_.parallel((int)coarse.size(), [&](int i, int worker) { coarse_tile(runs_[coarse[i].first], coarse[i].second, scratch(worker)); });
     if (!job_.rays.empty()) sort_rays();
@@ -120,7 +115,7 @@ class Composite {
       Scratch &b = *scratches_[worker];
       const size_t plane = (size_t)window_ * pitch_;
       const int count = s_.count, planes = count * (C_ + 2) + 1 + (C_ + 3) + 1;
-      b.memory.assign(planes * plane + (size_t)(2 * C_ + 4 * E_) * TILE_PIXELS + (size_t)count * pitch_ * 2 + 16, 0.0f);
+      b.memory.assign(planes * plane + (size_t)(2 * C_ + E_) * TILE_PIXELS + (size_t)count * pitch_ * 2 + 16, 0.0f);
       float *p = b.memory.data();
       auto take = [&](size_t size) { return (p += size) - size; };
       for (int i = 0; i < count * C_; i++) b.light.push_back(take(plane));
@@ -128,35 +123,35 @@ class Composite {
       b.known = take(plane);
       for (int i = 0; i < C_ + 3; i++) b.term.push_back(take(plane));
       b.rest = take(plane);
-      for (int i = 0; i < C_ + 3 * E_; i++) b.spread.push_back(take(TILE_PIXELS));
+      b.traced = take((size_t)C_ * TILE_PIXELS);
       for (int i = 0; i < C_ + E_; i++) b.canvas.push_back(take(TILE_PIXELS));
       for (int i = 0; i < 2 * count; i++) b.mine.push_back(take(pitch_));
-      b.rows.resize(window_);
+      for (auto *rows : {&b.occupied, &b.open, &b.uneven}) rows->resize(window_);
       b.every.assign(window_, ~0u);
       b.pointers.resize(C_);
-      b.layers.resize(words_);
+      b.layers.resize(index_.words);
     }
     return *scratches_[worker];
   }
 
   // For each pixel of each surface the node before it, and for each cell the layers in it.
   void index() {
-    words_ = (N_ + 63) / 64;
-    cell_rows_ = ceil_div(H_, CELL);
-    cell_columns_ = ceil_div(W_, CELL);
-    cells_.assign((size_t)cell_rows_ * cell_columns_ * words_, 0);
-    single_.assign((size_t)cell_rows_ * cell_columns_, 0);
-    for (int i = 0; i < s_.count; i++) intervals_.emplace_back(s_.area());
+    index_.words = (N_ + 63) / 64;
+    index_.rows = ceil_div(H_, CELL);
+    index_.columns = ceil_div(W_, CELL);
+    index_.bits.assign((size_t)index_.rows * index_.columns * index_.words, 0);
+    index_.single.assign((size_t)index_.rows * index_.columns, 0);
+    for (int i = 0; i < s_.count; i++) index_.intervals.emplace_back(s_.area());
     constexpr int STEPS = 4096;
     std::vector<int> start(STEPS + 2);
-    const double reach = (double)high_ - low_;
+    const double reach = (double)index_.high - index_.low;
     for (int i = 0, k = 0; i <= STEPS + 1; i++) {
-      while (k + 1 < N_ && (float)layers_[k + 1].node <= low_ + (i - 1) * reach / STEPS) k++;
+      while (k + 1 < N_ && (float)layers_[k + 1].node <= index_.low + (i - 1) * reach / STEPS) k++;
       start[i] = k;
     }
     const float scale = reach > 0 ? (float)(STEPS / reach) : 0.0f;
     auto node_before = [&](float place) {
-      int k = start[std::clamp((int)((place - low_) * scale), 0, STEPS)];
+      int k = start[std::clamp((int)((place - index_.low) * scale), 0, STEPS)];
       while (k + 1 < N_ && place >= layers_[k + 1].at) k++;
       return k;
     };
@@ -171,24 +166,24 @@ class Composite {
       for (int bx = 0; bx < s_.block_columns; bx++) {
         const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK), x_end = std::min(W_, (bx + 1) * BLOCK);
         if (!s_.whole() && !s_.has_block(block)) {  // one surface; mostly between the same two nodes
-          const float low = axis(job_.block_low[block], low_, high_), high = axis(job_.block_high[block], low_, high_);
+          const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
           const int k = node_before(low);
           if (k == node_before(high)) {
-            for (int y = by * BLOCK; y < y_end; y++) std::fill(&intervals_[0][(size_t)y * W_ + bx * BLOCK], &intervals_[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
+            for (int y = by * BLOCK; y < y_end; y++) std::fill(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK], &index_.intervals[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
             for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
               for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-                const size_t cell = (size_t)row * cell_columns_ + column;
-                mark(&cells_[cell * words_], low, k);
-                mark(&cells_[cell * words_], high, k);
-                single_[cell] = !s_.independent;
+                const size_t cell = (size_t)row * index_.columns + column;
+                mark(&index_.bits[cell * index_.words], low, k);
+                mark(&index_.bits[cell * index_.words], high, k);
+                index_.single[cell] = !s_.independent;
               }
             continue;
           }
         }
         for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
           for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-            const size_t cell = (size_t)row * cell_columns_ + column;
-            uint64_t *bits = &cells_[cell * words_];
+            const size_t cell = (size_t)row * index_.columns + column;
+            uint64_t *bits = &index_.bits[cell * index_.words];
             const int x0 = column * CELL, n = std::min(CELL, W_ - x0);
             bool single = true;
             for (int i = 0; i < s_.count; i++) {
@@ -201,7 +196,7 @@ class Composite {
                 if (n == CELL) {
                   vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = all(weight ? 0.0f : 1.0f);
                   for (int x = 0; x < CELL; x += LANES, count += LANES) {
-                    const vec place = axis(load<vec>(coc + x), low_, high_);
+                    const vec place = index_.place(load<vec>(coc + x));
                     store(places + count, place);
                     lows = least(lows, place);
                     highs = most(highs, place);
@@ -221,16 +216,19 @@ class Composite {
                   const float w = weight ? weight[x] : 1.0f;
                   if (weight && (i ? w != 0 : w < 1)) single = false;
                   any |= there[count] = w != 0;
-                  places[count] = axis(coc[x], low_, high_);
+                  places[count] = index_.place(coc[x]);
                   low = std::min(low, places[count]);
                   high = std::max(high, places[count]);
                 }
               }
-              if (!any) continue;
+              if (!any) {
+                for (int j = 0; j < count; j++) index_.intervals[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = 0;
+                continue;
+              }
               const int first = node_before(low), last = node_before(high);
               for (int j = 0; j < count; j++) {
                 const int k = first == last ? first : node_before(places[j]);
-                intervals_[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = (uint16_t)k;
+                index_.intervals[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = (uint16_t)k;
                 if (first != last && there[j]) mark(bits, places[j], k);
               }
               if (first == last) {
@@ -238,7 +236,7 @@ class Composite {
                 mark(bits, high, first);
               }
             }
-            single_[cell] = single && !s_.independent;
+            index_.single[cell] = single && !s_.independent;
           }
       }
     });
@@ -246,21 +244,19 @@ class Composite {
 
   // Layers in cells, and whether these show the first surface alone.
   bool around(int r0, int r1, int c0, int c1, uint64_t *bits) const {
-    r0 = std::clamp(r0, 0, cell_rows_ - 1), r1 = std::clamp(r1, 0, cell_rows_ - 1);
-    c0 = std::clamp(c0, 0, cell_columns_ - 1), c1 = std::clamp(c1, 0, cell_columns_ - 1);
-    for (int w = 0; w < words_; w++) bits[w] = 0;
+    r0 = std::clamp(r0, 0, index_.rows - 1), r1 = std::clamp(r1, 0, index_.rows - 1);
+    c0 = std::clamp(c0, 0, index_.columns - 1), c1 = std::clamp(c1, 0, index_.columns - 1);
+    for (int w = 0; w < index_.words; w++) bits[w] = 0;
     bool single = true;
     for (int r = r0; r <= r1; r++)
       for (int c = c0; c <= c1; c++) {
-        const size_t cell = (size_t)r * cell_columns_ + c;
-        for (int w = 0; w < words_; w++) bits[w] |= cells_[cell * words_ + w];
-        single &= (bool)single_[cell];
+        const size_t cell = (size_t)r * index_.columns + c;
+        for (int w = 0; w < index_.words; w++) bits[w] |= index_.bits[cell * index_.words + w];
+        single &= (bool)index_.single[cell];
       }
     return single;
   }
   static bool has(const uint64_t *bits, int k) { return bits[k / 64] >> k % 64 & 1; }
-
-  static int floor_div(int a, int b) { return a >= 0 ? a / b : -((-a + b - 1) / b); }
 
   // A coarse run in one of its tiles.
   void coarse_tile(Run &run, int which, Scratch &b) {
@@ -281,19 +277,17 @@ class Composite {
     run.used[which] = 1;
     const bool border = !extend_ && (top < 0 || left < 0 || (top + height) * s > H_ || (left + width) * s > W_);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
-    if (!s_.independent) {
-      if (C_ == 3) gather<3>(run, top, left, height, width, b); else gather<0>(run, top, left, height, width, b);
-    }
+    const Downsampled *d = downsampled(s);
+    if (d) find_pieces(run, *d, top, left, height, width, b);
     for (int k = run.last; k >= run.first; k--) {
+      if (!has(b.layers.data(), k)) continue;
       const Layer &l = layers_[k];
-      const bool there = s_.independent ? has(b.layers.data(), k) : !(piece_start(b, k - run.first + 2) == piece_start(b, k - run.first));
-      if (!there) continue;
       const int spare = half - l.half;
       const size_t shift = (size_t)spare * pitch_ + spare;
-      if (s_.independent)
-        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, shift, b);
+      if (d)
+        downsampled_terms(run, *d, k, top, left, height, width, border, b);
       else
-        add_pieces(run, k, height, b);
+        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, shift, b);
       lay(b, l, rows, columns, shift, border);
     }
     for (int c = 0; c < C_ + E_; c++)
@@ -301,212 +295,88 @@ class Composite {
         memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE, columns * sizeof(float));
   }
 
-  static int piece_start(const Scratch &b, int i) { return b.pieces.order[i]; }
+  const Downsampled *downsampled(int scale) const {
+    for (const auto &d : downsampled_)
+      if (d->scale == scale) return d.get();
+    return nullptr;
+  }
 
-  // What the blocks of a window hold for a run, sorted by node. Pieces between node first - 1 + i and the next one are
-  // order[i] to order[i + 1].
-  template <int CHANNELS>
-  void gather(const Run &run, int top, int left, int height, int width, Scratch &b) {
-    const int C = CHANNELS ? CHANNELS : C_, s = run.scale, stride = 2 * (C + 2), L = run.last - run.first + 2;
-    const float each = 1.0f / (s * s);
-    Pieces &p = b.pieces;
+  // Pieces in a window that a run spreads, sorted by node; the weight of those behind the run.
+  void find_pieces(const Run &run, const Downsampled &d, int top, int left, int height, int width, Scratch &b) {
+    const int per_band = BLOCK / d.scale, L = run.last - run.first + 2, stride = d.stride();
+    WindowPieces &p = b.pieces;
     p.at.clear();
     p.node.clear();
-    p.count = 0;
-    std::vector<float> sums(stride);
-    for (int by = 0; by < height; by++) memset(b.rest + (size_t)by * pitch_, 0, width * sizeof(float));
-    for (int by = 0; by < height; by++)
-      for (int bx = 0; bx < width; bx++) {
-        const int y0 = (top + by) * s, x0 = (left + bx) * s, place = by * pitch_ + bx;
-        const bool inside = y0 >= 0 && x0 >= 0 && y0 + s <= H_ && x0 + s <= W_;
-        // beyond the frame all rows of a block are alike, or all columns
-        const int rows = y0 + s <= 0 || y0 >= H_ ? 1 : s, columns = x0 + s <= 0 || x0 >= W_ ? 1 : s;
-        const float times = (float)(s / rows * (s / columns));
-        int count = s_.count;
-        if (inside) {
-          bool before = false, behind = false, here = false, single = true;  // layers of its cells relative to the run
-          for (int row = y0 / CELL; row <= (y0 + s - 1) / CELL; row++)
-            for (int column = x0 / CELL; column <= (x0 + s - 1) / CELL; column++) {
-              const size_t cell = (size_t)row * cell_columns_ + column;
-              const uint64_t *bits = &cells_[cell * words_];
-              for (int w = 0; w < words_; w++) {
-                before |= (bits[w] & below(run.first, w)) != 0;
-                behind |= (bits[w] & ~below(run.last + 1, w)) != 0;
-                here |= (bits[w] & ~below(run.first, w) & below(run.last + 1, w)) != 0;
-              }
-              single &= (bool)single_[cell];
-            }
-          if (!here && !behind) continue;
-          if (single && !here && !before) {
-            b.rest[place] = 1.0f;
-            continue;
-          }
-          if (single) count = 1;
+    p.values.clear();
+    if (over_)
+      for (int y = 0; y < height; y++) memset(b.rest + (size_t)y * pitch_, 0, width * sizeof(float));
+    for (int y = 0; y < height; y++) {
+      const int row = top + y, band = floor_div(row, per_band);
+      const Pieces &pieces = d.pieces[band - d.first_band];
+      const int *start = &pieces.start[row - band * per_band], *column = pieces.column.data();
+      const int end = (int)(std::lower_bound(column + start[0], column + start[1], left + width) - column);
+      for (int i = (int)(std::lower_bound(column + start[0], column + start[1], left) - column); i < end; i++) {
+        const int node = (int)pieces.node[i] - run.first + 1, at = y * pitch_ + column[i] - left;
+        const float *values = &pieces.values[(size_t)i * stride];
+        if (node < 0) continue;
+        if (node >= L) {
+          b.rest[at] += values[0];
+          continue;
         }
-        for (int i = 0; i < count; i++) {
-          const float *light_of[CHANNELS ? CHANNELS : 1], *coc, *weight;
-          const float **light = CHANNELS ? light_of : b.pointers.data();
-          if (inside) {
-            if (!s_.row(i, y0, x0, light, coc, weight)) break;
-            const uint16_t *interval = &intervals_[i][(size_t)y0 * W_ + x0];
-            const size_t light_step = s_.whole() || !weight ? W_ : BLOCK, coc_step = i && !s_.whole() ? BLOCK : W_;
-            if (CHANNELS && one_interval(interval, s)) {
-              const int k = *interval;
-              if (k + 1 < run.first) continue;
-              if (k > run.last) {
-                float sum = weight ? 0.0f : s * s;
-                if (weight)
-                  for (int y = 0; y < s; y++)
-                    for (int x = 0; x < s; x++) sum += weight[y * light_step + x];
-                b.rest[place] += sum * each;
-                continue;
-              }
-              float *to = p.add(place, k - run.first + 1, stride);
-              if (weight)
-                sum_block<CHANNELS, true>(light, light_step, coc, coc_step, weight, s, k, to);
-              else
-                sum_block<CHANNELS, false>(light, light_step, coc, coc_step, weight, s, k, to);
-              continue;
-            }
-          }
-          int node = -1;
-          auto flush = [&] {
-            if (node < 0) return;
-            memcpy(p.add(place, node - run.first + 1, stride), sums.data(), stride * sizeof(float));
-          };
-          for (int y = 0; y < rows; y++) {
-            const int at_y = std::clamp(y0 + y, 0, H_ - 1);
-            if (inside) s_.row(i, at_y, x0, light, coc, weight);
-            for (int x = 0; x < columns; x++) {
-              int at = x, at_x = x0 + x;
-              bool known = true;
-              if (!inside) {
-                known = extend_ || (y0 + y == at_y && at_x >= 0 && at_x < W_);
-                at_x = std::clamp(at_x, 0, W_ - 1);
-                at = 0;
-                if (!s_.row(i, at_y, at_x, light, coc, weight)) continue;
-              }
-              const float w = weight ? weight[at] * times : times;
-              if (w == 0) continue;
-              const int k = intervals_[i][(size_t)at_y * W_ + at_x];
-              if (k + 1 < run.first) continue;
-              if (k > run.last) {
-                b.rest[place] += w * each;
-                continue;
-              }
-              if (k != node) {
-                flush();
-                node = k;
-                std::fill(sums.begin(), sums.end(), 0.0f);
-              }
-              const float part = (axis(coc[at], low_, high_) - layers_[k].at) * layers_[k].per_after;
-              float *one = sums.data(), *two = one + C + 2;
-              one[0] += w;
-              two[0] += w * part;
-              if (!known) continue;
-              one[1] += w;
-              two[1] += w * part;
-              for (int c = 0; c < C; c++) {
-                const float v = light[c][at] * w;
-                one[2 + c] += v;
-                two[2 + c] += v * part;
-              }
-            }
-          }
-          flush();
+        p.at.push_back(at);
+        p.node.push_back(node);
+        p.values.push_back(values);
+      }
+    }
+    p.start.assign(L + 1, 0);
+    for (int node : p.node) p.start[node + 1]++;
+    for (int i = 0; i < L; i++) p.start[i + 1] += p.start[i];
+    p.order.resize(p.node.size());
+    std::vector<int> next(p.start.begin(), p.start.end() - 1);
+    for (int i = 0; i < (int)p.node.size(); i++) p.order[next[p.node[i]]++] = i;
+  }
+
+  // What layer k spreads of a window; what lies behind it is added to the rest.
+  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, bool border, Scratch &b) {
+    const int C = C_;
+    const vec at = all((float)k), before = all((float)(k - 1));
+    for (int y = 0; y < height; y++) {
+      const size_t to = (size_t)y * pitch_;
+      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(2, top + y) + left;
+      float *share = b.term[C] + to, *room = b.term[C + 1] + to, *seen = b.term[C + 2] + to;
+      for (int x = 0; x < width; x += LANES) {
+        const vec n = load<vec>(node + x);
+        const auto ahead = n == before, behind = n == at;
+        const vec w = load<vec>(one + x), part = load<vec>(two + x);
+        const vec ramp = ahead ? part : vec{}, its_share = behind ? w - part : ramp;
+        store(share + x, its_share);
+        if (border) store(seen + x, its_share);
+        if (over_) store(room + x, (n >= at ? w : ramp) + load<vec>(b.rest + to + x));
+      }
+      for (int c = 0; c < C; c++) {
+        const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
+        float *term = b.term[c] + to;
+        for (int x = 0; x < width; x += LANES) {
+          const vec n = load<vec>(node + x), v = load<vec>(far + x);
+          store(term + x, n == at ? load<vec>(light + x) - v : n == before ? v : vec{});
         }
       }
-    // sorted by node
-    const int pieces = p.count;
-    p.order.assign(L + 2 + pieces, 0);
-    for (int node : p.node) p.order[node + 1]++;
-    for (int i = 0; i <= L; i++) p.order[i + 1] += p.order[i];
-    std::vector<int> next(p.order.begin(), p.order.begin() + L + 1);
-    for (int i = 0; i < pieces; i++) p.order[L + 2 + next[p.node[i]]++] = i;
-  }
-
-  bool one_interval(const uint16_t *at, int s) const {
-    const uint16_t first = at[0];
-    unsigned differs = 0;
-    for (int y = 0; y < s; y++, at += W_)
-      for (int x = 0; x < s; x++) differs |= at[x] ^ first;
-    return !differs;
-  }
-
-  // The sums of a block of one surface that lies between two nodes.
-  template <int CHANNELS, bool WEIGHTED>
-  void sum_block(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int s,
-                 int k, float *out) const {
-    typedef float f4 __attribute__((vector_size(16)));
-    const float node = layers_[k].at, per_after = layers_[k].per_after;
-    f4 share = {}, part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
-    auto add = [&](const f4 w, const f4 at, auto light_at) {
-      const f4 part = (axis4(at) - node) * per_after * w;
-      share += w;
-      part_sum += part;
-      for (int c = 0; c < CHANNELS; c++) {
-        const f4 v = light_at(light[c]);
-        one[c] += v * w;
-        two[c] += v * part;
-      }
-    };
-    const f4 whole = {1, 1, 1, 1};
-    if (s == 2) {
-      auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
-      add(WEIGHTED ? four(weight, light_step) : whole, four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
-    } else {
-      for (int y = 0; y < s; y++)
-        for (int x = 0; x < s; x += 4)
-          add(WEIGHTED ? load<f4>(weight + y * light_step + x) : whole, load<f4>(coc + y * coc_step + x),
-              [&](const float *from) { return load<f4>(from + y * light_step + x); });
     }
-    auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
-    out[0] = out[1] = sum(share);
-    out[CHANNELS + 2] = out[CHANNELS + 3] = sum(part_sum);
-    for (int c = 0; c < CHANNELS; c++) {
-      out[2 + c] = sum(one[c]);
-      out[CHANNELS + 4 + c] = sum(two[c]);
-    }
-  }
-
-  template <typename F4>
-  F4 axis4(F4 coc) const {
-    const F4 zero = {}, half = zero + 0.5f, low = zero + low_, high = zero + high_;
-    F4 middle = coc > -half ? coc : -half;
-    middle = middle < half ? middle : half;
-    F4 x = coc - middle;
-    x = x > low ? x : low;
-    return x < high ? x : high;
-  }
-
-  static uint64_t below(int k, int word) {  // bits of layers before layer k
-    const int bit = k - 64 * word;
-    return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
-  }
-
-  // What layer k spreads of the pieces of its run; what lies behind it is added to the rest.
-  void add_pieces(const Run &run, int k, int height, Scratch &b) {
-    const int C = C_, stride = 2 * (C + 2), L = run.last - run.first + 2;
-    const float each = 1.0f / (run.scale * run.scale);
-    Pieces &p = b.pieces;
-    for (int c = 0; c < C + 3; c++)
-      if (c != C + 1) memset(b.term[c], 0, sizeof(float) * height * pitch_);
+    const WindowPieces &p = b.pieces;
     auto add = [&](int node, bool behind) {  // pieces before the layer's node, or behind it
-      for (int i = p.order[node]; i < p.order[node + 1]; i++) {
-        const int piece = p.order[L + 2 + i], at = p.at[piece];
-        const float *one = &p.values[(size_t)piece * stride], *two = one + C + 2;
-        auto part = [&](int v) { return (behind ? one[v] - two[v] : two[v]) * each; };
+      for (int i = p.start[node]; i < p.start[node + 1]; i++) {
+        const int piece = p.order[i], at = p.at[piece];
+        const float *one = p.values[piece], *two = one + C + 2;
+        auto part = [&](int v) { return behind ? one[v] - two[v] : two[v]; };
         b.term[C][at] += part(0);
-        b.term[C + 2][at] += part(1);
         for (int c = 0; c < C; c++) b.term[c][at] += part(2 + c);
-        if (behind)
-          b.rest[at] += one[0] * each;
-        else
-          b.term[C + 1][at] += part(0);
+        if (border) b.term[C + 2][at] += part(1);
+        if (!over_) continue;
+        b.term[C + 1][at] += behind ? one[0] : two[0];
+        if (behind) b.rest[at] += one[0];
       }
     };
     add(k - run.first + 1, true);
-    memcpy(b.term[C + 1], b.rest, sizeof(float) * height * pitch_);
     add(k - run.first, false);
   }
 
@@ -583,7 +453,7 @@ class Composite {
       }
       go_on(coc[i], false);
       go_on(weight[i], false);
-      for (int x = 0; x < n; x += LANES) store(coc[i] + x, axis(load<vec>(coc[i] + x), low_, high_));
+      for (int x = 0; x < n; x += LANES) store(coc[i] + x, index_.place(load<vec>(coc[i] + x)));
     }
     for (int x = 0; x < n; x++) known[x] = row_known && (extend_ || (x >= before && x < n - after));
   }
@@ -654,88 +524,116 @@ class Composite {
 
   // Spreads the terms of a layer, which begin at an offset, and lays them on the tile's canvas.
   void lay(Scratch &b, const Layer &l, int rows, int columns, size_t shift, bool border) {
-    const int C = C_, E = E_, height = rows + 2 * l.half, width = columns + 2 * l.half;
-    const int whole_rows = (rows + 3) / 4 * 4, whole_columns = (columns + 15) / 16 * 16;
-    // where there is anything; whether nothing lies behind the layer, or before it
+    const int C = C_, height = rows + 2 * l.half, width = columns + 2 * l.half;
+    // of each row, where there is anything (a bit for 16 columns); something behind the layer; something before it
     bool any = false;
-    vec open = {}, uneven = {};
     for (int y = 0; y < height; y++) {
       const float *share = b.term[C] + shift + (size_t)y * pitch_, *room = b.term[C + 1] + shift + (size_t)y * pitch_;
-      uint32_t bits = 0;
+      uint32_t occupied = 0, open = 0, uneven = 0;
       for (int x = 0; x < width; x += 16) {
-        vec some = {};
+        vec some = {}, more = {}, other = {};
         int i = x;
         for (; i + LANES <= std::min(x + 16, width); i += LANES) {
           const vec s = load<vec>(share + i);
           some = most(some, s);
           if (!over_) continue;
           const vec r = load<vec>(room + i), d = r - all(1.0f);
-          open = most(open, r - s);
-          uneven = most(uneven, d * d);
+          more = most(more, r - s);
+          other = most(other, d * d - all(1e-12f));
         }
         for (; i < std::min(x + 16, width); i++) {
           some[0] = std::max(some[0], share[i]);
           if (!over_) continue;
-          open[0] = std::max(open[0], room[i] - share[i]);
-          uneven[0] = std::max(uneven[0], (room[i] - 1.0f) * (room[i] - 1.0f));
+          more[0] = std::max(more[0], room[i] - share[i]);
+          other[0] = std::max(other[0], (room[i] - 1.0f) * (room[i] - 1.0f) - 1e-12f);
         }
-        bits |= (uint32_t)any_positive(some) << std::min(x / 16, 31);
+        const int bit = std::min(x / 16, 31);
+        occupied |= (uint32_t)any_positive(some) << bit;
+        open |= (uint32_t)any_positive(more) << bit;
+        uneven |= (uint32_t)any_positive(other) << bit;
       }
-      b.rows[y] = bits;
-      any |= bits != 0;
+      b.occupied[y] = occupied;
+      b.open[y] = open;
+      b.uneven[y] = uneven;
+      any |= occupied != 0;
     }
-    for (int y = height; y < whole_rows + 2 * l.half; y++) b.rows[y] = 0;
-    const bool closed = !any_positive(open), flat = largest(uneven) <= 1e-12f;
     if (!any) return;
-    auto spread = [&](int term, const uint32_t *rows_with, const Kernel &kernel, float *to) {
-      if (l.half)
-        convolve(b.term[term] + shift, pitch_, rows_with, kernel, whole_rows, whole_columns, to, TILE);
-      else
-        for (int y = 0; y < rows; y++)
-          for (int x = 0; x < columns; x++) to[y * TILE + x] = b.term[term][shift + (size_t)y * pitch_ + x] * kernel.sum;
-    };
-    for (int c = 0; c < C; c++) spread(c, b.rows.data(), l.kernels[E > 1 ? c : 0], b.spread[c]);
-    for (int e = 0; e < E; e++) {
-      const Kernel &kernel = l.kernels[e];
-      float *share = b.spread[C + e], *room = b.spread[C + E + e], *seen = b.spread[C + 2 * E + e];
-      if (!over_) {
-        spread(border ? C + 2 : C, b.rows.data(), kernel, share);
-        for (int c = 0; c < C; c++)
-          if (E == 1 || c == e) add_to(b.canvas[c], b.spread[c]);
-        add_to(b.canvas[C + e], share);
-        continue;
+    for (int y = height; y < ceil_div(rows, STRIP_ROWS) * STRIP_ROWS + 2 * l.half; y++) b.occupied[y] = b.open[y] = b.uneven[y] = 0;
+    for (int y = 0; y < rows; y += STRIP_ROWS) {
+      uint32_t occupied = 0, open = 0, uneven = 0;  // what reaches these rows
+      for (int i = y; i < y + STRIP_ROWS + 2 * l.half; i++) {
+        occupied |= b.occupied[i];
+        open |= b.open[i];
+        uneven |= b.uneven[i];
       }
-      if (flat)
-        std::fill(room, room + whole_rows * TILE, kernel.sum);
-      else
-        spread(C + 1, b.every.data(), kernel, room);
-      if (closed)
-        memcpy(share, room, whole_rows * TILE * sizeof(float));
-      else
-        spread(C, b.rows.data(), kernel, share);
-      if (border) spread(C + 2, b.rows.data(), kernel, seen);
-      // colour = light / room, coverage = share / room; where not all light was seen, the colour of what was, fading
-      // out with the last of it
-      for (int i = 0; i < whole_rows * TILE; i += LANES) {
-        const vec all_room = load<vec>(room + i), its_share = load<vec>(share + i), one = all(1.0f);
-        const vec per_room = one / most(all_room, all(LEAST));
-        vec gain = per_room, cover = its_share;
-        if (border) {
-          const vec floor = least(most(its_share, all(LEAST * LEAST)), all(LEAST)), was_seen = load<vec>(seen + i);
-          gain *= its_share / most(was_seen, floor);
-          cover *= least(was_seen / floor, one);
-        }
-        cover *= per_room;
-        const vec left = most(one - cover, vec{});
-        for (int c = 0; c < C; c++)
-          if (E == 1 || c == e) store(b.canvas[c] + i, load<vec>(b.spread[c] + i) * gain + left * load<vec>(b.canvas[c] + i));
-        store(b.canvas[C + e] + i, cover + left * load<vec>(b.canvas[C + e] + i));
+      for (int x = 0; x < columns; x += STRIP_COLUMNS) {
+        const uint32_t within = strip_inputs(x, l.half);
+        if (!(occupied & within)) continue;
+        const size_t from = shift + (size_t)y * pitch_ + x;
+        if (over_)
+          lay_strip(b, l, from, y, within, open & within, uneven & within, border, y * TILE + x);
+        else
+          add_strip(b, l, from, y, within, border, y * TILE + x);
       }
     }
   }
 
-  static void add_to(float *to, const float *more) {
-    for (int i = 0; i < TILE_PIXELS; i += LANES) store(to + i, load<vec>(to + i) + load<vec>(more + i));
+  // One term of a layer, spread to a strip of the tile. Kernels of half 0 have one tap.
+  void spread(const Scratch &b, int term, size_t from, const uint32_t *rows, uint32_t within, const Kernel &kernel, float *to) const {
+    convolve_strip(b.term[term] + from, pitch_, rows, within, kernel, to);
+  }
+
+  void add_strip(Scratch &b, const Layer &l, size_t from, int y, uint32_t within, bool border, int at) {
+    float spread_of[STRIP];
+    for (int v = 0; v < C_ + E_; v++) {
+      const Kernel &kernel = l.kernels[E_ == 1 ? 0 : v < C_ ? v : v - C_];
+      spread(b, v < C_ ? v : border ? C_ + 2 : C_, from, &b.occupied[y], within, kernel, spread_of);
+      for (int i = 0; i < STRIP; i += LANES) {
+        float *to = b.canvas[v] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
+        store(to, load<vec>(to) + load<vec>(spread_of + i));
+      }
+    }
+  }
+
+  void lay_strip(Scratch &b, const Layer &l, size_t from, int y, uint32_t within, bool open, bool uneven, bool border, int at) {
+    float share[STRIP], room[STRIP], seen[STRIP], gain[STRIP], left[STRIP], light[STRIP];
+    for (int e = 0; e < E_; e++) {
+      const Kernel &kernel = l.kernels[e];
+      if (uneven)
+        spread(b, C_ + 1, from, b.every.data(), ~0u, kernel, room);
+      else
+        std::fill(room, room + STRIP, kernel.sum);
+      if (open)
+        spread(b, C_, from, &b.occupied[y], within, kernel, share);
+      else
+        memcpy(share, room, sizeof(room));
+      if (border) spread(b, C_ + 2, from, &b.occupied[y], within, kernel, seen);
+      // colour = light / room, coverage = share / room; where not all light was seen, the colour of what was, fading
+      // out with the last of it
+      float *const canvas = b.canvas[C_ + e] + at;
+      for (int i = 0; i < STRIP; i += LANES) {
+        const vec its_share = load<vec>(share + i), one = all(1.0f), per_room = one / most(load<vec>(room + i), all(LEAST));
+        vec its_gain = per_room, cover = its_share;
+        if (border) {
+          const vec floor = least(most(its_share, all(LEAST * LEAST)), all(LEAST)), was_seen = load<vec>(seen + i);
+          its_gain *= its_share / most(was_seen, floor);
+          cover *= least(was_seen / floor, one);
+        }
+        cover *= per_room;
+        const vec its_left = most(one - cover, vec{});
+        store(gain + i, its_gain);
+        store(left + i, its_left);
+        float *to = canvas + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
+        store(to, cover + its_left * load<vec>(to));
+      }
+      for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
+        spread(b, c, from, &b.occupied[y], within, kernel, light);
+        for (int i = 0; i < STRIP; i += LANES) {
+          float *to = b.canvas[c] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
+          store(to, load<vec>(light + i) * load<vec>(gain + i) + load<vec>(left + i) * load<vec>(to));
+        }
+      }
+    }
   }
 
   // A coarser canvas, interpolated, over the tile's canvas.
@@ -863,7 +761,7 @@ class Composite {
   // The tile's canvas over what lies behind all layers, with the light of rays, to the picture.
   void finish(int which, int y0, int x0, int rows, int columns, Scratch &b) {
     const int C = C_, E = E_;
-    float *const traced = b.spread[0];  // [channels, TILE, TILE]: planes of spread lie side by side
+    float *const traced = b.traced;  // [channels, TILE, TILE]
     const bool has_rays = !job_.rays.empty() && ray_start_[which] < ray_start_[which + 1];
     if (has_rays) {
       memset(traced, 0, sizeof(float) * C * TILE_PIXELS);
@@ -950,17 +848,25 @@ class Composite {
   float *out_;
   int H_, W_, C_, E_, N_;
   bool over_, extend_;
-  float low_, high_;  // the outermost nodes
   std::vector<Run> runs_;
   int window_, pitch_;
   std::vector<std::unique_ptr<Scratch>> scratches_;
-  int words_, cell_rows_, cell_columns_;
-  std::vector<uint64_t> cells_;            // layers that occur in each cell, a bit each
-  std::vector<uint8_t> single_;            // cells that show the first surface alone, whole
-  std::vector<Buffer<uint16_t>> intervals_;
+  LayerIndex index_;
+  std::vector<std::unique_ptr<Downsampled>> downsampled_;  // of each scale of the runs
   Visibility visibility_;
   std::vector<int> ray_start_, ray_list_;
 };
+
+int LayerIndex::only_interval(size_t i) const {
+  int first = -1, last = -1;
+  for (int w = 0; w < words; w++) {
+    const uint64_t found = cell(i)[w];
+    if (!found) continue;
+    if (first < 0) first = 64 * w + __builtin_ctzll(found);
+    last = 64 * w + 63 - __builtin_clzll(found);
+  }
+  return last <= first + 1 ? first : -1;
+}
 
 void composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out) {
   Composite(job, ray_kernels, ray_halves, out).run();

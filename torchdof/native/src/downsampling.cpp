@@ -1,0 +1,348 @@
+// Downsampling: means of the surfaces over blocks of pixels, once for all layers of a resolution. Pixels that lie between
+// the same two nodes are added up together, with and without how far between them each lies: layers before and behind
+// take their part of both.
+#include "engine.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+namespace {
+
+typedef float f4 __attribute__((vector_size(16)));
+
+// Sums over a part of a block of one surface that lies between two nodes; out as Pieces::values, unscaled.
+template <int CHANNELS>
+void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int rows,
+              int columns, const LayerIndex &index, const Layer &l, float *out) {
+  f4 share = {}, part_sum = {}, one[CHANNELS] = {}, two[CHANNELS] = {};
+  const f4 low = f4{} + index.low, high = f4{} + index.high, half = f4{} + 0.5f, whole = f4{} + 1.0f;
+  auto add = [&](const f4 w, const f4 c, auto light_at) {
+    f4 place = c > -half ? c : -half;
+    place = c - (place < half ? place : half);
+    place = place > low ? place : low;
+    place = place < high ? place : high;
+    const f4 part = (place - l.at) * l.per_after * w;
+    share += w;
+    part_sum += part;
+    for (int i = 0; i < CHANNELS; i++) {
+      const f4 v = light_at(light[i]);
+      one[i] += v * w;
+      two[i] += v * part;
+    }
+  };
+  if (columns == 2) {
+    auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
+    add(weight ? four(weight, light_step) : whole, four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
+  } else {
+    for (int y = 0; y < rows; y++)
+      for (int x = 0; x < columns; x += 4)
+        add(weight ? load<f4>(weight + y * light_step + x) : whole, load<f4>(coc + y * coc_step + x),
+            [&](const float *from) { return load<f4>(from + y * light_step + x); });
+  }
+  auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
+  float *two_of = out + CHANNELS + 2;
+  out[0] += sum(share);
+  out[1] += sum(share);
+  two_of[0] += sum(part_sum);
+  two_of[1] += sum(part_sum);
+  for (int i = 0; i < CHANNELS; i++) {
+    out[2 + i] += sum(one[i]);
+    two_of[2 + i] += sum(two[i]);
+  }
+}
+
+// Of a block of pixels: what lies between each two nodes.
+struct Gathered {
+  int count = 0;
+  std::vector<int> nodes;
+  std::vector<float> values;
+  explicit Gathered(int stride) : stride(stride) {}
+  float *between(int node) {
+    for (int i = 0; i < count; i++)
+      if (nodes[i] == node) return &values[(size_t)i * stride];
+    if (count == (int)nodes.size()) {
+      nodes.push_back(0);
+      values.resize(values.size() + stride);
+    }
+    nodes[count] = node;
+    float *made = &values[(size_t)count++ * stride];
+    std::fill(made, made + stride, 0.0f);
+    return made;
+  }
+
+ private:
+  const int stride;
+};
+
+bool all_alike(const uint16_t *at, int pitch, int s) {
+  unsigned differs = 0;
+  for (int y = 0; y < s; y++)
+    for (int x = 0; x < s; x++) differs |= at[(size_t)y * pitch + x] ^ at[0];
+  return !differs;
+}
+
+}  // namespace
+
+class Downsampling {
+ public:
+  Downsampling(const Job &job, const LayerIndex &index, Downsampled &to)
+      : job_(job), s_(job.surfaces), index_(index), to_(to), C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)),
+        gathered_(stride_), light_(C_) {}
+
+  // Rows of blocks of BLOCK pixels.
+  void band(int band) {
+    const int s = to_.scale, first = band * (BLOCK / s), columns = job_.width / s;
+    Pieces &pieces = to_.pieces[band - to_.first_band];
+    for (int row = first; row < first + BLOCK / s; row++) {
+      pieces.start.push_back((int)pieces.column.size());
+      if (row < -to_.margin || row >= to_.rows + to_.margin) continue;
+      const bool inside = row >= 0 && (row + 1) * s <= job_.height;
+      const uint8_t *near = &to_.near[(size_t)std::clamp(band, 0, s_.block_rows - 1) * s_.block_columns];
+      int column = -to_.margin;
+      while (column < to_.columns + to_.margin) {
+        // as far as the next block of the image, or around the frame
+        const int block_of = std::clamp(floor_div(column * s, BLOCK), 0, s_.block_columns - 1);
+        int end = block_of + 1 == s_.block_columns ? to_.columns + to_.margin : (block_of + 1) * BLOCK / s;
+        if (!near[block_of]) {
+          std::fill(to_.row(0, row) + column, to_.row(0, row) + end, FARTHEST);
+          std::fill(to_.row(1, row) + column, to_.row(1, row) + end, 1.0f);
+          column = end;
+        }
+        while (column < end) {
+          if (inside && column >= 0 && column < columns) {
+            column += blocks(row, column, std::min(std::min(end, columns) - column, std::max(1, CELL / s)), pieces);
+          } else {
+            to_.row(0, row)[column] = NOWHERE;
+            block(row, column++, false, pieces);
+          }
+        }
+      }
+      std::fill(to_.row(0, row) + column, to_.row(0, row) - to_.margin + to_.pitch, NOWHERE);
+    }
+    pieces.start.push_back((int)pieces.column.size());
+  }
+
+ private:
+  static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;  // nodes of blocks that hold nothing, and of what is of no account
+
+  // Blocks of one row within a cell, or one that is larger; returns how many.
+  int blocks(int row, int column, int count, Pieces &pieces) {
+    const int s = to_.scale, y0 = row * s, x0 = column * s;
+    const size_t cell = (size_t)(y0 / CELL) * index_.columns + x0 / CELL;
+    const int k = s <= CELL && index_.single[cell] ? index_.only_interval(cell) : -1;
+    if (k < 0) {
+      for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
+      return count;
+    }
+    std::fill(to_.row(0, row) + column, to_.row(0, row) + column + count, (float)to_.stands_for[k]);
+    if (!to_.wanted[k]) {
+      std::fill(to_.row(1, row) + column, to_.row(1, row) + column + count, 1.0f);
+      return count;
+    }
+    if (count * s < CELL) {  // at the frame's border
+      for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
+    } else if (C_ == 3) {
+      s == 2 ? cell_sums<2, 3>(row, column, k) : s == 4 ? cell_sums<4, 3>(row, column, k) : cell_sums<8, 3>(row, column, k);
+    } else {
+      s == 2 ? cell_sums<2, 0>(row, column, k) : s == 4 ? cell_sums<4, 0>(row, column, k) : cell_sums<8, 0>(row, column, k);
+    }
+    return count;
+  }
+
+  // Blocks in a row of a cell of one surface that lies between two nodes.
+  template <int S, int CHANNELS>
+  void cell_sums(int row, int column, int k) {
+    const int C = CHANNELS ? CHANNELS : C_, y0 = row * S, x0 = column * S;
+    const Layer &l = job_.layers[k];
+    constexpr int PARTS = CELL / LANES;
+    const float *coc;
+    const float *weight;
+    vec part[S][PARTS], sum[PARTS] = {};
+    auto put = [&](int plane, int to) {  // sums of S neighbours
+      float columns_of[CELL];
+      for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
+      float *out = to_.row(plane, to) + column;
+      for (int i = 0; i < CELL / S; i++) {
+        float total = 0;
+        for (int x = 0; x < S; x++) total += columns_of[i * S + x];
+        out[i] = total;
+      }
+    };
+    s_.row(0, y0, x0, light_.data(), coc, weight);
+    const size_t light_step = weight ? BLOCK : s_.width;
+    for (int y = 0; y < S; y++)
+      for (int p = 0; p < PARTS; p++) {
+        part[y][p] = (index_.place(load<vec>(coc + (size_t)y * s_.width + p * LANES)) - l.at) * l.per_after;
+        sum[p] += part[y][p];
+      }
+    std::fill(to_.row(1, row) + column, to_.row(1, row) + column + CELL / S, 1.0f);
+    put(2, row);
+    for (int c = 0; c < C; c++) {
+      vec far[PARTS] = {};
+      for (int p = 0; p < PARTS; p++) {
+        sum[p] = vec{};
+        for (int y = 0; y < S; y++) {
+          const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
+          sum[p] += v;
+          far[p] += v * part[y][p];
+        }
+      }
+      put(3 + c, row);
+      for (int p = 0; p < PARTS; p++) sum[p] = far[p];
+      put(3 + C + c, row);
+    }
+  }
+
+  // Any block. The first of what it holds stands in the planes, unless part of the block lies beyond the frame.
+  void block(int row, int column, bool inside, Pieces &pieces) {
+    gathered_.count = 0;
+    gather(row, column, inside);
+    int first = 0;
+    if (inside) {
+      to_.row(0, row)[column] = NOWHERE;
+      if (gathered_.count) {
+        const float *one = gathered_.values.data(), *two = one + C_ + 2;
+        to_.row(0, row)[column] = (float)gathered_.nodes[0];
+        to_.row(1, row)[column] = one[0] * each_;
+        to_.row(2, row)[column] = two[0] * each_;
+        for (int c = 0; c < C_; c++) {
+          to_.row(3 + c, row)[column] = one[2 + c] * each_;
+          to_.row(3 + C_ + c, row)[column] = two[2 + c] * each_;
+        }
+        first = 1;
+      }
+    }
+    for (int i = first; i < gathered_.count; i++) {
+      pieces.column.push_back(column);
+      pieces.node.push_back(gathered_.nodes[i]);
+      for (int v = 0; v < stride_; v++) pieces.values.push_back(gathered_.values[(size_t)i * stride_ + v] * each_);
+    }
+  }
+
+  void gather(int row, int column, bool inside) {
+    const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width, C = C_;
+    const bool extend = job_.scene.extend;
+    // beyond the frame all rows of a block are alike, or all columns
+    const int rows = y0 + s <= 0 || y0 >= H ? 1 : s, columns = x0 + s <= 0 || x0 >= W ? 1 : s;
+    const float times = (float)(s / rows * (s / columns));
+    const float *coc, *weight;
+    for (int i = 0; i < s_.count; i++) {
+      if (inside) {
+        if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
+        const uint16_t *interval = &index_.intervals[i][(size_t)y0 * W + x0];
+        if (C == 3 && all_alike(interval, W, s)) {
+          const int k = *interval;
+          if (!to_.needed(k)) continue;
+          const size_t light_step = weight ? BLOCK : W, coc_step = i ? BLOCK : W;
+          sum_part<3>(light_.data(), light_step, coc, coc_step, weight, s, s, index_, job_.layers[k], gathered_.between(to_.stands_for[k]));
+          continue;
+        }
+      }
+      int last = -1;
+      float *one = nullptr;
+      for (int y = 0; y < rows; y++) {
+        const int at_y = std::clamp(y0 + y, 0, H - 1);
+        if (inside) s_.row(i, at_y, x0, light_.data(), coc, weight);
+        for (int x = 0; x < columns; x++) {
+          int at = x, at_x = x0 + x;
+          bool known = true;
+          if (!inside) {
+            known = extend || (y0 + y == at_y && at_x >= 0 && at_x < W);
+            at_x = std::clamp(at_x, 0, W - 1);
+            at = 0;
+            if (!s_.row(i, at_y, at_x, light_.data(), coc, weight)) continue;
+          }
+          const float w = weight ? weight[at] * times : times;
+          if (w == 0) continue;
+          const int k = index_.intervals[i][(size_t)at_y * W + at_x];
+          if (!to_.needed(k)) continue;
+          if (k != last) {
+            last = k;
+            one = gathered_.between(to_.stands_for[k]);
+          }
+          const Layer &l = job_.layers[k];
+          const float part = (index_.place(coc[at]) - l.at) * l.per_after;
+          float *two = one + C + 2;
+          one[0] += w;
+          two[0] += w * part;
+          if (!known) continue;
+          one[1] += w;
+          two[1] += w * part;
+          for (int c = 0; c < C; c++) {
+            const float v = light_[c][at] * w;
+            one[2 + c] += v;
+            two[2 + c] += v * part;
+          }
+        }
+      }
+    }
+    // nothing is left of what weighs nothing
+    for (int i = 0; i < gathered_.count;) {
+      if (gathered_.values[(size_t)i * stride_] != 0) {
+        i++;
+        continue;
+      }
+      gathered_.count--;
+      gathered_.nodes[i] = gathered_.nodes[gathered_.count];
+      memcpy(&gathered_.values[(size_t)i * stride_], &gathered_.values[(size_t)gathered_.count * stride_], stride_ * sizeof(float));
+    }
+  }
+
+  const Job &job_;
+  const Surfaces &s_;
+  const LayerIndex &index_;
+  Downsampled &to_;
+  const int C_, stride_;
+  const float each_;
+  Gathered gathered_;
+  std::vector<const float *> light_;
+};
+
+Downsampled::Downsampled(const Job &job, int scale, int margin)
+    : scale(scale), margin(margin), rows(ceil_div(job.height, scale)), columns(ceil_div(job.width, scale)), channels(job.channels) {
+  const int per_band = BLOCK / scale;
+  pitch = (columns + 2 * margin + 15) / 16 * 16 + 32;  // rows are read in whole vectors
+  size = (size_t)(rows + 2 * margin) * pitch;
+  planes = Buffer<float>(size * (3 + 2 * channels));
+  first_band = -ceil_div(margin, per_band);
+  pieces.resize(ceil_div(rows + margin, per_band) - first_band);
+  // what is neither spread by a layer of this resolution nor seen behind one is left out
+  const int layers = (int)job.layers.size();
+  wanted.resize(layers), behind.resize(layers), stands_for.resize(layers);
+  for (int k = 0, class_of = 0; k < layers; k++) {
+    const bool here = job.layers[k].scale == scale, next = k + 1 < layers && job.layers[k + 1].scale == scale;
+    wanted[k] = here || next;
+    behind[k] = here || (k && behind[k - 1]);
+    if (wanted[k] || (k && wanted[k - 1])) class_of = k;  // those between two runs lie behind the same layers
+    stands_for[k] = (uint16_t)class_of;
+  }
+  if (!job.scene.occlusion) behind = wanted;
+}
+
+void Downsampled::take(const Job &job, const LayerIndex &index) {
+  // blocks of pixels that a layer of this resolution occupies; as far as its light reaches, and as far again for what
+  // lies behind there
+  const int cells = BLOCK / CELL, block_rows = job.surfaces.block_rows, block_columns = job.surfaces.block_columns;
+  std::vector<uint64_t> layers(index.words, 0);
+  for (int k = 0; k < (int)job.layers.size(); k++)
+    if (job.layers[k].scale == scale) layers[k / 64] |= 1ull << k % 64;
+  std::vector<uint8_t> occupied((size_t)block_rows * block_columns, 0);
+  for (int row = 0; row < index.rows; row++)
+    for (int column = 0; column < index.columns; column++)
+      for (int w = 0; w < index.words; w++)
+        if (index.cell((size_t)row * index.columns + column)[w] & layers[w]) occupied[(size_t)(row / cells) * block_columns + column / cells] = 1;
+  const int reach = ceil_div(2 * margin * scale, BLOCK);
+  auto widen = [](const uint8_t *from, uint8_t *to, int count, int step, int reach) {
+    for (int i = 0, last = -reach - 1; i < count + reach; i++) {  // last: of those occupied up to i
+      if (i < count && from[(size_t)i * step]) last = i;
+      if (i >= reach) to[(size_t)(i - reach) * step] = last >= i - 2 * reach && last >= 0;
+    }
+  };
+  near.resize(occupied.size());
+  for (int row = 0; row < block_rows; row++) widen(&occupied[(size_t)row * block_columns], &near[(size_t)row * block_columns], block_columns, 1, reach);
+  occupied.swap(near);
+  for (int column = 0; column < block_columns; column++) widen(&occupied[column], &near[column], block_rows, block_columns, reach);
+  job.parallel((int)pieces.size(), [&](int band, int) { Downsampling(job, index, *this).band(first_band + band); });
+}
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof
