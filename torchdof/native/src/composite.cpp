@@ -11,21 +11,27 @@ constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing 
 constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
+constexpr int PART = 16;  // pixels a side of what is known to be empty in a coarser canvas
 
 inline bool any_positive(vec v) {
+#if defined(__AVX2__)
+  return __builtin_ia32_movmskps256(vec(v > vec{})) != 0;
+#else
   typedef long long wide __attribute__((vector_size(LANES * 4)));
   const wide bits = (wide)(v > vec{});
-  long long any = 0;
-  for (int i = 0; i < LANES / 2; i++) any |= bits[i];
-  return any != 0;
+  return (bits[0] | bits[1]) != 0;
+#endif
 }
+
+constexpr float EVEN = 1e-12f;  // square of what a weight of 1 may lack
 
 // Neighbouring layers of one resolution and, if it is a coarser one, one side of the focus.
 struct Run {
   int scale, first, last, half;
   int tile_rows = 0, tile_columns = 0, rows = 0, columns = 0;  // of its canvas, one pixel more on each side
   Buffer<float> canvas;                                        // light and coverage
-  std::vector<uint8_t> used;                                   // tiles with anything in them
+  int part_columns = 0;                                        // of parts of PART x PART of its pixels
+  std::vector<uint8_t> used;                                   // parts with anything in them
 };
 
 // Pieces of blocks in a window: where each lies in it, its node and values. Those of node i are order[start[i]] to
@@ -33,6 +39,22 @@ struct Run {
 struct WindowPieces {
   std::vector<int> at, node, start, order;
   std::vector<const float *> values;
+};
+
+// The part of a window that lies in one block of pixels: where its surfaces are, and what its terms were last.
+struct WindowBlock {
+  struct Surface {
+    const float *light, *coc, *weight;  // from the block's first row in the window; weight null: 1
+    int light_pitch, coc_pitch, weight_pitch;
+    size_t channel;  // from one channel to the next
+  };
+  int top, rows, column;  // in the window
+  Surface surfaces[2];
+  int count;
+  bool placed;             // coc are places on the blur axis already, known is in the window
+  const uint64_t *layers;  // that occur in it
+  bool clear;              // no layer's light or share stands in the terms
+  int room;                // 0 or 1 where that is all that stands in this term, else -1
 };
 
 // Planes of a window, `pitch` values a row.
@@ -47,8 +69,25 @@ struct Scratch {
   float *rest;                  // what lies wholly behind a coarse layer
   std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for 16 columns
   std::vector<const float *> pointers;
-  std::vector<uint64_t> layers;
+  std::vector<uint64_t> layers, block_layers;
+  std::vector<WindowBlock> blocks;
   WindowPieces pieces;
+};
+
+// What a row of terms has, a bit for 16 columns: something; something behind the layer; something before it.
+struct Occupied {
+  uint32_t some = 0, open = 0, uneven = 0;
+  void add(int x, float share, float room, bool over) {
+    const uint32_t bit = 1u << std::min(x / 16, 31);
+    if (share > 0) some |= bit;
+    if (over && room > share) open |= bit;
+    if (over && (room - 1.0f) * (room - 1.0f) > EVEN) uneven |= bit;
+  }
+  void put(Scratch &b, int y) const {
+    b.occupied[y] = some;
+    b.open[y] = open;
+    b.uneven[y] = uneven;
+  }
 };
 
 }  // namespace
@@ -92,8 +131,9 @@ class Composite {
       run.columns = ceil_div(W_, run.scale) + 2;
       run.tile_rows = ceil_div(run.rows, TILE);
       run.tile_columns = ceil_div(run.columns, TILE);
-      run.used.assign(run.tile_rows * run.tile_columns, 0);
-      run.canvas = Buffer<float>((size_t)(C_ + E_) * run.rows * run.columns);
+      run.part_columns = run.tile_columns * (TILE / PART);
+      run.used.assign((size_t)run.tile_rows * (TILE / PART) * run.part_columns, 0);
+      run.canvas = Buffer<float>((size_t)(C_ + E_) * run.rows * run.columns + PART);  // rows are read in whole vectors
       for (int t = 0; t < run.tile_rows * run.tile_columns; t++) coarse.push_back({r, t});
       if (s_.independent || downsampled(run.scale)) continue;
       int margin = 0;
@@ -115,7 +155,7 @@ class Composite {
       Scratch &b = *scratches_[worker];
       const size_t plane = (size_t)window_ * pitch_;
       const int count = s_.count, planes = count * (C_ + 2) + 1 + (C_ + 3) + 1;
-      b.memory.assign(planes * plane + (size_t)(2 * C_ + E_) * TILE_PIXELS + (size_t)count * pitch_ * 2 + 16, 0.0f);
+      b.memory.assign(planes * plane + (size_t)(2 * C_ + E_) * TILE_PIXELS + (size_t)(count + 2) * pitch_ + 16, 0.0f);
       float *p = b.memory.data();
       auto take = [&](size_t size) { return (p += size) - size; };
       for (int i = 0; i < count * C_; i++) b.light.push_back(take(plane));
@@ -125,7 +165,7 @@ class Composite {
       b.rest = take(plane);
       b.traced = take((size_t)C_ * TILE_PIXELS);
       for (int i = 0; i < C_ + E_; i++) b.canvas.push_back(take(TILE_PIXELS));
-      for (int i = 0; i < 2 * count; i++) b.mine.push_back(take(pitch_));
+      for (int i = 0; i < count + 2; i++) b.mine.push_back(take(pitch_));
       for (auto *rows : {&b.occupied, &b.open, &b.uneven}) rows->resize(window_);
       b.every.assign(window_, ~0u);
       b.pointers.resize(C_);
@@ -274,7 +314,6 @@ class Composite {
           memset(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], 0, columns * sizeof(float));
       return;
     }
-    run.used[which] = 1;
     const bool border = !extend_ && (top < 0 || left < 0 || (top + height) * s > H_ || (left + width) * s > W_);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
     const Downsampled *d = downsampled(s);
@@ -283,16 +322,24 @@ class Composite {
       if (!has(b.layers.data(), k)) continue;
       const Layer &l = layers_[k];
       const int spare = half - l.half;
-      const size_t shift = (size_t)spare * pitch_ + spare;
       if (d)
-        downsampled_terms(run, *d, k, top, left, height, width, border, b);
+        downsampled_terms(run, *d, k, top, left, height, width, spare, border, b);
       else
-        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, shift, b);
-      lay(b, l, rows, columns, shift, border);
+        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, (size_t)spare * pitch_ + spare, b);
+      if (!d) find_occupied(b, spare, rows + 2 * l.half, spare, columns + 2 * l.half);
+      lay(b, l, rows, columns, spare, spare, border);
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
         memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE, columns * sizeof(float));
+    for (int y = 0; y < rows; y += PART)
+      for (int x = 0; x < columns; x += PART) {
+        vec most_cover = {};
+        for (int e = 0; e < E_; e++)
+          for (int i = 0; i < PART; i++)
+            for (int j = 0; j < PART; j += LANES) most_cover = most(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
+        run.used[(size_t)(tile_y + y) / PART * run.part_columns + (tile_x + x) / PART] = any_positive(most_cover);
+      }
   }
 
   const Downsampled *downsampled(int scale) const {
@@ -337,22 +384,38 @@ class Composite {
   }
 
   // What layer k spreads of a window; what lies behind it is added to the rest.
-  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, bool border, Scratch &b) {
+  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, int spare, bool border, Scratch &b) {
     const int C = C_;
     const vec at = all((float)k), before = all((float)(k - 1));
-    for (int y = 0; y < height; y++) {
+    for (int y = spare; y < height - spare; y++) {
       const size_t to = (size_t)y * pitch_;
       const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(2, top + y) + left;
       float *share = b.term[C] + to, *room = b.term[C + 1] + to, *seen = b.term[C + 2] + to;
-      for (int x = 0; x < width; x += LANES) {
-        const vec n = load<vec>(node + x);
-        const auto ahead = n == before, behind = n == at;
-        const vec w = load<vec>(one + x), part = load<vec>(two + x);
-        const vec ramp = ahead ? part : vec{}, its_share = behind ? w - part : ramp;
-        store(share + x, its_share);
-        if (border) store(seen + x, its_share);
-        if (over_) store(room + x, (n >= at ? w : ramp) + load<vec>(b.rest + to + x));
+      uint32_t occupied = 0, open = 0, uneven = 0;
+      for (int x0 = 0; x0 < width; x0 += 16) {
+        vec some = {}, more = {}, other = {};
+        for (int x = x0; x < x0 + 16; x += LANES) {
+          const vec n = load<vec>(node + x);
+          const auto ahead = n == before, behind = n == at;
+          const vec w = load<vec>(one + x), part = load<vec>(two + x);
+          const vec ramp = ahead ? part : vec{}, its_share = behind ? w - part : ramp;
+          store(share + x, its_share);
+          some = most(some, its_share);
+          if (border) store(seen + x, its_share);
+          if (!over_) continue;
+          const vec its_room = (n >= at ? w : ramp) + load<vec>(b.rest + to + x), lacking = its_room - all(1.0f);
+          store(room + x, its_room);
+          more = most(more, its_room - its_share);
+          other = most(other, lacking * lacking - all(EVEN));
+        }
+        const int bit = std::min(x0 / 16, 31);
+        occupied |= (uint32_t)any_positive(some) << bit;
+        open |= (uint32_t)any_positive(more) << bit;
+        uneven |= (uint32_t)any_positive(other) << bit;
       }
+      b.occupied[y] = occupied;
+      b.open[y] = open;
+      b.uneven[y] = uneven;
       for (int c = 0; c < C; c++) {
         const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
         float *term = b.term[c] + to;
@@ -368,6 +431,10 @@ class Composite {
         const int piece = p.order[i], at = p.at[piece];
         const float *one = p.values[piece], *two = one + C + 2;
         auto part = [&](int v) { return behind ? one[v] - two[v] : two[v]; };
+        const uint32_t bit = 1u << std::min(at % pitch_ / 16, 31);
+        b.occupied[at / pitch_] |= bit;
+        b.open[at / pitch_] |= bit;
+        b.uneven[at / pitch_] |= bit;
         b.term[C][at] += part(0);
         for (int c = 0; c < C; c++) b.term[c][at] += part(2 + c);
         if (border) b.term[C + 2][at] += part(1);
@@ -384,10 +451,10 @@ class Composite {
   void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
-    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + 1 + C_ + 3 + 2 * s_.count) * (n + LANES));
+    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + 1 + C_ + 3 + s_.count + 2) * (n + LANES));
     float *m = memory.data();
     auto take = [&] { return (m += n + LANES) - (n + LANES); };  // vectors may read beyond the end
-    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 3), mine(2 * s_.count);
+    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 3), mine(s_.count + 2);
     for (auto *v : {&light, &coc, &weight, &term, &mine})
       for (float *&row : *v) row = take();
     float *known = take();
@@ -396,7 +463,7 @@ class Composite {
       for (int c = 0; c < C_ + 3; c++) memset(b.term[c] + to, 0, width * sizeof(float));
       for (int y = 0; y < s; y++) {
         read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), known, b);
-        row_terms(layers_[k], n, false, light.data(), coc.data(), weight.data(), mine.data(), term.data());
+        row_terms(layers_[k], n, light.data(), coc.data(), weight.data(), mine.data(), term.data());
         for (int x = 0; x < n; x++) {
           for (int c = 0; c < C_ + 2; c++) b.term[c][to + x / s] += term[c][x] * each;
           b.term[C_ + 2][to + x / s] += term[C_][x] * known[x] * each;
@@ -405,7 +472,7 @@ class Composite {
     }
   }
 
-  // A row of all surfaces, continued beyond the frame: light [surfaces, channels], place on the blur axis and weight.
+  // A row of all surfaces, continued beyond the frame: light [surfaces, channels], coc and weight.
   void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight, float *known, Scratch &b) {
     const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1), last = std::clamp(x0 + n - 1, 0, W_ - 1);
     const int before = std::max(0, std::min(n, -x0)), after = std::max(0, std::min(n, x0 + n - W_));
@@ -453,67 +520,36 @@ class Composite {
       }
       go_on(coc[i], false);
       go_on(weight[i], false);
-      for (int x = 0; x < n; x += LANES) store(coc[i] + x, index_.place(load<vec>(coc[i] + x)));
     }
     for (int x = 0; x < n; x++) known[x] = row_known && (extend_ || (x >= before && x < n - after));
   }
 
-  // What a layer spreads of a row: light, share, and the share at or behind it, its room.
-  void row_terms(const Layer &l, int n, bool single, const float *const *light, const float *const *x, const float *const *weight,
+  // What a layer spreads of a row of surfaces that cover each other: light, share, and the share at or behind it, its room.
+  void row_terms(const Layer &l, int n, const float *const *light, const float *const *coc, const float *const *weight,
                  float *const *mine, float *const *term) const {
-    const float before = l.before, per_before = l.per_before, at = l.at, per_after = l.per_after;
     const float first = l.first ? 1.0f : 0.0f;
     float *share = term[C_], *room = term[C_ + 1];
-    if (single) {
-      for (int i = 0; i < n; i += LANES) {
-        const vec p = load<vec>(x[0] + i), h = clamp01((p - before) * per_before + first), g = h - clamp01((p - at) * per_after);
-        store(room + i, h);
-        store(share + i, g);
-        for (int c = 0; c < C_; c++) store(term[c] + i, load<vec>(light[c] + i) * g);
+    // a pixel is there for the layer as far as what is at or behind it is known, but for what that has in front
+    float *left = mine[s_.count], *unknown = mine[s_.count + 1];
+    for (int i = 0; i < n; i++) room[i] = left[i] = unknown[i] = 1.0f;
+    for (int j = 0; j < s_.count; j++) {
+      const float *c = coc[j], *w = weight[j];
+      float *m = mine[j];
+      for (int i = 0; i < n; i++) {
+        const float p = index_.place(c[i]), h = clamp01((p - l.before) * l.per_before + first), cover = w[i];
+        const float g = h - clamp01((p - l.at) * l.per_after);
+        const float there = h > 0 ? 1.0f - cover * (1.0f - h) : 1.0f;
+        const float stops = cover * g / std::max(there, LEAST);
+        m[i] = left[i] * stops;
+        left[i] *= 1.0f - stops;
+        room[i] *= there;
+        unknown[i] = h > 0 ? unknown[i] * (1.0f - cover) : unknown[i];
       }
-      return;
     }
-    if (!s_.independent) {
-      for (int i = 0; i < n; i += LANES) {
-        vec shares = {}, rooms = {};
-        for (int j = 0; j < s_.count; j++) {
-          const vec p = load<vec>(x[j] + i), w = load<vec>(weight[j] + i), h = clamp01((p - before) * per_before + first);
-          const vec m = (h - clamp01((p - at) * per_after)) * w;
-          store(mine[j] + i, m);
-          shares += m;
-          rooms += h * w;
-        }
-        store(share + i, shares);
-        store(room + i, rooms);
-      }
-    } else {
-      // a pixel is there for the layer as far as what is at or behind it is known, but for what that has in front
-      float *left = mine[s_.count], *unknown = mine[s_.count + 1 < 2 * s_.count ? s_.count + 1 : s_.count];
-      std::vector<float> spare;
-      if (s_.count == 1) {
-        spare.resize(n);
-        unknown = spare.data();
-      }
-      for (int i = 0; i < n; i++) room[i] = left[i] = unknown[i] = 1.0f;
-      for (int j = 0; j < s_.count; j++) {
-        const float *p = x[j], *w = weight[j];
-        float *m = mine[j];
-        for (int i = 0; i < n; i++) {
-          const float h = clamp01((p[i] - before) * per_before + first), cover = w[i];
-          const float g = h - clamp01((p[i] - at) * per_after);
-          const float there = h > 0 ? 1.0f - cover * (1.0f - h) : 1.0f;
-          const float stops = cover * g / std::max(there, LEAST);
-          m[i] = left[i] * stops;
-          left[i] *= 1.0f - stops;
-          room[i] *= there;
-          unknown[i] = h > 0 ? unknown[i] * (1.0f - cover) : unknown[i];
-        }
-      }
-      for (int i = 0; i < n; i++) share[i] = 0;
-      for (int j = 0; j < s_.count; j++)
-        for (int i = 0; i < n; i++) share[i] += mine[j][i] *= room[i];
-      for (int i = 0; i < n; i++) room[i] *= 1.0f - unknown[i];
-    }
+    for (int i = 0; i < n; i++) share[i] = 0;
+    for (int j = 0; j < s_.count; j++)
+      for (int i = 0; i < n; i++) share[i] += mine[j][i] *= room[i];
+    for (int i = 0; i < n; i++) room[i] *= 1.0f - unknown[i];
     for (int c = 0; c < C_; c++)
       for (int i = 0; i < n; i += LANES) {
         vec sum = load<vec>(light[c] + i) * load<vec>(mine[0] + i);
@@ -522,58 +558,212 @@ class Composite {
       }
   }
 
-  // Spreads the terms of a layer, which begin at an offset, and lays them on the tile's canvas.
-  void lay(Scratch &b, const Layer &l, int rows, int columns, size_t shift, bool border) {
-    const int C = C_, height = rows + 2 * l.half, width = columns + 2 * l.half;
-    // of each row, where there is anything (a bit for 16 columns); something behind the layer; something before it
-    bool any = false;
-    for (int y = 0; y < height; y++) {
-      const float *share = b.term[C] + shift + (size_t)y * pitch_, *room = b.term[C + 1] + shift + (size_t)y * pitch_;
-      uint32_t occupied = 0, open = 0, uneven = 0;
-      for (int x = 0; x < width; x += 16) {
-        vec some = {}, more = {}, other = {};
-        int i = x;
-        for (; i + LANES <= std::min(x + 16, width); i += LANES) {
-          const vec s = load<vec>(share + i);
-          some = most(some, s);
-          if (!over_) continue;
-          const vec r = load<vec>(room + i), d = r - all(1.0f);
-          more = most(more, r - s);
-          other = most(other, d * d - all(1e-12f));
-        }
-        for (; i < std::min(x + 16, width); i++) {
-          some[0] = std::max(some[0], share[i]);
-          if (!over_) continue;
-          more[0] = std::max(more[0], room[i] - share[i]);
-          other[0] = std::max(other[0], (room[i] - 1.0f) * (room[i] - 1.0f) - 1e-12f);
-        }
-        const int bit = std::min(x / 16, 31);
-        occupied |= (uint32_t)any_positive(some) << bit;
-        open |= (uint32_t)any_positive(more) << bit;
-        uneven |= (uint32_t)any_positive(other) << bit;
-      }
-      b.occupied[y] = occupied;
-      b.open[y] = open;
-      b.uneven[y] = uneven;
-      any |= occupied != 0;
+  // Where a layer's terms have something: of the rows of a window from `top` on, columns from `left` on.
+  void find_occupied(Scratch &b, int top, int rows, int left, int columns) const {
+    for (int y = top; y < top + rows; y++) {
+      const float *share = b.term[C_] + (size_t)y * pitch_, *room = b.term[C_ + 1] + (size_t)y * pitch_;
+      Occupied row;
+      for (int x = left; x < left + columns; x++) row.add(x, share[x], room[x], over_);
+      row.put(b, y);
     }
-    if (!any) return;
-    for (int y = height; y < ceil_div(rows, STRIP_ROWS) * STRIP_ROWS + 2 * l.half; y++) b.occupied[y] = b.open[y] = b.uneven[y] = 0;
+  }
+
+  // The parts of a window that lie in blocks of pixels. What touches the frame's border is copied, and continued beyond.
+  void find_blocks(int top, int rows, int left, int columns, Scratch &b) {
+    b.blocks.clear();
+    const size_t plane = (size_t)window_ * pitch_, area = s_.area();
+    const int block_rows = ceil_div(top + rows - floor_div(top, BLOCK) * BLOCK, BLOCK), block_columns = columns / BLOCK;
+    b.block_layers.assign((size_t)block_rows * block_columns * index_.words, 0);
+    std::vector<float *> light(b.light.size()), coc(s_.count), weight(s_.count);
+    for (int i = 0; i < block_rows * block_columns; i++) {
+      const int y0 = floor_div(top, BLOCK) * BLOCK + i / block_columns * BLOCK, x0 = left + i % block_columns * BLOCK;
+      const bool inside = y0 >= 0 && x0 >= 0 && y0 + BLOCK <= H_ && x0 + BLOCK <= W_;
+      const int y_in = std::clamp(y0, 0, (s_.block_rows - 1) * BLOCK), x_in = std::clamp(x0, 0, (s_.block_columns - 1) * BLOCK);
+      WindowBlock w;
+      uint64_t *layers = &b.block_layers[(size_t)i * index_.words];
+      const bool single = around(y_in / CELL, y_in / CELL + BLOCK / CELL - 1, x_in / CELL, x_in / CELL + BLOCK / CELL - 1, layers);
+      w.layers = layers;
+      w.count = single ? 1 : s_.count;
+      w.top = std::max(y0 - top, 0);
+      w.rows = std::min(y0 + BLOCK - top, rows) - w.top;
+      w.column = x0 - left;
+      w.clear = false;
+      w.room = -1;
+      w.placed = !inside;
+      const int first_row = top + w.top;
+      for (int j = 0; j < w.count && inside; j++) {
+        WindowBlock::Surface &of = w.surfaces[j];
+        const float *own;
+        s_.row(j, first_row, x0, b.pointers.data(), own, of.weight);
+        const bool in_block = s_.has_block(first_row / BLOCK * s_.block_columns + x0 / BLOCK);
+        of.light = b.pointers[0];
+        of.coc = own;
+        of.channel = in_block ? BLOCK_PIXELS : area;
+        of.light_pitch = in_block ? BLOCK : W_;
+        of.coc_pitch = j ? BLOCK : W_;
+        of.weight_pitch = BLOCK;
+        if (single) of.weight = nullptr;
+      }
+      if (!inside) {
+        for (int y = w.top; y < w.top + w.rows; y++) {
+          const size_t at = (size_t)y * pitch_ + w.column;
+          for (size_t v = 0; v < light.size(); v++) light[v] = b.light[v] + at;
+          for (int j = 0; j < s_.count; j++) coc[j] = b.coc[j] + at, weight[j] = b.weight[j] + at;
+          read_row(top + y, x0, BLOCK, single, light.data(), coc.data(), weight.data(), b.known + at, b);
+        }
+        for (int j = 0; j < w.count; j++) {
+          const size_t at = (size_t)w.top * pitch_ + w.column;
+          w.surfaces[j] = {b.light[j * C_] + at, b.coc[j] + at, single ? nullptr : b.weight[j] + at, pitch_, pitch_, pitch_, plane};
+        }
+      }
+      b.blocks.push_back(w);
+    }
+  }
+
+  // What layer k spreads of a window, rows from `first` on and columns from `from` on. Nothing is written again that
+  // stands there from the layer before.
+  void window_terms(int k, int first, int rows, int from, int columns, bool border, Scratch &b) {
+    std::fill(&b.occupied[first], &b.occupied[first] + rows, 0u);
+    std::fill(&b.open[first], &b.open[first] + rows, 0u);
+    std::fill(&b.uneven[first], &b.uneven[first] + rows, 0u);
+    for (WindowBlock &w : b.blocks) {
+      bool before = false, behind = false;
+      for (int i = 0; i < index_.words; i++) {
+        before |= (w.layers[i] & below(k, i)) != 0;
+        behind |= (w.layers[i] & ~below(k + 1, i)) != 0;
+      }
+      const int y0 = std::max(w.top, first), y1 = std::min(w.top + w.rows, first + rows);
+      const int x0 = std::max(0, from - w.column) / LANES * LANES, x1 = std::min(BLOCK, from + columns - w.column);
+      if (y0 >= y1 || x0 >= x1) continue;
+      if (has(w.layers, k)) {
+        w.clear = false;
+        w.room = -1;
+        if (C_ == 3)
+          w.count == 1 ? block_terms<3, 1>(layers_[k], w, y0, y1, x0, x1, border, b) : block_terms<3, 2>(layers_[k], w, y0, y1, x0, x1, border, b);
+        else
+          w.count == 1 ? block_terms<0, 1>(layers_[k], w, y0, y1, x0, x1, border, b) : block_terms<0, 2>(layers_[k], w, y0, y1, x0, x1, border, b);
+        continue;
+      }
+      if (!w.clear) {
+        w.clear = true;
+        for (int c = 0; c < C_ + 3; c++)
+          if (c != C_ + 1) fill(b.term[c], w, 0.0f);
+      }
+      if (!over_) continue;
+      const uint32_t bit = 1u << std::min(w.column / BLOCK, 31);
+      if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
+        w.room = -1;
+        block_room(layers_[k], w, y0, y1, x0, x1, b);
+      } else {
+        if (w.room != (int)behind) fill(b.term[C_ + 1], w, behind ? 1.0f : 0.0f);
+        w.room = behind;
+        for (int y = y0; y < y1; y++) (behind ? b.open : b.uneven)[y] |= bit;
+      }
+    }
+  }
+
+  void fill(float *term, const WindowBlock &w, float value) const {
+    for (int y = w.top; y < w.top + w.rows; y++) {
+      float *row = term + (size_t)y * pitch_ + w.column;
+      std::fill(row, row + BLOCK, value);
+    }
+  }
+
+  // Columns of a block from x0 up to x1, rows from y0 up to y1 of its window.
+  template <int CHANNELS, int COUNT>
+  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, bool border, Scratch &b) {
+    const int C = CHANNELS ? CHANNELS : C_;
+    for (int y = y0; y < y1; y++) {
+      const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
+      vec some = {}, more = {}, other = {};
+      for (int x = x0; x < x1; x += LANES) {
+        vec mine[COUNT], share = {}, room = {};
+        for (int j = 0; j < COUNT; j++) {
+          const WindowBlock::Surface &of = w.surfaces[j];
+          const vec p = index_.place(load<vec>(of.coc + row * of.coc_pitch + x));
+          vec h = clamp01((p - l.before) * l.per_before + (l.first ? 1.0f : 0.0f));
+          mine[j] = h - clamp01((p - l.at) * l.per_after);
+          if (of.weight) {
+            const vec weight = load<vec>(of.weight + row * of.weight_pitch + x);
+            mine[j] *= weight;
+            h *= weight;
+          }
+          share += mine[j];
+          room += h;
+        }
+        store(b.term[C] + at + x, share);
+        if (over_) store(b.term[C + 1] + at + x, room);
+        if (border) store(b.term[C + 2] + at + x, w.placed ? share * load<vec>(b.known + at + x) : share);
+        for (int c = 0; c < C; c++) {
+          vec sum = load<vec>(w.surfaces[0].light + c * w.surfaces[0].channel + row * w.surfaces[0].light_pitch + x) * mine[0];
+          for (int j = 1; j < COUNT; j++)
+            sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * mine[j];
+          store(b.term[c] + at + x, sum);
+        }
+        const vec lacking = room - all(1.0f);
+        some = most(some, share);
+        more = most(more, room - share);
+        other = most(other, lacking * lacking - all(EVEN));
+      }
+      const int bit = std::min(w.column / BLOCK, 31);
+      b.occupied[y] |= (uint32_t)any_positive(some) << bit;
+      b.open[y] |= (uint32_t)any_positive(more) << bit;
+      b.uneven[y] |= (uint32_t)any_positive(other) << bit;
+    }
+  }
+
+  // The same of a block in which the layer does not occur: its room alone.
+  void block_room(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, Scratch &b) {
+    for (int y = y0; y < y1; y++) {
+      const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
+      vec more = {}, other = {};
+      for (int x = x0; x < x1; x += LANES) {
+        vec room = {};
+        for (int j = 0; j < w.count; j++) {
+          const WindowBlock::Surface &of = w.surfaces[j];
+          const vec p = index_.place(load<vec>(of.coc + row * of.coc_pitch + x));
+          vec h = clamp01((p - l.before) * l.per_before + (l.first ? 1.0f : 0.0f));
+          if (of.weight) h *= load<vec>(of.weight + row * of.weight_pitch + x);
+          room += h;
+        }
+        store(b.term[C_ + 1] + at + x, room);
+        const vec lacking = room - all(1.0f);
+        more = most(more, room);
+        other = most(other, lacking * lacking - all(EVEN));
+      }
+      const int bit = std::min(w.column / BLOCK, 31);
+      b.open[y] |= (uint32_t)any_positive(more) << bit;
+      b.uneven[y] |= (uint32_t)any_positive(other) << bit;
+    }
+  }
+
+  static uint64_t below(int k, int word) {  // bits of layers before layer k
+    const int bit = k - 64 * word;
+    return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
+  }
+
+  // Spreads the terms of a layer, which begin at a row and a column of the window, and lays them on the tile's canvas.
+  void lay(Scratch &b, const Layer &l, int rows, int columns, int first, int from, bool border) {
+    for (int y = rows; y < ceil_div(rows, STRIP_ROWS) * STRIP_ROWS; y++) {
+      const int row = first + y + 2 * l.half;
+      b.occupied[row] = b.open[row] = b.uneven[row] = 0;
+    }
     for (int y = 0; y < rows; y += STRIP_ROWS) {
       uint32_t occupied = 0, open = 0, uneven = 0;  // what reaches these rows
-      for (int i = y; i < y + STRIP_ROWS + 2 * l.half; i++) {
+      for (int i = first + y; i < first + y + STRIP_ROWS + 2 * l.half; i++) {
         occupied |= b.occupied[i];
         open |= b.open[i];
         uneven |= b.uneven[i];
       }
+      if (!occupied) continue;
       for (int x = 0; x < columns; x += STRIP_COLUMNS) {
-        const uint32_t within = strip_inputs(x, l.half);
+        const uint32_t within = strip_inputs(from + x, l.half);
         if (!(occupied & within)) continue;
-        const size_t from = shift + (size_t)y * pitch_ + x;
+        const size_t at = (size_t)(first + y) * pitch_ + from + x;
         if (over_)
-          lay_strip(b, l, from, y, within, open & within, uneven & within, border, y * TILE + x);
+          lay_strip(b, l, at, first + y, within, open & within, uneven & within, border, y * TILE + x);
         else
-          add_strip(b, l, from, y, within, border, y * TILE + x);
+          add_strip(b, l, at, first + y, within, border, y * TILE + x);
       }
     }
   }
@@ -639,13 +829,13 @@ class Composite {
   // A coarser canvas, interpolated, over the tile's canvas.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
-    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / TILE, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / TILE;
+    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;
     bool any = false;
-    for (int r = y0 / s / TILE; r <= r1; r++)
-      for (int c = x0 / s / TILE; c <= c1; c++) any |= run.used[r * run.tile_columns + c];
+    for (int r = y0 / s / PART; r <= r1; r++)
+      for (int c = x0 / s / PART; c <= c1; c++) any |= run.used[(size_t)r * run.part_columns + c];
     if (!any) return;
-    const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s, pitch = TILE + 32;
-    std::vector<float> lines((size_t)channels * count), planes((size_t)channels * pitch);
+    const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s, pitch = TILE + 32, line_pitch = count + LANES;
+    std::vector<float> lines((size_t)channels * line_pitch), planes((size_t)channels * pitch);
     float *const values = planes.data() + s / 2;  // between two samples the first value lies half a sample behind
     float ramp[16];
     for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
@@ -657,10 +847,15 @@ class Composite {
       bool covered = false;
       for (int c = channels - 1; c >= 0; c--) {
         const float *upper = &run.canvas[((size_t)c * run.rows + row) * run.columns + first], *lower = upper + run.columns;
-        float *line = &lines[(size_t)c * count];
-        for (int i = 0; i < inside; i++) line[i] = upper[i] + down * (lower[i] - upper[i]);
+        float *line = &lines[(size_t)c * line_pitch];
+        vec most_of = {};
+        for (int i = 0; i < inside; i += LANES) {
+          const vec top = load<vec>(upper + i), value = top + down * (load<vec>(lower + i) - top);
+          store(line + i, value);
+          most_of = most(most_of, value);
+        }
         if (c >= C_)
-          for (int i = 0; i < inside; i++) covered |= line[i] > 0;
+          covered |= any_positive(most_of);
         else if (!covered)
           break;
         float *v = &planes[(size_t)c * pitch];
@@ -709,24 +904,10 @@ class Composite {
       halo = std::max(halo, l.half);
     }
     const bool border = !extend_ && (y0 < halo || x0 < halo || y0 + TILE + halo > H_ || x0 + TILE + halo > W_);
-    bool single = false;
-    int left = x0;  // where rows begin
-    if (!reaching.empty()) {
-      single = look_around(y0, x0, ceil_div(halo, CELL), b);
-      std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
-      float *known = b.known;
-      left = floor_div(x0 - halo, BLOCK) * BLOCK;
-      const int across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
-      for (int y = y0 - halo; y < y0 + rows + halo; y++) {
-        read_row(y, left, across, single, light.data(), coc.data(), weight.data(), known, b);
-        for (auto *v : {&light, &coc, &weight})
-          for (float *&row : *v) row += pitch_;
-        known += pitch_;
-      }
-    }
+    const int top = y0 - halo, left = floor_div(x0 - halo, BLOCK) * BLOCK;  // of the window
+    const int height = rows + 2 * halo, across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
+    if (!reaching.empty()) s_.independent ? read_window(top, height, left, across, b) : find_blocks(top, height, left, across, b);
     size_t next = 0;
-    std::vector<const float *> light(s_.count * C_), coc(s_.count), weight(s_.count);
-    std::vector<float *> term(C_ + 3);
     for (int r = (int)runs_.size() - 1; r >= 0; r--) {
       const Run &run = runs_[r];
       if (run.scale > 1) {
@@ -735,23 +916,45 @@ class Composite {
       }
       for (; next < reaching.size() && reaching[next] >= run.first; next++) {
         const Layer &l = layers_[reaching[next]];
-        const int spare = halo - l.half, width = columns + 2 * l.half;
-        for (int y = 0; y < rows + 2 * l.half; y++) {
-          const size_t from = (size_t)(y + spare) * pitch_ + x0 - l.half - left, to = (size_t)y * pitch_;
-          for (int i = 0; i < s_.count; i++) {
-            for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + from;
-            coc[i] = b.coc[i] + from;
-            weight[i] = b.weight[i] + from;
-          }
-          for (int c = 0; c < C_ + 3; c++) term[c] = b.term[c] + to;
-          row_terms(l, width, single, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
-          if (border)
-            for (int x = 0; x < width; x += LANES) store(term[C_ + 2] + x, load<vec>(term[C_] + x) * load<vec>(b.known + from + x));
-        }
-        lay(b, l, rows, columns, 0, border);
+        const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half, reach_columns = columns + 2 * l.half;
+        if (s_.independent)
+          stack_terms(l, first, reach_rows, from, reach_columns, border, b);
+        else
+          window_terms(reaching[next], first, reach_rows, from, reach_columns, border, b);
+        lay(b, l, rows, columns, first, from, border);
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);
+  }
+
+  // All of a window, for surfaces that cover each other.
+  void read_window(int top, int rows, int left, int columns, Scratch &b) {
+    std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
+    float *known = b.known;
+    for (int y = 0; y < rows; y++) {
+      read_row(top + y, left, columns, false, light.data(), coc.data(), weight.data(), known, b);
+      for (auto *v : {&light, &coc, &weight})
+        for (float *&row : *v) row += pitch_;
+      known += pitch_;
+    }
+  }
+
+  void stack_terms(const Layer &l, int first, int rows, int from, int columns, bool border, Scratch &b) {
+    std::vector<const float *> light(s_.count * C_), coc(s_.count), weight(s_.count);
+    std::vector<float *> term(C_ + 3);
+    for (int y = first; y < first + rows; y++) {
+      const size_t at = (size_t)y * pitch_ + from;
+      for (int i = 0; i < s_.count; i++) {
+        for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + at;
+        coc[i] = b.coc[i] + at;
+        weight[i] = b.weight[i] + at;
+      }
+      for (int c = 0; c < C_ + 3; c++) term[c] = b.term[c] + at;
+      row_terms(l, columns, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
+      if (border)
+        for (int x = 0; x < columns; x += LANES) store(term[C_ + 2] + x, load<vec>(term[C_] + x) * load<vec>(b.known + at + x));
+    }
+    find_occupied(b, first, rows, from, columns);
   }
 
   bool look_around(int y0, int x0, int reach, Scratch &b) const {

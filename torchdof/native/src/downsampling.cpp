@@ -9,12 +9,12 @@ namespace {
 
 typedef float f4 __attribute__((vector_size(16)));
 
-// Sums over a part of a block of one surface that lies between two nodes; out as Pieces::values, unscaled.
+// Adds up what a block of one surface has between two nodes; out as Pieces::values. Weights lie without gaps.
 template <int CHANNELS>
-void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int rows,
-              int columns, const LayerIndex &index, const Layer &l, float *out) {
+void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int s,
+              const LayerIndex &index, const Layer &l, float *out) {
   f4 share = {}, part_sum = {}, one[CHANNELS] = {}, two[CHANNELS] = {};
-  const f4 low = f4{} + index.low, high = f4{} + index.high, half = f4{} + 0.5f, whole = f4{} + 1.0f;
+  const f4 low = f4{} + index.low, high = f4{} + index.high, half = f4{} + 0.5f;
   auto add = [&](const f4 w, const f4 c, auto light_at) {
     f4 place = c > -half ? c : -half;
     place = c - (place < half ? place : half);
@@ -29,13 +29,13 @@ void sum_part(const float *const *light, size_t light_step, const float *coc, si
       two[i] += v * part;
     }
   };
-  if (columns == 2) {
+  if (s == 2) {
     auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
-    add(weight ? four(weight, light_step) : whole, four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
+    add(load<f4>(weight), four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
   } else {
-    for (int y = 0; y < rows; y++)
-      for (int x = 0; x < columns; x += 4)
-        add(weight ? load<f4>(weight + y * light_step + x) : whole, load<f4>(coc + y * coc_step + x),
+    for (int y = 0; y < s; y++)
+      for (int x = 0; x < s; x += 4)
+        add(load<f4>(weight + y * s + x), load<f4>(coc + y * coc_step + x),
             [&](const float *from) { return load<f4>(from + y * light_step + x); });
   }
   auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
@@ -72,13 +72,6 @@ struct Gathered {
  private:
   const int stride;
 };
-
-bool all_alike(const uint16_t *at, int pitch, int s) {
-  unsigned differs = 0;
-  for (int y = 0; y < s; y++)
-    for (int x = 0; x < s; x++) differs |= at[(size_t)y * pitch + x] ^ at[0];
-  return !differs;
-}
 
 }  // namespace
 
@@ -228,12 +221,8 @@ class Downsampling {
     for (int i = 0; i < s_.count; i++) {
       if (inside) {
         if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
-        const uint16_t *interval = &index_.intervals[i][(size_t)y0 * W + x0];
-        if (C == 3 && all_alike(interval, W, s)) {
-          const int k = *interval;
-          if (!to_.needed(k)) continue;
-          const size_t light_step = weight ? BLOCK : W, coc_step = i ? BLOCK : W;
-          sum_part<3>(light_.data(), light_step, coc, coc_step, weight, s, s, index_, job_.layers[k], gathered_.between(to_.stands_for[k]));
+        if (C == 3) {
+          sum_intervals(&index_.intervals[i][(size_t)y0 * W + x0], coc, i ? BLOCK : W, weight);
           continue;
         }
       }
@@ -258,6 +247,10 @@ class Downsampling {
           if (k != last) {
             last = k;
             one = gathered_.between(to_.stands_for[k]);
+          }
+          if (!to_.wanted[k]) {
+            one[0] += w;
+            continue;
           }
           const Layer &l = job_.layers[k];
           const float part = (index_.place(coc[at]) - l.at) * l.per_after;
@@ -284,6 +277,44 @@ class Downsampling {
       gathered_.count--;
       gathered_.nodes[i] = gathered_.nodes[gathered_.count];
       memcpy(&gathered_.values[(size_t)i * stride_], &gathered_.values[(size_t)gathered_.count * stride_], stride_ * sizeof(float));
+    }
+  }
+
+  // A block of one surface, of three channels, within the frame: the sums of each interval that occurs in it.
+  void sum_intervals(const uint16_t *interval, const float *coc, int coc_step, const float *weight) {
+    const int s = to_.scale, area = s * s;
+    const size_t light_step = weight ? BLOCK : s_.width;
+    float left[BLOCK_PIXELS], interval_of[BLOCK_PIXELS], of_one[BLOCK_PIXELS];
+    bool alike = true;
+    float any = 0;
+    for (int y = 0, i = 0; y < s; y++)
+      for (int x = 0; x < s; x++, i++) {
+        const int k = interval[(size_t)y * s_.width + x];
+        alike &= k == *interval;
+        interval_of[i] = (float)k;
+        left[i] = weight ? weight[y * BLOCK + x] : 1.0f;
+        any += left[i];
+      }
+    if (any == 0) return;
+    for (int i = 0; i < area; i++) {
+      if (left[i] == 0) continue;
+      const float k = interval_of[i];
+      float *from = left;
+      if (!alike) {  // the others weigh nothing
+        from = of_one;
+        any = 0;
+        for (int j = 0; j < area; j++) {
+          of_one[j] = interval_of[j] == k ? left[j] : 0.0f;
+          left[j] -= of_one[j];
+          any += of_one[j];
+        }
+      }
+      const int node = (int)k;
+      if (to_.wanted[node])
+        sum_part<3>(light_.data(), light_step, coc, coc_step, from, s, index_, job_.layers[node], gathered_.between(to_.stands_for[node]));
+      else if (to_.needed(node))
+        gathered_.between(to_.stands_for[node])[0] += any;
+      if (alike) return;
     }
   }
 
