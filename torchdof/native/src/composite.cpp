@@ -44,14 +44,14 @@ struct WindowPieces {
 // The part of a window that lies in one block of pixels: where its surfaces are, and what its terms were last.
 struct WindowBlock {
   struct Surface {
-    const float *light, *coc, *weight;  // from the block's first row in the window; weight null: 1
-    int light_pitch, coc_pitch, weight_pitch;
+    const float *light, *weight;  // from the block's first row in the window; weight null: 1
+    int light_pitch, weight_pitch;
     size_t channel;  // from one channel to the next
   };
   int top, rows, column;  // in the window
   Surface surfaces[2];
   int count;
-  bool placed;             // coc are places on the blur axis already, known is in the window
+  bool inside;             // all of it is known
   const uint64_t *layers;  // that occur in it
   bool clear;              // no layer's light or share stands in the terms
   int room;                // 0 or 1 where that is all that stands in this term, else -1
@@ -589,20 +589,19 @@ class Composite {
       w.column = x0 - left;
       w.clear = false;
       w.room = -1;
-      w.placed = !inside;
+      w.inside = inside;
       const int first_row = top + w.top;
       for (int j = 0; j < w.count && inside; j++) {
         WindowBlock::Surface &of = w.surfaces[j];
-        const float *own;
-        s_.row(j, first_row, x0, b.pointers.data(), own, of.weight);
+        const float *from;
+        s_.row(j, first_row, x0, b.pointers.data(), from, of.weight);
         const bool in_block = s_.has_block(first_row / BLOCK * s_.block_columns + x0 / BLOCK);
         of.light = b.pointers[0];
-        of.coc = own;
         of.channel = in_block ? BLOCK_PIXELS : area;
         of.light_pitch = in_block ? BLOCK : W_;
-        of.coc_pitch = j ? BLOCK : W_;
         of.weight_pitch = BLOCK;
         if (single) of.weight = nullptr;
+        for (int y = w.top; y < w.top + w.rows; y++, from += j ? BLOCK : W_) memcpy(b.coc[j] + (size_t)y * pitch_ + w.column, from, BLOCK * sizeof(float));
       }
       if (!inside) {
         for (int y = w.top; y < w.top + w.rows; y++) {
@@ -613,9 +612,15 @@ class Composite {
         }
         for (int j = 0; j < w.count; j++) {
           const size_t at = (size_t)w.top * pitch_ + w.column;
-          w.surfaces[j] = {b.light[j * C_] + at, b.coc[j] + at, single ? nullptr : b.weight[j] + at, pitch_, pitch_, pitch_, plane};
+          w.surfaces[j] = {b.light[j * C_] + at, single ? nullptr : b.weight[j] + at, pitch_, pitch_, plane};
         }
       }
+      for (int j = 0; j < w.count; j++)  // from coc to places on the blur axis
+        for (int y = w.top; y < w.top + w.rows; y++)
+          for (int x = 0; x < BLOCK; x += LANES) {
+            float *place = b.coc[j] + (size_t)y * pitch_ + w.column + x;
+            store(place, index_.place(load<vec>(place)));
+          }
       b.blocks.push_back(w);
     }
   }
@@ -680,7 +685,7 @@ class Composite {
         vec mine[COUNT], share = {}, room = {};
         for (int j = 0; j < COUNT; j++) {
           const WindowBlock::Surface &of = w.surfaces[j];
-          const vec p = index_.place(load<vec>(of.coc + row * of.coc_pitch + x));
+          const vec p = load<vec>(b.coc[j] + at + x);
           vec h = clamp01((p - l.before) * l.per_before + (l.first ? 1.0f : 0.0f));
           mine[j] = h - clamp01((p - l.at) * l.per_after);
           if (of.weight) {
@@ -693,7 +698,7 @@ class Composite {
         }
         store(b.term[C] + at + x, share);
         if (over_) store(b.term[C + 1] + at + x, room);
-        if (border) store(b.term[C + 2] + at + x, w.placed ? share * load<vec>(b.known + at + x) : share);
+        if (border) store(b.term[C + 2] + at + x, w.inside ? share : share * load<vec>(b.known + at + x));
         for (int c = 0; c < C; c++) {
           vec sum = load<vec>(w.surfaces[0].light + c * w.surfaces[0].channel + row * w.surfaces[0].light_pitch + x) * mine[0];
           for (int j = 1; j < COUNT; j++)
@@ -721,7 +726,7 @@ class Composite {
         vec room = {};
         for (int j = 0; j < w.count; j++) {
           const WindowBlock::Surface &of = w.surfaces[j];
-          const vec p = index_.place(load<vec>(of.coc + row * of.coc_pitch + x));
+          const vec p = load<vec>(b.coc[j] + at + x);
           vec h = clamp01((p - l.before) * l.per_before + (l.first ? 1.0f : 0.0f));
           if (of.weight) h *= load<vec>(of.weight + row * of.weight_pitch + x);
           room += h;

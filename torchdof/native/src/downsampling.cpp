@@ -14,13 +14,8 @@ template <int CHANNELS>
 void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int s,
               const LayerIndex &index, const Layer &l, float *out) {
   f4 share = {}, part_sum = {}, one[CHANNELS] = {}, two[CHANNELS] = {};
-  const f4 low = f4{} + index.low, high = f4{} + index.high, half = f4{} + 0.5f;
   auto add = [&](const f4 w, const f4 c, auto light_at) {
-    f4 place = c > -half ? c : -half;
-    place = c - (place < half ? place : half);
-    place = place > low ? place : low;
-    place = place < high ? place : high;
-    const f4 part = (place - l.at) * l.per_after * w;
+    const f4 part = (index.place(c) - l.at) * l.per_after * w;
     share += w;
     part_sum += part;
     for (int i = 0; i < CHANNELS; i++) {

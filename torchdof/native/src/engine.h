@@ -133,6 +133,16 @@ struct Layer {
   std::vector<Kernel> kernels;  // one, or one a colour
 };
 
+// Places on the blur axis, from low to high.
+template <typename V>
+inline V axis(V coc, float low, float high) {
+  const V zero = {}, half = zero + 0.5f, lowest = zero + low, highest = zero + high;
+  V middle = coc > -half ? coc : -half;
+  middle = middle < half ? middle : half;
+  V x = coc - middle;
+  x = x > lowest ? x : lowest;
+  return x < highest ? x : highest;
+}
 // Signed coc of a place on the blur axis.
 inline float coc_at(double node) { return (float)(node == 0 ? 0 : node > 0 ? node + 0.5 : node - 0.5); }
 
@@ -204,9 +214,9 @@ struct LayerIndex {
   const uint64_t *cell(size_t i) const { return &bits[i * words]; }
   // The node before all pixels of a cell, or -1 where they lie between several.
   int only_interval(size_t i) const;
-  // Place on the blur axis, within the nodes.
-  float place(float coc) const { return clamp(coc - clamp(coc, -0.5f, 0.5f), low, high); }
-  vec place(vec coc) const { return least(most(coc - least(most(coc, all(-0.5f)), all(0.5f)), all(low)), all(high)); }
+  // Places on the blur axis, within the nodes.
+  template <typename V>
+  V place(V coc) const { return axis(coc, low, high); }
 };
 
 // Parts of blocks of pixels that lie between two nodes, row by row of blocks: start[r] to start[r + 1] are those of row r.
