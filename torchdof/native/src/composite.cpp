@@ -839,55 +839,64 @@ class Composite {
     for (int r = y0 / s / PART; r <= r1; r++)
       for (int c = x0 / s / PART; c <= c1; c++) any |= run.used[(size_t)r * run.part_columns + c];
     if (!any) return;
-    const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s, pitch = TILE + 32, line_pitch = count + LANES;
-    std::vector<float> lines((size_t)channels * line_pitch), planes((size_t)channels * pitch);
-    float *const values = planes.data() + s / 2;  // between two samples the first value lies half a sample behind
+    const int channels = C_ + E_, count = TILE / s + 1, first = x0 / s, pitch = TILE + 32;
+    std::vector<float> memory((size_t)2 * channels * pitch);
+    float *upper = memory.data(), *lower = upper + channels * pitch;  // rows of the canvas, as wide as the tile's
+    bool upper_covers = false, lower_covers = false;
     float ramp[16];
     for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
-    for (int y = 0; y < TILE; y++) {
+    auto widen = [&](int row, float *to) {
+      vec most_cover = {};
+      for (int c = channels - 1; c >= 0; c--) {
+        const float *from = &run.canvas[((size_t)c * run.rows + row) * run.columns + first];
+        const int inside = std::max(std::min(count, run.columns - 1 - first), 0);
+        if (c >= C_) {
+          for (int i = 0; i <= inside; i += LANES) most_cover = most(most_cover, load<vec>(from + i));
+        } else if (!any_positive(most_cover)) {
+          memset(to, 0, (size_t)channels * pitch * sizeof(float));
+          return false;
+        }
+        float *v = to + (size_t)c * pitch;
+        if (s == 2)
+          for (int i = 0; i < inside; i++) {
+            const float step = from[i + 1] - from[i];
+            v[2 * i] = from[i] + 0.25f * step;
+            v[2 * i + 1] = from[i] + 0.75f * step;
+          }
+        else
+          for (int i = 0; i < inside; i++)
+            for (int part = 0; part < s; part += 4, v += 4) {
+              typedef float f4 __attribute__((vector_size(16)));
+              const f4 value = f4{} + from[i], step = f4{} + (from[i + 1] - from[i]);
+              store(v, value + step * load<f4>(ramp + part));
+            }
+      }
+      return true;
+    };
+    for (int y = 0, known = -2; y < TILE; y++) {
       const float at_y = (y0 + y + 0.5f) / s + 0.5f;
       const int row = std::min((int)at_y, run.rows - 2);
       const float down = at_y - row;
-      const int inside = std::max(std::min(count, run.columns - first), 0);
-      bool covered = false;
-      for (int c = channels - 1; c >= 0; c--) {
-        const float *upper = &run.canvas[((size_t)c * run.rows + row) * run.columns + first], *lower = upper + run.columns;
-        float *line = &lines[(size_t)c * line_pitch];
-        vec most_of = {};
-        for (int i = 0; i < inside; i += LANES) {
-          const vec top = load<vec>(upper + i), value = top + down * (load<vec>(lower + i) - top);
-          store(line + i, value);
-          most_of = most(most_of, value);
-        }
-        if (c >= C_)
-          covered |= any_positive(most_of);
-        else if (!covered)
-          break;
-        float *v = &planes[(size_t)c * pitch];
-        if (s == 2)
-          for (int i = 0; i + 1 < count; i++, v += 2) {
-            const float step = line[i + 1] - line[i];
-            v[0] = line[i] + 0.25f * step;
-            v[1] = line[i] + 0.75f * step;
-          }
-        else
-          for (int i = 0; i + 1 < count; i++)
-            for (int part = 0; part < s; part += 4, v += 4) {
-              typedef float f4 __attribute__((vector_size(16)));
-              const f4 from = f4{} + line[i], step = f4{} + (line[i + 1] - line[i]);
-              store(v, from + step * load<f4>(ramp + part));
-            }
+      if (row != known) {
+        std::swap(upper, lower);
+        upper_covers = row == known + 1 ? lower_covers : widen(row, upper);
+        lower_covers = widen(row + 1, lower);
+        known = row;
       }
-      if (!covered) continue;
-      for (int e = 0; e < E_; e++) {
-        const float *cover = values + (size_t)(C_ + e) * pitch;
+      if (!upper_covers && !lower_covers) continue;
+      // between two samples the first value lies half a sample behind
+      auto value_at = [&](int c, int x) {
+        const vec a = load<vec>(upper + (size_t)c * pitch + s / 2 + x), b = load<vec>(lower + (size_t)c * pitch + s / 2 + x);
+        return a + down * (b - a);
+      };
+      for (int c = 0; c < channels; c++) {
+        // coverage comes last, for what is left is told by its own
+        const int e = c < C_ ? E_ == 1 ? 0 : c : c - C_;
+        float *canvas = b.canvas[c] + y * TILE;
         for (int x = 0; x < TILE; x += LANES) {
-          const vec left = over_ ? most(all(1.0f) - load<vec>(cover + x), vec{}) : all(1.0f);
-          for (int c = 0; c < channels; c++) {
-            if (c < C_ ? E_ > 1 && c != e : c != C_ + e) continue;
-            float *canvas = b.canvas[c] + y * TILE + x;
-            store(canvas, load<vec>(values + (size_t)c * pitch + x) + left * load<vec>(canvas));
-          }
+          const vec value = value_at(c, x);
+          const vec left = over_ ? most(all(1.0f) - (c < C_ ? value_at(C_ + e, x) : value), vec{}) : all(1.0f);
+          store(canvas + x, value + left * load<vec>(canvas + x));
         }
       }
     }

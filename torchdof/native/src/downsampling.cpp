@@ -10,8 +10,8 @@ namespace {
 typedef float f4 __attribute__((vector_size(16)));
 
 // Adds up what a block of one surface has between two nodes; out as Pieces::values. Weights lie without gaps.
-template <int CHANNELS>
-void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int s,
+template <int CHANNELS, int S>
+void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight,
               const LayerIndex &index, const Layer &l, float *out) {
   f4 share = {}, part_sum = {}, one[CHANNELS] = {}, two[CHANNELS] = {};
   auto add = [&](const f4 w, const f4 c, auto light_at) {
@@ -24,13 +24,13 @@ void sum_part(const float *const *light, size_t light_step, const float *coc, si
       two[i] += v * part;
     }
   };
-  if (s == 2) {
+  if (S == 2) {
     auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
     add(load<f4>(weight), four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
   } else {
-    for (int y = 0; y < s; y++)
-      for (int x = 0; x < s; x += 4)
-        add(load<f4>(weight + y * s + x), load<f4>(coc + y * coc_step + x),
+    for (int y = 0; y < S; y++)
+      for (int x = 0; x < S; x += 4)
+        add(load<f4>(weight + y * S + x), load<f4>(coc + y * coc_step + x),
             [&](const float *from) { return load<f4>(from + y * light_step + x); });
   }
   auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
@@ -217,7 +217,12 @@ class Downsampling {
       if (inside) {
         if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
         if (C == 3) {
-          sum_intervals(&index_.intervals[i][(size_t)y0 * W + x0], coc, i ? BLOCK : W, weight);
+          const uint16_t *interval = &index_.intervals[i][(size_t)y0 * W + x0];
+          const int coc_step = i ? BLOCK : W;
+          s == 2 ? sum_intervals<2>(interval, coc, coc_step, weight)
+          : s == 4 ? sum_intervals<4>(interval, coc, coc_step, weight)
+          : s == 8 ? sum_intervals<8>(interval, coc, coc_step, weight)
+                   : sum_intervals<16>(interval, coc, coc_step, weight);
           continue;
         }
       }
@@ -276,40 +281,39 @@ class Downsampling {
   }
 
   // A block of one surface, of three channels, within the frame: the sums of each interval that occurs in it.
+  template <int S>
   void sum_intervals(const uint16_t *interval, const float *coc, int coc_step, const float *weight) {
-    const int s = to_.scale, area = s * s;
+    constexpr int AREA = S * S;
     const size_t light_step = weight ? BLOCK : s_.width;
-    float left[BLOCK_PIXELS], interval_of[BLOCK_PIXELS], of_one[BLOCK_PIXELS];
-    bool alike = true;
+    float left[AREA], interval_of[AREA], of_one[AREA];
+    unsigned differs = 0;
     float any = 0;
-    for (int y = 0, i = 0; y < s; y++)
-      for (int x = 0; x < s; x++, i++) {
-        const int k = interval[(size_t)y * s_.width + x];
-        alike &= k == *interval;
-        interval_of[i] = (float)k;
-        left[i] = weight ? weight[y * BLOCK + x] : 1.0f;
-        any += left[i];
+    for (int y = 0; y < S; y++)
+      for (int x = 0; x < S; x++) {
+        differs |= interval[(size_t)y * s_.width + x] ^ *interval;
+        left[y * S + x] = weight ? weight[y * BLOCK + x] : 1.0f;
+        any += left[y * S + x];
       }
     if (any == 0) return;
-    for (int i = 0; i < area; i++) {
+    auto add = [&](int node, const float *weights, float sum) {
+      if (to_.wanted[node])
+        sum_part<3, S>(light_.data(), light_step, coc, coc_step, weights, index_, job_.layers[node], gathered_.between(to_.stands_for[node]));
+      else if (to_.needed(node))
+        gathered_.between(to_.stands_for[node])[0] += sum;
+    };
+    if (!differs) return add(*interval, left, any);
+    for (int y = 0; y < S; y++)
+      for (int x = 0; x < S; x++) interval_of[y * S + x] = (float)interval[(size_t)y * s_.width + x];
+    for (int i = 0; i < AREA; i++) {
       if (left[i] == 0) continue;
       const float k = interval_of[i];
-      float *from = left;
-      if (!alike) {  // the others weigh nothing
-        from = of_one;
-        any = 0;
-        for (int j = 0; j < area; j++) {
-          of_one[j] = interval_of[j] == k ? left[j] : 0.0f;
-          left[j] -= of_one[j];
-          any += of_one[j];
-        }
+      any = 0;
+      for (int j = 0; j < AREA; j++) {  // the others weigh nothing
+        of_one[j] = interval_of[j] == k ? left[j] : 0.0f;
+        left[j] -= of_one[j];
+        any += of_one[j];
       }
-      const int node = (int)k;
-      if (to_.wanted[node])
-        sum_part<3>(light_.data(), light_step, coc, coc_step, from, s, index_, job_.layers[node], gathered_.between(to_.stands_for[node]));
-      else if (to_.needed(node))
-        gathered_.between(to_.stands_for[node])[0] += any;
-      if (alike) return;
+      add((int)k, of_one, any);
     }
   }
 
