@@ -89,21 +89,16 @@ def _crowded(x: Tensor, width: float, least_share: float, tolerance: float | Non
     bins = torch.round(_in_finest(x) * (3.0 / width)).long()
     first = int(bins.min())
     counts = torch.bincount(bins - first)
-    sums = functional.pad(counts.cumsum(0), (1, 0)).tolist()
-
-    def count_within(i: int, reach: int) -> int:
-        return int(sums[min(i + reach + 1, len(counts))] - sums[max(i - reach, 0)])
+    crowds: list[int] = functional.pad(counts, (1, 1)).unfold(0, 3, 1).sum(-1).tolist()
+    sums: list[int] = functional.pad(counts.cumsum(0), (1, 0)).tolist()
 
     places: list[float] = []
     least = max(least_share * len(x), 16)
-    crowds = {i: count_within(i, 1) for i in range(len(counts))}
-    for i, count in sorted(crowds.items(), key=lambda item: -item[1]):
-        if count < least:
-            break
+    for i in sorted((i for i, crowd in enumerate(crowds) if crowd >= least), key=lambda i: -crowds[i]):
         place = _from_finest((first + i) * width / 3.0)
         if tolerance is not None:
             reach = round(1.5 * spacing(place, tolerance) / (finest(place) * width))
-            if 2 * count < count_within(i, reach):
+            if 2 * crowds[i] < sums[min(i + reach + 1, len(crowds))] - sums[max(i - reach, 0)]:
                 continue
         if all(abs(place - other) > 0.6 * finest(place) for other in places):
             # one that occurs: its pixels then lie in no other layer
