@@ -57,7 +57,6 @@ struct Scene {
     scene.kind = integer(TORCHDOF_IMAGE, TORCHDOF_STACK);
     scene.surfaces = scene.kind == TORCHDOF_IMAGE ? 1 : scene.kind == TORCHDOF_BACKGROUND ? 2 : integer(1, 4);
     scene.occlusion = integer(0, 3) > 0;
-    scene.extend = integer(0, 1);
     scene.normalize = integer(0, 3) > 0;
     scene.masked = integer(0, 1) && scene.kind != TORCHDOF_STACK;  // a stack's values are finite
     scene.highlights = integer(0, 3) > 0;

@@ -145,6 +145,18 @@ def test_engines_agree_on_highlights(occlusion: bool, table: BlurTable, by_both:
     assert_same_picture(by_both(Scene(image, coc, {"table": table, "occlusion": occlusion}).blurred), image)
 
 
+@pytest.mark.parametrize("occlusion", [True, False])
+@pytest.mark.parametrize(("near_px", "far_px"), [(-9.0, 11.0), (-24.0, 30.0)])
+def test_engines_agree_where_coarse_layers_are_few(
+    near_px: float, far_px: float, occlusion: bool, by_both: Any
+) -> None:
+    torch.manual_seed(3)
+    image, coc = torch.rand(1, 3, 270, 390), random_map("smooth", (1, 270, 390), 2.5)
+    coc[..., 20:60, 30:75] = near_px + torch.rand(40, 45)
+    coc[..., 200:, 310:] = far_px + torch.rand(70, 80)
+    assert_same_picture(by_both(Scene(image, coc, {"occlusion": occlusion}).blurred), image)
+
+
 @pytest.mark.parametrize("check", [True, False])
 @pytest.mark.parametrize("lamps", [1.0, 50.0])
 def test_engines_agree_before_a_known_background(lamps: float, check: bool, by_both: Any) -> None:

@@ -9,52 +9,53 @@ namespace {
 
 constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing is known
 constexpr float KNOWN = 2e-3f;    // and from which on a layer is known in full
-constexpr float FOOT = 0.15f;     // share up to which a ramp between layers rises by its square,
-constexpr float SLOPE = 1 / (1 - FOOT / 2);  // and how it goes on
 constexpr float HAIR = 0.06f;     // share of a surface up to which it does not yet hide what is known behind it
 constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
+constexpr int PART = 16;  // pixels a side of what is known to be empty in a coarser canvas
 
-// A ramp from 0 to 1, exactly, whose foot is a parabola.
-inline float eased(float v) {
-  const float foot = std::min(v, FOOT);
-  return std::max(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
-}
-template <typename V>
-inline V eased(V v) {
-  const V most = V{} + FOOT, foot = v < most ? v : most;
-  const V line = 1.0f - SLOPE * (1.0f - v), parabola = SLOPE / (2 * FOOT) * foot * foot;
-  return line > parabola ? line : parabola;
-}
 inline bool any_positive(vec v) {
+#if defined(__AVX2__)
+  return __builtin_ia32_movmskps256(vec(v > vec{})) != 0;
+#else
   typedef long long wide __attribute__((vector_size(LANES * 4)));
   const wide bits = (wide)(v > vec{});
-  long long any = 0;
-  for (int i = 0; i < LANES / 2; i++) any |= bits[i];
-  return any != 0;
+  return (bits[0] | bits[1]) != 0;
+#endif
 }
+
+constexpr float EVEN = 1e-12f;  // square of what a weight of 1 may lack
 
 // Neighbouring layers of one resolution and, if it is a coarser one, one side of the focus.
 struct Run {
   int scale, first, last, half;
   int tile_rows = 0, tile_columns = 0, rows = 0, columns = 0;  // of its canvas, one pixel more on each side
   Buffer<float> canvas;                                        // light and coverage
-  std::vector<uint8_t> used;                                   // tiles with anything in them
+  int part_columns = 0;                                        // of parts of PART x PART of its pixels
+  std::vector<uint8_t> used;                                   // parts with anything in them
 };
 
-// Parts of blocks of pixels that lie between two nodes: for each its place in the window, the node before, and
-// 2 (channels + 1) sums: share and light; and these times how far between the nodes each pixel lies.
-struct Pieces {
-  std::vector<int> at, node, order;
-  std::vector<float> values;  // of more pieces than there are
-  int count = 0;
-  float *add(int place, int after, int stride) {
-    if ((size_t)(count + 1) * stride > values.size()) values.resize(std::max<size_t>(values.size() * 2, 4096 * stride));
-    at.push_back(place);
-    node.push_back(after);
-    return values.data() + (size_t)count++ * stride;
-  }
+// Pieces of blocks in a window: where each lies in it, its node and values. Those of node i are order[start[i]] to
+// order[start[i + 1]].
+struct WindowPieces {
+  std::vector<int> at, node, start, order;
+  std::vector<const float *> values;
+};
+
+// The part of a window that lies in one block of pixels: where its surfaces are, and what its terms were last.
+struct WindowBlock {
+  struct Surface {
+    const float *light, *weight;  // from the block's first row in the window; weight null: 1
+    int light_pitch, weight_pitch;
+    size_t channel;  // from one channel to the next
+  };
+  int top, rows, column;  // in the window
+  Surface surfaces[2];
+  int count;
+  const uint64_t *layers;  // that occur in it
+  bool clear;              // no layer's light or share stands in the terms
+  int room;                // 0 or 1 where that is all that stands in this term, else -1
 };
 
 // Planes of a window, `pitch` values a row.
@@ -62,14 +63,31 @@ struct Scratch {
   std::vector<float> memory;
   std::vector<float *> light, coc, weight;  // of each surface (light: [surfaces, channels])
   std::vector<float *> term;    // what a layer spreads: light, share, room
-  std::vector<float *> spread;  // the same spread: light, then share and room of each colour
   std::vector<float *> canvas;  // light and coverage of a tile
+  float *traced;                // light of rays in a tile
   std::vector<float *> mine;    // a row of each surface's share
   float *rest;                  // what lies wholly behind a coarse layer
-  std::vector<uint32_t> rows, every;
+  std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for 16 columns
   std::vector<const float *> pointers;
-  std::vector<uint64_t> layers;
-  Pieces pieces;
+  std::vector<uint64_t> layers, block_layers;
+  std::vector<WindowBlock> blocks;
+  WindowPieces pieces;
+};
+
+// What a row of terms has, a bit for 16 columns: something; something behind the layer; something before it.
+struct Occupied {
+  uint32_t some = 0, open = 0, uneven = 0;
+  void add(int x, float share, float room, bool over) {
+    const uint32_t bit = 1u << std::min(x / 16, 31);
+    if (share > 0) some |= bit;
+    if (over && room > share) open |= bit;
+    if (over && (room - 1.0f) * (room - 1.0f) > EVEN) uneven |= bit;
+  }
+  void put(Scratch &b, int y) const {
+    b.occupied[y] = some;
+    b.open[y] = open;
+    b.uneven[y] = uneven;
+  }
 };
 
 }  // namespace
@@ -82,8 +100,8 @@ class Composite {
   void run() {
     H_ = job_.height, W_ = job_.width, C_ = job_.channels, E_ = job_.colours, N_ = (int)layers_.size();
     over_ = job_.scene.occlusion;
-    low_ = (float)layers_.front().node;
-    high_ = (float)layers_.back().node;
+    index_.low = (float)layers_.front().node;
+    index_.high = (float)layers_.back().node;
     int half = 0;
     for (int k = 0; k < N_; k++) {
       const Layer &l = layers_[k];
@@ -115,9 +133,16 @@ class Composite {
       run.columns = ceil_div(W_, run.scale) + 2;
       run.tile_rows = ceil_div(run.rows, TILE);
       run.tile_columns = ceil_div(run.columns, TILE);
-      run.used.assign(run.tile_rows * run.tile_columns, 0);
-      run.canvas = Buffer<float>((size_t)(C_ + E_) * run.rows * run.columns);
+      run.part_columns = run.tile_columns * (TILE / PART);
+      run.used.assign((size_t)run.tile_rows * (TILE / PART) * run.part_columns, 0);
+      run.canvas = Buffer<float>((size_t)(C_ + E_) * run.rows * run.columns + PART);  // rows are read in whole vectors
       for (int t = 0; t < run.tile_rows * run.tile_columns; t++) coarse.push_back({r, t});
+      if (s_.independent || downsampled(run.scale)) continue;
+      int margin = 0;
+      for (const Run &same : runs_)
+        if (same.scale == run.scale) margin = std::max(margin, same.half + 1);
+      downsampled_.emplace_back(new Downsampled(job_, run.scale, margin));
+      downsampled_.back()->take(job_, index_, border_);
     }
     job_.parallel((int)coarse.size(), [&](int i, int worker) { coarse_tile(runs_[coarse[i].first], coarse[i].second, scratch(worker)); });
     if (!job_.rays.empty()) sort_rays();
@@ -132,42 +157,42 @@ class Composite {
       Scratch &b = *scratches_[worker];
       const size_t plane = (size_t)window_ * pitch_;
       const int count = s_.count, planes = count * (C_ + 2) + (C_ + 2) + 1;
-      b.memory.assign(planes * plane + (size_t)(2 * C_ + 3 * E_) * TILE_PIXELS + (size_t)count * pitch_ * 2 + 16, 0.0f);
+      b.memory.assign(planes * plane + (size_t)(2 * C_ + E_) * TILE_PIXELS + (size_t)(count + 2) * pitch_ + 16, 0.0f);
       float *p = b.memory.data();
       auto take = [&](size_t size) { return (p += size) - size; };
       for (int i = 0; i < count * C_; i++) b.light.push_back(take(plane));
       for (int i = 0; i < count; i++) b.coc.push_back(take(plane)), b.weight.push_back(take(plane));
       for (int i = 0; i < C_ + 2; i++) b.term.push_back(take(plane));
       b.rest = take(plane);
-      for (int i = 0; i < C_ + 2 * E_; i++) b.spread.push_back(take(TILE_PIXELS));
+      b.traced = take((size_t)C_ * TILE_PIXELS);
       for (int i = 0; i < C_ + E_; i++) b.canvas.push_back(take(TILE_PIXELS));
-      for (int i = 0; i < 2 * count; i++) b.mine.push_back(take(pitch_));
-      b.rows.resize(window_);
+      for (int i = 0; i < count + 2; i++) b.mine.push_back(take(pitch_));
+      for (auto *rows : {&b.occupied, &b.open, &b.uneven}) rows->resize(window_);
       b.every.assign(window_, ~0u);
       b.pointers.resize(C_);
-      b.layers.resize(words_);
+      b.layers.resize(index_.words);
     }
     return *scratches_[worker];
   }
 
   // For each pixel of each surface the node before it, and for each cell the layers in it.
   void index() {
-    words_ = (N_ + 63) / 64;
-    cell_rows_ = ceil_div(H_, CELL);
-    cell_columns_ = ceil_div(W_, CELL);
-    cells_.assign((size_t)cell_rows_ * cell_columns_ * words_, 0);
-    single_.assign((size_t)cell_rows_ * cell_columns_, 0);
-    for (int i = 0; i < s_.count; i++) intervals_.emplace_back(s_.area());
+    index_.words = (N_ + 63) / 64;
+    index_.rows = ceil_div(H_, CELL);
+    index_.columns = ceil_div(W_, CELL);
+    index_.bits.assign((size_t)index_.rows * index_.columns * index_.words, 0);
+    index_.single.assign((size_t)index_.rows * index_.columns, 0);
+    for (int i = 0; i < s_.count; i++) index_.intervals.emplace_back(s_.area());
     constexpr int STEPS = 4096;
     std::vector<int> start(STEPS + 2);
-    const double reach = (double)high_ - low_;
+    const double reach = (double)index_.high - index_.low;
     for (int i = 0, k = 0; i <= STEPS + 1; i++) {
-      while (k + 1 < N_ && (float)layers_[k + 1].node <= low_ + (i - 1) * reach / STEPS) k++;
+      while (k + 1 < N_ && (float)layers_[k + 1].node <= index_.low + (i - 1) * reach / STEPS) k++;
       start[i] = k;
     }
     const float scale = reach > 0 ? (float)(STEPS / reach) : 0.0f;
     auto node_before = [&](float place) {
-      int k = start[std::clamp((int)((place - low_) * scale), 0, STEPS)];
+      int k = start[std::clamp((int)((place - index_.low) * scale), 0, STEPS)];
       while (k + 1 < N_ && place >= layers_[k + 1].at) k++;
       return k;
     };
@@ -182,24 +207,24 @@ class Composite {
       for (int bx = 0; bx < s_.block_columns; bx++) {
         const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK), x_end = std::min(W_, (bx + 1) * BLOCK);
         if (!s_.whole() && !s_.has_block(block)) {  // one surface; mostly between the same two nodes
-          const float low = axis(job_.block_low[block], low_, high_), high = axis(job_.block_high[block], low_, high_);
+          const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
           const int k = node_before(low);
           if (k == node_before(high)) {
-            for (int y = by * BLOCK; y < y_end; y++) std::fill(&intervals_[0][(size_t)y * W_ + bx * BLOCK], &intervals_[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
+            for (int y = by * BLOCK; y < y_end; y++) std::fill(&index_.intervals[0][(size_t)y * W_ + bx * BLOCK], &index_.intervals[0][(size_t)y * W_ + x_end - 1] + 1, (uint16_t)k);
             for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
               for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-                const size_t cell = (size_t)row * cell_columns_ + column;
-                mark(&cells_[cell * words_], low, k);
-                mark(&cells_[cell * words_], high, k);
-                single_[cell] = !s_.independent;
+                const size_t cell = (size_t)row * index_.columns + column;
+                mark(&index_.bits[cell * index_.words], low, k);
+                mark(&index_.bits[cell * index_.words], high, k);
+                index_.single[cell] = !s_.independent;
               }
             continue;
           }
         }
         for (int row = by * CELLS; row * CELL < y_end && row < (by + 1) * CELLS; row++)
           for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
-            const size_t cell = (size_t)row * cell_columns_ + column;
-            uint64_t *bits = &cells_[cell * words_];
+            const size_t cell = (size_t)row * index_.columns + column;
+            uint64_t *bits = &index_.bits[cell * index_.words];
             const int x0 = column * CELL, n = std::min(CELL, W_ - x0);
             bool single = true;
             for (int i = 0; i < s_.count; i++) {
@@ -212,7 +237,7 @@ class Composite {
                 if (n == CELL) {
                   vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = all(weight ? 0.0f : 1.0f);
                   for (int x = 0; x < CELL; x += LANES, count += LANES) {
-                    const vec place = axis(load<vec>(coc + x), low_, high_);
+                    const vec place = index_.place(load<vec>(coc + x));
                     store(places + count, place);
                     lows = least(lows, place);
                     highs = most(highs, place);
@@ -232,16 +257,19 @@ class Composite {
                   const float w = weight ? weight[x] : 1.0f;
                   if (weight && (i ? w != 0 : w < 1)) single = false;
                   any |= there[count] = w != 0;
-                  places[count] = axis(coc[x], low_, high_);
+                  places[count] = index_.place(coc[x]);
                   low = std::min(low, places[count]);
                   high = std::max(high, places[count]);
                 }
               }
-              if (!any) continue;
+              if (!any) {
+                for (int j = 0; j < count; j++) index_.intervals[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = 0;
+                continue;
+              }
               const int first = node_before(low), last = node_before(high);
               for (int j = 0; j < count; j++) {
                 const int k = first == last ? first : node_before(places[j]);
-                intervals_[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = (uint16_t)k;
+                index_.intervals[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = (uint16_t)k;
                 if (first != last && there[j]) mark(bits, places[j], k);
               }
               if (first == last) {
@@ -249,7 +277,7 @@ class Composite {
                 mark(bits, high, first);
               }
             }
-            single_[cell] = single && !s_.independent;
+            index_.single[cell] = single && !s_.independent;
           }
       }
     });
@@ -257,21 +285,19 @@ class Composite {
 
   // Layers in cells, and whether these show the first surface alone.
   bool around(int r0, int r1, int c0, int c1, uint64_t *bits) const {
-    r0 = std::clamp(r0, 0, cell_rows_ - 1), r1 = std::clamp(r1, 0, cell_rows_ - 1);
-    c0 = std::clamp(c0, 0, cell_columns_ - 1), c1 = std::clamp(c1, 0, cell_columns_ - 1);
-    for (int w = 0; w < words_; w++) bits[w] = 0;
+    r0 = std::clamp(r0, 0, index_.rows - 1), r1 = std::clamp(r1, 0, index_.rows - 1);
+    c0 = std::clamp(c0, 0, index_.columns - 1), c1 = std::clamp(c1, 0, index_.columns - 1);
+    for (int w = 0; w < index_.words; w++) bits[w] = 0;
     bool single = true;
     for (int r = r0; r <= r1; r++)
       for (int c = c0; c <= c1; c++) {
-        const size_t cell = (size_t)r * cell_columns_ + c;
-        for (int w = 0; w < words_; w++) bits[w] |= cells_[cell * words_ + w];
-        single &= (bool)single_[cell];
+        const size_t cell = (size_t)r * index_.columns + c;
+        for (int w = 0; w < index_.words; w++) bits[w] |= index_.bits[cell * index_.words + w];
+        single &= (bool)index_.single[cell];
       }
     return single;
   }
   static bool has(const uint64_t *bits, int k) { return bits[k / 64] >> k % 64 & 1; }
-
-  static int floor_div(int a, int b) { return a >= 0 ? a / b : -((-a + b - 1) / b); }
 
   // A coarse run in one of its tiles.
   void coarse_tile(Run &run, int which, Scratch &b) {
@@ -289,222 +315,133 @@ class Composite {
           memset(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], 0, columns * sizeof(float));
       return;
     }
-    run.used[which] = 1;
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
-    if (!s_.independent) {
-      if (C_ == 3) gather<3>(run, top, left, height, width, b); else gather<0>(run, top, left, height, width, b);
-    }
+    const Downsampled *d = downsampled(s);
+    if (d) find_pieces(run, *d, top, left, height, width, b);
     for (int k = run.last; k >= run.first; k--) {
+      if (!has(b.layers.data(), k)) continue;
       const Layer &l = layers_[k];
-      const bool there = s_.independent ? has(b.layers.data(), k) : !(piece_start(b, k - run.first + 2) == piece_start(b, k - run.first));
-      if (!there) continue;
       const int spare = half - l.half;
-      const size_t shift = (size_t)spare * pitch_ + spare;
-      if (s_.independent)
-        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, shift, b);
+      if (d)
+        downsampled_terms(run, *d, k, top, left, height, width, spare, b);
       else
-        add_pieces(run, k, height, b);
-      lay(b, l, rows, columns, shift);
+        block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, (size_t)spare * pitch_ + spare, b);
+      if (!d) find_occupied(b, spare, rows + 2 * l.half, spare, columns + 2 * l.half);
+      lay(b, l, rows, columns, spare, spare);
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
         memcpy(&run.canvas[((size_t)c * run.rows + tile_y + y) * run.columns + tile_x], b.canvas[c] + y * TILE, columns * sizeof(float));
+    for (int y = 0; y < rows; y += PART)
+      for (int x = 0; x < columns; x += PART) {
+        vec most_cover = {};
+        for (int e = 0; e < E_; e++)
+          for (int i = 0; i < PART; i++)
+            for (int j = 0; j < PART; j += LANES) most_cover = most(most_cover, load<vec>(b.canvas[C_ + e] + (y + i) * TILE + x + j));
+        run.used[(size_t)(tile_y + y) / PART * run.part_columns + (tile_x + x) / PART] = any_positive(most_cover);
+      }
   }
 
-  static int piece_start(const Scratch &b, int i) { return b.pieces.order[i]; }
+  const Downsampled *downsampled(int scale) const {
+    for (const auto &d : downsampled_)
+      if (d->scale == scale) return d.get();
+    return nullptr;
+  }
 
-  // What the blocks of a window hold for a run, sorted by node. Pieces between node first - 1 + i and the next one are
-  // order[i] to order[i + 1].
-  template <int CHANNELS>
-  void gather(const Run &run, int top, int left, int height, int width, Scratch &b) {
-    const int C = CHANNELS ? CHANNELS : C_, s = run.scale, stride = 2 * (C + 1), L = run.last - run.first + 2;
-    const float each = 1.0f / (s * s);
-    Pieces &p = b.pieces;
+  // Pieces in a window that a run spreads, sorted by node; the weight of those behind the run.
+  void find_pieces(const Run &run, const Downsampled &d, int top, int left, int height, int width, Scratch &b) {
+    const int per_band = BLOCK / d.scale, L = run.last - run.first + 2, stride = d.stride();
+    WindowPieces &p = b.pieces;
     p.at.clear();
     p.node.clear();
-    p.count = 0;
-    std::vector<float> sums(stride);
-    for (int by = 0; by < height; by++) memset(b.rest + (size_t)by * pitch_, 0, width * sizeof(float));
-    for (int by = 0; by < height; by++)
-      for (int bx = 0; bx < width; bx++) {
-        const int y0 = (top + by) * s, x0 = (left + bx) * s, place = by * pitch_ + bx;
-        const bool inside = y0 >= 0 && x0 >= 0 && y0 + s <= H_ && x0 + s <= W_;
-        int count = s_.count;
-        if (inside) {
-          bool before = false, behind = false, here = false, single = true;  // layers of its cells relative to the run
-          for (int row = y0 / CELL; row <= (y0 + s - 1) / CELL; row++)
-            for (int column = x0 / CELL; column <= (x0 + s - 1) / CELL; column++) {
-              const size_t cell = (size_t)row * cell_columns_ + column;
-              const uint64_t *bits = &cells_[cell * words_];
-              for (int w = 0; w < words_; w++) {
-                before |= (bits[w] & below(run.first, w)) != 0;
-                behind |= (bits[w] & ~below(run.last + 1, w)) != 0;
-                here |= (bits[w] & ~below(run.first, w) & below(run.last + 1, w)) != 0;
-              }
-              single &= (bool)single_[cell];
-            }
-          if (!here && !behind) continue;
-          if (single && !here && !before) {
-            b.rest[place] = 1.0f;
-            continue;
-          }
-          if (single) count = 1;
+    p.values.clear();
+    if (over_)
+      for (int y = 0; y < height; y++) memset(b.rest + (size_t)y * pitch_, 0, width * sizeof(float));
+    for (int y = 0; y < height; y++) {
+      const int row = top + y, band = floor_div(row, per_band);
+      const Pieces &pieces = d.pieces[band - d.first_band];
+      const int *start = &pieces.start[row - band * per_band], *column = pieces.column.data();
+      const int end = (int)(std::lower_bound(column + start[0], column + start[1], left + width) - column);
+      for (int i = (int)(std::lower_bound(column + start[0], column + start[1], left) - column); i < end; i++) {
+        const int node = (int)pieces.node[i] - run.first + 1, at = y * pitch_ + column[i] - left;
+        const float *values = &pieces.values[(size_t)i * stride];
+        if (node < 0) continue;
+        if (node >= L) {
+          b.rest[at] += values[0];
+          continue;
         }
-        for (int i = 0; i < count; i++) {
-          const float *light_of[CHANNELS ? CHANNELS : 1], *coc, *weight;
-          const float **light = CHANNELS ? light_of : b.pointers.data();
-          if (inside) {
-            if (!s_.row(i, y0, x0, light, coc, weight)) break;
-            const uint16_t *interval = &intervals_[i][(size_t)y0 * W_ + x0];
-            const size_t light_step = s_.whole() || !weight ? W_ : BLOCK, coc_step = i && !s_.whole() ? BLOCK : W_;
-            if (CHANNELS && one_interval(interval, s)) {
-              const int k = *interval;
-              if (k + 1 < run.first) continue;
-              if (k > run.last) {
-                float sum = weight ? 0.0f : s * s;
-                if (weight)
-                  for (int y = 0; y < s; y++)
-                    for (int x = 0; x < s; x++) sum += weight[y * light_step + x];
-                b.rest[place] += sum * each;
-                continue;
-              }
-              float *to = p.add(place, k - run.first + 1, stride);
-              if (weight)
-                sum_block<CHANNELS, true>(light, light_step, coc, coc_step, weight, s, k, to);
-              else
-                sum_block<CHANNELS, false>(light, light_step, coc, coc_step, weight, s, k, to);
-              continue;
-            }
-          }
-          int node = -1;
-          auto flush = [&] {
-            if (node < 0) return;
-            memcpy(p.add(place, node - run.first + 1, stride), sums.data(), stride * sizeof(float));
-          };
-          for (int y = 0; y < s; y++) {
-            const int at_y = std::clamp(y0 + y, 0, H_ - 1);
-            if (inside) s_.row(i, at_y, x0, light, coc, weight);
-            for (int x = 0; x < s; x++) {
-              int at = x, at_x = x0 + x;
-              bool beyond = false;
-              if (!inside) {
-                at_x = std::clamp(at_x, 0, W_ - 1);
-                beyond = y0 + y != at_y || x0 + x != at_x;
-                at = 0;
-                if (!s_.row(i, at_y, at_x, light, coc, weight)) continue;
-              }
-              const float w = weight ? weight[at] : 1.0f;
-              if (w == 0) continue;
-              const int k = intervals_[i][(size_t)at_y * W_ + at_x];
-              if (k + 1 < run.first) continue;
-              if (k > run.last) {
-                b.rest[place] += w * each;
-                continue;
-              }
-              if (k != node) {
-                flush();
-                node = k;
-                std::fill(sums.begin(), sums.end(), 0.0f);
-              }
-              const float ramp = clamp01((axis(coc[at], low_, high_) - layers_[k].at) * layers_[k].per_after);
-              const float part = over_ ? eased(ramp) : ramp;
-              float *one = sums.data(), *two = one + C + 1;
-              one[0] += w;
-              two[0] += w * part;
-              for (int c = 0; c < C; c++) {
-                const float v = w * (beyond ? border_.light(i, c, y0 + y, x0 + x, light[c][at]) : light[c][at]);
-                one[1 + c] += v;
-                two[1 + c] += v * part;
-              }
-            }
-          }
-          flush();
+        p.at.push_back(at);
+        p.node.push_back(node);
+        p.values.push_back(values);
+      }
+    }
+    p.start.assign(L + 1, 0);
+    for (int node : p.node) p.start[node + 1]++;
+    for (int i = 0; i < L; i++) p.start[i + 1] += p.start[i];
+    p.order.resize(p.node.size());
+    std::vector<int> next(p.start.begin(), p.start.end() - 1);
+    for (int i = 0; i < (int)p.node.size(); i++) p.order[next[p.node[i]]++] = i;
+  }
+
+  // What layer k spreads of a window; what lies behind it is added to the rest.
+  void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, int spare, Scratch &b) {
+    const int C = C_;
+    const vec at = all((float)k), before = all((float)(k - 1));
+    for (int y = spare; y < height - spare; y++) {
+      const size_t to = (size_t)y * pitch_;
+      const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(2, top + y) + left;
+      float *share = b.term[C] + to, *room = b.term[C + 1] + to;
+      uint32_t occupied = 0, open = 0, uneven = 0;
+      for (int x0 = 0; x0 < width; x0 += 16) {
+        vec some = {}, more = {}, other = {};
+        for (int x = x0; x < x0 + 16; x += LANES) {
+          const vec n = load<vec>(node + x);
+          const auto ahead = n == before, behind = n == at;
+          const vec w = load<vec>(one + x), part = load<vec>(two + x);
+          const vec ramp = ahead ? part : vec{}, its_share = behind ? w - part : ramp;
+          store(share + x, its_share);
+          some = most(some, its_share);
+          if (!over_) continue;
+          const vec its_room = (n >= at ? w : ramp) + load<vec>(b.rest + to + x), lacking = its_room - all(1.0f);
+          store(room + x, its_room);
+          more = most(more, its_room - its_share);
+          other = most(other, lacking * lacking - all(EVEN));
+        }
+        const int bit = std::min(x0 / 16, 31);
+        occupied |= (uint32_t)any_positive(some) << bit;
+        open |= (uint32_t)any_positive(more) << bit;
+        uneven |= (uint32_t)any_positive(other) << bit;
+      }
+      b.occupied[y] = occupied;
+      b.open[y] = open;
+      b.uneven[y] = uneven;
+      for (int c = 0; c < C; c++) {
+        const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
+        float *term = b.term[c] + to;
+        for (int x = 0; x < width; x += LANES) {
+          const vec n = load<vec>(node + x), v = load<vec>(far + x);
+          store(term + x, n == at ? load<vec>(light + x) - v : n == before ? v : vec{});
         }
       }
-    // sorted by node
-    const int pieces = p.count;
-    p.order.assign(L + 2 + pieces, 0);
-    for (int node : p.node) p.order[node + 1]++;
-    for (int i = 0; i <= L; i++) p.order[i + 1] += p.order[i];
-    std::vector<int> next(p.order.begin(), p.order.begin() + L + 1);
-    for (int i = 0; i < pieces; i++) p.order[L + 2 + next[p.node[i]]++] = i;
-  }
-
-  bool one_interval(const uint16_t *at, int s) const {
-    const uint16_t first = at[0];
-    unsigned differs = 0;
-    for (int y = 0; y < s; y++, at += W_)
-      for (int x = 0; x < s; x++) differs |= at[x] ^ first;
-    return !differs;
-  }
-
-  // The sums of a block of one surface that lies between two nodes.
-  template <int CHANNELS, bool WEIGHTED>
-  void sum_block(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight, int s,
-                 int k, float *out) const {
-    typedef float f4 __attribute__((vector_size(16)));
-    const float node = layers_[k].at, per_after = layers_[k].per_after;
-    f4 share = {}, part_sum = {}, one[CHANNELS ? CHANNELS : 1] = {}, two[CHANNELS ? CHANNELS : 1] = {};
-    const f4 none = {}, whole = {1, 1, 1, 1};
-    auto add = [&](const f4 w, const f4 at, auto light_at) {
-      f4 ramp = (axis(at, low_, high_) - node) * per_after;
-      if (over_) {
-        ramp = ramp < whole ? ramp : whole;
-        ramp = eased(ramp > none ? ramp : none);
-      }
-      const f4 part = ramp * w;
-      share += w;
-      part_sum += part;
-      for (int c = 0; c < CHANNELS; c++) {
-        const f4 v = light_at(light[c]);
-        one[c] += v * w;
-        two[c] += v * part;
-      }
-    };
-    if (s == 2) {
-      auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
-      add(WEIGHTED ? four(weight, light_step) : whole, four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
-    } else {
-      for (int y = 0; y < s; y++)
-        for (int x = 0; x < s; x += 4)
-          add(WEIGHTED ? load<f4>(weight + y * light_step + x) : whole, load<f4>(coc + y * coc_step + x),
-              [&](const float *from) { return load<f4>(from + y * light_step + x); });
     }
-    auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
-    out[0] = sum(share);
-    out[CHANNELS + 1] = sum(part_sum);
-    for (int c = 0; c < CHANNELS; c++) {
-      out[1 + c] = sum(one[c]);
-      out[CHANNELS + 2 + c] = sum(two[c]);
-    }
-  }
-
-  static uint64_t below(int k, int word) {  // bits of layers before layer k
-    const int bit = k - 64 * word;
-    return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
-  }
-
-  // What layer k spreads of the pieces of its run; what lies behind it is added to the rest.
-  void add_pieces(const Run &run, int k, int height, Scratch &b) {
-    const int C = C_, stride = 2 * (C + 1), L = run.last - run.first + 2;
-    const float each = 1.0f / (run.scale * run.scale);
-    Pieces &p = b.pieces;
-    for (int c = 0; c < C + 1; c++) memset(b.term[c], 0, sizeof(float) * height * pitch_);
+    const WindowPieces &p = b.pieces;
     auto add = [&](int node, bool behind) {  // pieces before the layer's node, or behind it
-      for (int i = p.order[node]; i < p.order[node + 1]; i++) {
-        const int piece = p.order[L + 2 + i], at = p.at[piece];
-        const float *one = &p.values[(size_t)piece * stride], *two = one + C + 1;
-        auto part = [&](int v) { return (behind ? one[v] - two[v] : two[v]) * each; };
+      for (int i = p.start[node]; i < p.start[node + 1]; i++) {
+        const int piece = p.order[i], at = p.at[piece];
+        const float *one = p.values[piece], *two = one + C + 1;
+        auto part = [&](int v) { return behind ? one[v] - two[v] : two[v]; };
+        const uint32_t bit = 1u << std::min(at % pitch_ / 16, 31);
+        b.occupied[at / pitch_] |= bit;
+        b.open[at / pitch_] |= bit;
+        b.uneven[at / pitch_] |= bit;
         b.term[C][at] += part(0);
         for (int c = 0; c < C; c++) b.term[c][at] += part(1 + c);
-        if (behind)
-          b.rest[at] += one[0] * each;
-        else
-          b.term[C + 1][at] += part(0);
+        if (!over_) continue;
+        b.term[C + 1][at] += behind ? one[0] : two[0];
+        if (behind) b.rest[at] += one[0];
       }
     };
     add(k - run.first + 1, true);
-    memcpy(b.term[C + 1], b.rest, sizeof(float) * height * pitch_);
     add(k - run.first, false);
   }
 
@@ -512,10 +449,10 @@ class Composite {
   void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
-    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + C_ + 2 + 2 * s_.count) * (n + LANES));
+    std::vector<float> memory((size_t)(s_.count * (C_ + 2) + C_ + 2 + s_.count + 2) * (n + LANES));
     float *m = memory.data();
     auto take = [&] { return (m += n + LANES) - (n + LANES); };  // vectors may read beyond the end
-    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 2), mine(2 * s_.count);
+    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 2), mine(s_.count + 2);
     for (auto *v : {&light, &coc, &weight, &term, &mine})
       for (float *&row : *v) row = take();
     for (int by = 0; by < height; by++) {
@@ -523,7 +460,7 @@ class Composite {
       for (int c = 0; c < C_ + 2; c++) memset(b.term[c] + to, 0, width * sizeof(float));
       for (int y = 0; y < s; y++) {
         read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), b);
-        row_terms(layers_[k], n, false, light.data(), coc.data(), weight.data(), mine.data(), term.data());
+        row_terms(layers_[k], n, light.data(), coc.data(), weight.data(), mine.data(), term.data());
         for (int x = 0; x < n; x++)
           for (int c = 0; c < C_ + 2; c++) b.term[c][to + x / s] += term[c][x] * each;
       }
@@ -578,74 +515,34 @@ class Composite {
       }
       go_on(coc[i]);
       go_on(weight[i]);
-      for (int x = 0; x < n; x += LANES) store(coc[i] + x, axis(load<vec>(coc[i] + x), low_, high_));
+      for (int x = 0; x < n; x += LANES) store(coc[i] + x, index_.place(load<vec>(coc[i] + x)));
     }
   }
 
-  // What a layer spreads of a row: light, share, and the share at or behind it, its room.
-  void row_terms(const Layer &l, int n, bool single, const float *const *light, const float *const *x, const float *const *weight,
+  // What a layer spreads of a row of surfaces that cover each other: light, share, and the share at or behind it, its room.
+  void row_terms(const Layer &l, int n, const float *const *light, const float *const *place, const float *const *weight,
                  float *const *mine, float *const *term) const {
-    const float before = l.before, per_before = l.per_before, at = l.at, per_after = l.per_after;
-    const float first = l.first ? 1.0f : 0.0f;
-    auto at_or_behind = [&](vec p) {
-      const vec ramp = clamp01((p - before) * per_before + first);
-      return over_ ? eased(ramp) : ramp;
-    };
-    auto beyond = [&](vec p) {
-      const vec ramp = clamp01((p - at) * per_after);
-      return over_ ? eased(ramp) : ramp;
-    };
     float *share = term[C_], *room = term[C_ + 1];
-    if (single) {
-      for (int i = 0; i < n; i += LANES) {
-        const vec p = load<vec>(x[0] + i), h = at_or_behind(p), g = h - beyond(p);
-        store(room + i, h);
-        store(share + i, g);
-        for (int c = 0; c < C_; c++) store(term[c] + i, load<vec>(light[c] + i) * g);
+    // a pixel is there for the layer as far as what is at or behind it is known, but for what that has in front
+    float *left = mine[s_.count], *unknown = mine[s_.count + 1];
+    for (int i = 0; i < n; i++) room[i] = left[i] = unknown[i] = 1.0f;
+    for (int j = 0; j < s_.count; j++) {
+      const float *p = place[j], *w = weight[j];
+      float *m = mine[j];
+      for (int i = 0; i < n; i++) {
+        const float cover = w[i], h = at_or_behind(l, p[i], over_), g = h - behind(l, p[i], over_);
+        const float here = cover * eased(std::min(h / HAIR, 1.0f)), there = 1.0f - here * (1.0f - h);
+        const float stops = cover * g / std::max(there, LEAST);
+        m[i] = left[i] * stops;
+        left[i] *= 1.0f - stops;
+        room[i] *= there;
+        unknown[i] *= 1.0f - here;
       }
-      return;
     }
-    if (!s_.independent) {
-      for (int i = 0; i < n; i += LANES) {
-        vec shares = {}, rooms = {};
-        for (int j = 0; j < s_.count; j++) {
-          const vec p = load<vec>(x[j] + i), w = load<vec>(weight[j] + i), h = at_or_behind(p);
-          const vec m = (h - beyond(p)) * w;
-          store(mine[j] + i, m);
-          shares += m;
-          rooms += h * w;
-        }
-        store(share + i, shares);
-        store(room + i, rooms);
-      }
-    } else {
-      // a pixel is there for the layer as far as what is at or behind it is known, but for what that has in front
-      float *left = mine[s_.count], *unknown = mine[s_.count + 1 < 2 * s_.count ? s_.count + 1 : s_.count];
-      std::vector<float> spare;
-      if (s_.count == 1) {
-        spare.resize(n);
-        unknown = spare.data();
-      }
-      for (int i = 0; i < n; i++) room[i] = left[i] = unknown[i] = 1.0f;
-      for (int j = 0; j < s_.count; j++) {
-        const float *p = x[j], *w = weight[j];
-        float *m = mine[j];
-        for (int i = 0; i < n; i++) {
-          const float ramp = clamp01((p[i] - before) * per_before + first), next = clamp01((p[i] - at) * per_after), cover = w[i];
-          const float h = over_ ? eased(ramp) : ramp, g = h - (over_ ? eased(next) : next);
-          const float here = cover * eased(std::min(h / HAIR, 1.0f)), there = 1.0f - here * (1.0f - h);
-          const float stops = cover * g / std::max(there, LEAST);
-          m[i] = left[i] * stops;
-          left[i] *= 1.0f - stops;
-          room[i] *= there;
-          unknown[i] *= 1.0f - here;
-        }
-      }
-      for (int i = 0; i < n; i++) share[i] = 0;
-      for (int j = 0; j < s_.count; j++)
-        for (int i = 0; i < n; i++) share[i] += mine[j][i] *= room[i];
-      for (int i = 0; i < n; i++) room[i] *= 1.0f - unknown[i];
-    }
+    for (int i = 0; i < n; i++) share[i] = 0;
+    for (int j = 0; j < s_.count; j++)
+      for (int i = 0; i < n; i++) share[i] += mine[j][i] *= room[i];
+    for (int i = 0; i < n; i++) room[i] *= 1.0f - unknown[i];
     for (int c = 0; c < C_; c++)
       for (int i = 0; i < n; i += LANES) {
         vec sum = load<vec>(light[c] + i) * load<vec>(mine[0] + i);
@@ -654,136 +551,330 @@ class Composite {
       }
   }
 
-  // Spreads the terms of a layer, which begin at an offset, and lays them on the tile's canvas.
-  void lay(Scratch &b, const Layer &l, int rows, int columns, size_t shift) {
-    const int C = C_, E = E_, height = rows + 2 * l.half, width = columns + 2 * l.half;
-    const int whole_rows = (rows + 3) / 4 * 4, whole_columns = (columns + 15) / 16 * 16;
-    // where there is anything; whether nothing lies behind the layer, or before it
-    bool any = false;
-    vec open = {}, uneven = {};
-    for (int y = 0; y < height; y++) {
-      const float *share = b.term[C] + shift + (size_t)y * pitch_, *room = b.term[C + 1] + shift + (size_t)y * pitch_;
-      uint32_t bits = 0;
-      for (int x = 0; x < width; x += 16) {
-        vec some = {};
-        int i = x;
-        for (; i + LANES <= std::min(x + 16, width); i += LANES) {
-          const vec s = load<vec>(share + i);
-          some = most(some, s);
-          if (!over_) continue;
-          const vec r = load<vec>(room + i), d = r - all(1.0f);
-          open = most(open, r - s);
-          uneven = most(uneven, d * d);
-        }
-        for (; i < std::min(x + 16, width); i++) {
-          some[0] = std::max(some[0], share[i]);
-          if (!over_) continue;
-          open[0] = std::max(open[0], room[i] - share[i]);
-          uneven[0] = std::max(uneven[0], (room[i] - 1.0f) * (room[i] - 1.0f));
-        }
-        bits |= (uint32_t)any_positive(some) << std::min(x / 16, 31);
-      }
-      b.rows[y] = bits;
-      any |= bits != 0;
+  // Where a layer's terms have something: of the rows of a window from `top` on, columns from `left` on.
+  void find_occupied(Scratch &b, int top, int rows, int left, int columns) const {
+    for (int y = top; y < top + rows; y++) {
+      const float *share = b.term[C_] + (size_t)y * pitch_, *room = b.term[C_ + 1] + (size_t)y * pitch_;
+      Occupied row;
+      for (int x = left; x < left + columns; x++) row.add(x, share[x], room[x], over_);
+      row.put(b, y);
     }
-    for (int y = height; y < whole_rows + 2 * l.half; y++) b.rows[y] = 0;
-    const bool closed = !any_positive(open), flat = largest(uneven) <= 1e-12f;
-    if (!any) return;
-    auto spread = [&](int term, const uint32_t *rows_with, const Kernel &kernel, float *to) {
-      if (l.half)
-        convolve(b.term[term] + shift, pitch_, rows_with, kernel, whole_rows, whole_columns, to, TILE);
-      else
-        for (int y = 0; y < rows; y++)
-          for (int x = 0; x < columns; x++) to[y * TILE + x] = b.term[term][shift + (size_t)y * pitch_ + x] * kernel.sum;
-    };
-    for (int c = 0; c < C; c++) spread(c, b.rows.data(), l.kernels[E > 1 ? c : 0], b.spread[c]);
-    for (int e = 0; e < E; e++) {
-      const Kernel &kernel = l.kernels[e];
-      float *share = b.spread[C + e], *room = b.spread[C + E + e];
-      if (!over_) {
-        spread(C, b.rows.data(), kernel, share);
-        for (int c = 0; c < C; c++)
-          if (E == 1 || c == e) add_to(b.canvas[c], b.spread[c]);
-        add_to(b.canvas[C + e], share);
+  }
+
+  // The parts of a window that lie in blocks of pixels. What touches the frame's border is copied, and continued beyond.
+  void find_blocks(int top, int rows, int left, int columns, Scratch &b) {
+    b.blocks.clear();
+    const size_t plane = (size_t)window_ * pitch_, area = s_.area();
+    const int block_rows = ceil_div(top + rows - floor_div(top, BLOCK) * BLOCK, BLOCK), block_columns = columns / BLOCK;
+    b.block_layers.assign((size_t)block_rows * block_columns * index_.words, 0);
+    std::vector<float *> light(b.light.size()), coc(s_.count), weight(s_.count);
+    for (int i = 0; i < block_rows * block_columns; i++) {
+      const int y0 = floor_div(top, BLOCK) * BLOCK + i / block_columns * BLOCK, x0 = left + i % block_columns * BLOCK;
+      const bool inside = y0 >= 0 && x0 >= 0 && y0 + BLOCK <= H_ && x0 + BLOCK <= W_;
+      const int y_in = std::clamp(y0, 0, (s_.block_rows - 1) * BLOCK), x_in = std::clamp(x0, 0, (s_.block_columns - 1) * BLOCK);
+      WindowBlock w;
+      uint64_t *layers = &b.block_layers[(size_t)i * index_.words];
+      const bool single = around(y_in / CELL, y_in / CELL + BLOCK / CELL - 1, x_in / CELL, x_in / CELL + BLOCK / CELL - 1, layers);
+      w.layers = layers;
+      w.count = single ? 1 : s_.count;
+      w.top = std::max(y0 - top, 0);
+      w.rows = std::min(y0 + BLOCK - top, rows) - w.top;
+      w.column = x0 - left;
+      w.clear = false;
+      w.room = -1;
+      const int first_row = top + w.top;
+      for (int j = 0; j < w.count && inside; j++) {
+        WindowBlock::Surface &of = w.surfaces[j];
+        const float *from;
+        s_.row(j, first_row, x0, b.pointers.data(), from, of.weight);
+        const bool in_block = s_.has_block(first_row / BLOCK * s_.block_columns + x0 / BLOCK);
+        of.light = b.pointers[0];
+        of.channel = in_block ? BLOCK_PIXELS : area;
+        of.light_pitch = in_block ? BLOCK : W_;
+        of.weight_pitch = BLOCK;
+        if (single) of.weight = nullptr;
+        for (int y = w.top; y < w.top + w.rows; y++, from += j ? BLOCK : W_)
+          for (int x = 0; x < BLOCK; x += LANES) store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
+      }
+      if (!inside) {
+        for (int y = w.top; y < w.top + w.rows; y++) {
+          const size_t at = (size_t)y * pitch_ + w.column;
+          for (size_t v = 0; v < light.size(); v++) light[v] = b.light[v] + at;
+          for (int j = 0; j < s_.count; j++) coc[j] = b.coc[j] + at, weight[j] = b.weight[j] + at;
+          read_row(top + y, x0, BLOCK, single, light.data(), coc.data(), weight.data(), b);
+        }
+        for (int j = 0; j < w.count; j++) {
+          const size_t at = (size_t)w.top * pitch_ + w.column;
+          w.surfaces[j] = {b.light[j * C_] + at, single ? nullptr : b.weight[j] + at, pitch_, pitch_, plane};
+        }
+      }
+      b.blocks.push_back(w);
+    }
+  }
+
+  // What layer k spreads of a window, rows from `first` on and columns from `from` on. Nothing is written again that
+  // stands there from the layer before.
+  void window_terms(int k, int first, int rows, int from, int columns, Scratch &b) {
+    std::fill(&b.occupied[first], &b.occupied[first] + rows, 0u);
+    std::fill(&b.open[first], &b.open[first] + rows, 0u);
+    std::fill(&b.uneven[first], &b.uneven[first] + rows, 0u);
+    for (WindowBlock &w : b.blocks) {
+      bool before = false, behind = false;
+      for (int i = 0; i < index_.words; i++) {
+        before |= (w.layers[i] & below(k, i)) != 0;
+        behind |= (w.layers[i] & ~below(k + 1, i)) != 0;
+      }
+      const int y0 = std::max(w.top, first), y1 = std::min(w.top + w.rows, first + rows);
+      const int x0 = std::max(0, from - w.column) / LANES * LANES, x1 = std::min(BLOCK, from + columns - w.column);
+      if (y0 >= y1 || x0 >= x1) continue;
+      if (has(w.layers, k)) {
+        w.clear = false;
+        w.room = -1;
+        if (C_ == 3)
+          w.count == 1 ? block_terms<3, 1>(layers_[k], w, y0, y1, x0, x1, b) : block_terms<3, 2>(layers_[k], w, y0, y1, x0, x1, b);
+        else
+          w.count == 1 ? block_terms<0, 1>(layers_[k], w, y0, y1, x0, x1, b) : block_terms<0, 2>(layers_[k], w, y0, y1, x0, x1, b);
         continue;
       }
-      if (flat)
-        std::fill(room, room + whole_rows * TILE, kernel.sum);
-      else
-        spread(C + 1, b.every.data(), kernel, room);
-      if (closed)
-        memcpy(share, room, whole_rows * TILE * sizeof(float));
-      else
-        spread(C, b.rows.data(), kernel, share);
-      // colour = light / room, coverage = share / room
-      for (int i = 0; i < whole_rows * TILE; i += LANES) {
-          const vec one = all(1.0f), all_room = load<vec>(room + i), little = least(all_room, all(KNOWN));
-          const vec per_room = one / (all_room - little + 0.5f * (all(KNOWN) + little * little / KNOWN));
-          const vec cover = load<vec>(share + i) * per_room;
-        const vec left = most(one - cover, vec{});
-        for (int c = 0; c < C; c++)
-          if (E == 1 || c == e) store(b.canvas[c] + i, load<vec>(b.spread[c] + i) * per_room + left * load<vec>(b.canvas[c] + i));
-        store(b.canvas[C + e] + i, cover + left * load<vec>(b.canvas[C + e] + i));
+      if (!w.clear) {
+        w.clear = true;
+        for (int c = 0; c < C_ + 1; c++) fill(b.term[c], w, 0.0f);
+      }
+      if (!over_) continue;
+      const uint32_t bit = 1u << std::min(w.column / BLOCK, 31);
+      if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
+        w.room = -1;
+        block_room(layers_[k], w, y0, y1, x0, x1, b);
+      } else {
+        if (w.room != (int)behind) fill(b.term[C_ + 1], w, behind ? 1.0f : 0.0f);
+        w.room = behind;
+        for (int y = y0; y < y1; y++) (behind ? b.open : b.uneven)[y] |= bit;
       }
     }
   }
 
-  static void add_to(float *to, const float *more) {
-    for (int i = 0; i < TILE_PIXELS; i += LANES) store(to + i, load<vec>(to + i) + load<vec>(more + i));
+  void fill(float *term, const WindowBlock &w, float value) const {
+    for (int y = w.top; y < w.top + w.rows; y++) {
+      float *row = term + (size_t)y * pitch_ + w.column;
+      std::fill(row, row + BLOCK, value);
+    }
+  }
+
+  // Columns of a block from x0 up to x1, rows from y0 up to y1 of its window.
+  template <int CHANNELS, int COUNT>
+  void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, Scratch &b) {
+    const int C = CHANNELS ? CHANNELS : C_;
+    for (int y = y0; y < y1; y++) {
+      const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
+      vec some = {}, more = {}, other = {};
+      for (int x = x0; x < x1; x += LANES) {
+        vec mine[COUNT], share = {}, room = {};
+        for (int j = 0; j < COUNT; j++) {
+          const WindowBlock::Surface &of = w.surfaces[j];
+          const vec p = load<vec>(b.coc[j] + at + x);
+          vec h = at_or_behind(l, p, over_);
+          mine[j] = h - behind(l, p, over_);
+          if (of.weight) {
+            const vec weight = load<vec>(of.weight + row * of.weight_pitch + x);
+            mine[j] *= weight;
+            h *= weight;
+          }
+          share += mine[j];
+          room += h;
+        }
+        store(b.term[C] + at + x, share);
+        if (over_) store(b.term[C + 1] + at + x, room);
+        for (int c = 0; c < C; c++) {
+          vec sum = load<vec>(w.surfaces[0].light + c * w.surfaces[0].channel + row * w.surfaces[0].light_pitch + x) * mine[0];
+          for (int j = 1; j < COUNT; j++)
+            sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * mine[j];
+          store(b.term[c] + at + x, sum);
+        }
+        const vec lacking = room - all(1.0f);
+        some = most(some, share);
+        more = most(more, room - share);
+        other = most(other, lacking * lacking - all(EVEN));
+      }
+      const int bit = std::min(w.column / BLOCK, 31);
+      b.occupied[y] |= (uint32_t)any_positive(some) << bit;
+      b.open[y] |= (uint32_t)any_positive(more) << bit;
+      b.uneven[y] |= (uint32_t)any_positive(other) << bit;
+    }
+  }
+
+  // The same of a block in which the layer does not occur: its room alone.
+  void block_room(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, Scratch &b) {
+    for (int y = y0; y < y1; y++) {
+      const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
+      vec more = {}, other = {};
+      for (int x = x0; x < x1; x += LANES) {
+        vec room = {};
+        for (int j = 0; j < w.count; j++) {
+          const WindowBlock::Surface &of = w.surfaces[j];
+          const vec p = load<vec>(b.coc[j] + at + x);
+          vec h = at_or_behind(l, p, over_);
+          if (of.weight) h *= load<vec>(of.weight + row * of.weight_pitch + x);
+          room += h;
+        }
+        store(b.term[C_ + 1] + at + x, room);
+        const vec lacking = room - all(1.0f);
+        more = most(more, room);
+        other = most(other, lacking * lacking - all(EVEN));
+      }
+      const int bit = std::min(w.column / BLOCK, 31);
+      b.open[y] |= (uint32_t)any_positive(more) << bit;
+      b.uneven[y] |= (uint32_t)any_positive(other) << bit;
+    }
+  }
+
+  static uint64_t below(int k, int word) {  // bits of layers before layer k
+    const int bit = k - 64 * word;
+    return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
+  }
+
+  // Spreads the terms of a layer, which begin at a row and a column of the window, and lays them on the tile's canvas.
+  void lay(Scratch &b, const Layer &l, int rows, int columns, int first, int from) {
+    for (int y = rows; y < ceil_div(rows, STRIP_ROWS) * STRIP_ROWS; y++) {
+      const int row = first + y + 2 * l.half;
+      b.occupied[row] = b.open[row] = b.uneven[row] = 0;
+    }
+    for (int y = 0; y < rows; y += STRIP_ROWS) {
+      uint32_t occupied = 0, open = 0, uneven = 0;  // what reaches these rows
+      for (int i = first + y; i < first + y + STRIP_ROWS + 2 * l.half; i++) {
+        occupied |= b.occupied[i];
+        open |= b.open[i];
+        uneven |= b.uneven[i];
+      }
+      if (!occupied) continue;
+      for (int x = 0; x < columns; x += STRIP_COLUMNS) {
+        const uint32_t within = strip_inputs(from + x, l.half);
+        if (!(occupied & within)) continue;
+        const size_t at = (size_t)(first + y) * pitch_ + from + x;
+        if (over_)
+          lay_strip(b, l, at, first + y, within, open & within, uneven & within, y * TILE + x);
+        else
+          add_strip(b, l, at, first + y, within, y * TILE + x);
+      }
+    }
+  }
+
+  // One term of a layer, spread to a strip of the tile. Kernels of half 0 have one tap.
+  void spread(const Scratch &b, int term, size_t from, const uint32_t *rows, uint32_t within, const Kernel &kernel, float *to) const {
+    convolve_strip(b.term[term] + from, pitch_, rows, within, kernel, to);
+  }
+
+  void add_strip(Scratch &b, const Layer &l, size_t from, int y, uint32_t within, int at) {
+    float spread_of[STRIP];
+    for (int v = 0; v < C_ + E_; v++) {
+      const Kernel &kernel = l.kernels[E_ == 1 ? 0 : v < C_ ? v : v - C_];
+      spread(b, std::min(v, C_), from, &b.occupied[y], within, kernel, spread_of);
+      for (int i = 0; i < STRIP; i += LANES) {
+        float *to = b.canvas[v] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
+        store(to, load<vec>(to) + load<vec>(spread_of + i));
+      }
+    }
+  }
+
+  void lay_strip(Scratch &b, const Layer &l, size_t from, int y, uint32_t within, bool open, bool uneven, int at) {
+    float share[STRIP], room[STRIP], gain[STRIP], left[STRIP], light[STRIP];
+    for (int e = 0; e < E_; e++) {
+      const Kernel &kernel = l.kernels[e];
+      if (uneven)
+        spread(b, C_ + 1, from, b.every.data(), ~0u, kernel, room);
+      else
+        std::fill(room, room + STRIP, kernel.sum);
+      if (open)
+        spread(b, C_, from, &b.occupied[y], within, kernel, share);
+      else
+        memcpy(share, room, sizeof(room));
+      // colour = light / room, coverage = share / room
+      float *const canvas = b.canvas[C_ + e] + at;
+      for (int i = 0; i < STRIP; i += LANES) {
+        const vec one = all(1.0f), all_room = load<vec>(room + i), little = least(all_room, all(KNOWN));
+        const vec per_room = one / (all_room - little + 0.5f * (all(KNOWN) + little * little / KNOWN));
+        const vec cover = load<vec>(share + i) * per_room;
+        const vec its_left = most(one - cover, vec{});
+        store(gain + i, per_room);
+        store(left + i, its_left);
+        float *to = canvas + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
+        store(to, cover + its_left * load<vec>(to));
+      }
+      for (int c = E_ == 1 ? 0 : e; c < (E_ == 1 ? C_ : e + 1); c++) {
+        spread(b, c, from, &b.occupied[y], within, kernel, light);
+        for (int i = 0; i < STRIP; i += LANES) {
+          float *to = b.canvas[c] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
+          store(to, load<vec>(light + i) * load<vec>(gain + i) + load<vec>(left + i) * load<vec>(to));
+        }
+      }
+    }
   }
 
   // A coarser canvas, interpolated, over the tile's canvas.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
-    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / TILE, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / TILE;
+    const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;
     bool any = false;
-    for (int r = y0 / s / TILE; r <= r1; r++)
-      for (int c = x0 / s / TILE; c <= c1; c++) any |= run.used[r * run.tile_columns + c];
+    for (int r = y0 / s / PART; r <= r1; r++)
+      for (int c = x0 / s / PART; c <= c1; c++) any |= run.used[(size_t)r * run.part_columns + c];
     if (!any) return;
-    const int channels = C_ + E_, count = TILE / s + 2, first = x0 / s, pitch = TILE + 32;
-    std::vector<float> lines((size_t)channels * count), planes((size_t)channels * pitch);
-    float *const values = planes.data() + s / 2;  // between two samples the first value lies half a sample behind
+    const int channels = C_ + E_, count = TILE / s + 1, first = x0 / s, pitch = TILE + 32;
+    std::vector<float> memory((size_t)2 * channels * pitch);
+    float *upper = memory.data(), *lower = upper + channels * pitch;  // rows of the canvas, as wide as the tile's
+    bool upper_covers = false, lower_covers = false;
     float ramp[16];
     for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
-    for (int y = 0; y < TILE; y++) {
+    auto widen = [&](int row, float *to) {
+      vec most_cover = {};
+      for (int c = channels - 1; c >= 0; c--) {
+        const float *from = &run.canvas[((size_t)c * run.rows + row) * run.columns + first];
+        const int inside = std::max(std::min(count, run.columns - 1 - first), 0);
+        if (c >= C_) {
+          for (int i = 0; i <= inside; i += LANES) most_cover = most(most_cover, load<vec>(from + i));
+        } else if (!any_positive(most_cover)) {
+          memset(to, 0, (size_t)channels * pitch * sizeof(float));
+          return false;
+        }
+        float *v = to + (size_t)c * pitch;
+        if (s == 2)
+          for (int i = 0; i < inside; i++) {
+            const float step = from[i + 1] - from[i];
+            v[2 * i] = from[i] + 0.25f * step;
+            v[2 * i + 1] = from[i] + 0.75f * step;
+          }
+        else
+          for (int i = 0; i < inside; i++)
+            for (int part = 0; part < s; part += 4, v += 4) {
+              typedef float f4 __attribute__((vector_size(16)));
+              const f4 value = f4{} + from[i], step = f4{} + (from[i + 1] - from[i]);
+              store(v, value + step * load<f4>(ramp + part));
+            }
+      }
+      return true;
+    };
+    for (int y = 0, known = -2; y < TILE; y++) {
       const float at_y = (y0 + y + 0.5f) / s + 0.5f;
       const int row = std::min((int)at_y, run.rows - 2);
       const float down = at_y - row;
-      const int inside = std::max(std::min(count, run.columns - first), 0);
-      bool covered = false;
-      for (int c = channels - 1; c >= 0; c--) {
-        const float *upper = &run.canvas[((size_t)c * run.rows + row) * run.columns + first], *lower = upper + run.columns;
-        float *line = &lines[(size_t)c * count];
-        for (int i = 0; i < inside; i++) line[i] = upper[i] + down * (lower[i] - upper[i]);
-        if (c >= C_)
-          for (int i = 0; i < inside; i++) covered |= line[i] > 0;
-        else if (!covered)
-          break;
-        float *v = &planes[(size_t)c * pitch];
-        if (s == 2)
-          for (int i = 0; i + 1 < count; i++, v += 2) {
-            const float step = line[i + 1] - line[i];
-            v[0] = line[i] + 0.25f * step;
-            v[1] = line[i] + 0.75f * step;
-          }
-        else
-          for (int i = 0; i + 1 < count; i++)
-            for (int part = 0; part < s; part += 4, v += 4) {
-              typedef float f4 __attribute__((vector_size(16)));
-              const f4 from = f4{} + line[i], step = f4{} + (line[i + 1] - line[i]);
-              store(v, from + step * load<f4>(ramp + part));
-            }
+      if (row != known) {
+        std::swap(upper, lower);
+        upper_covers = row == known + 1 ? lower_covers : widen(row, upper);
+        lower_covers = widen(row + 1, lower);
+        known = row;
       }
-      if (!covered) continue;
-      for (int e = 0; e < E_; e++) {
-        const float *cover = values + (size_t)(C_ + e) * pitch;
+      if (!upper_covers && !lower_covers) continue;
+      // between two samples the first value lies half a sample behind
+      auto value_at = [&](int c, int x) {
+        const vec a = load<vec>(upper + (size_t)c * pitch + s / 2 + x), b = load<vec>(lower + (size_t)c * pitch + s / 2 + x);
+        return a + down * (b - a);
+      };
+      for (int c = 0; c < channels; c++) {
+        // coverage comes last, for what is left is told by its own
+        const int e = c < C_ ? E_ == 1 ? 0 : c : c - C_;
+        float *canvas = b.canvas[c] + y * TILE;
         for (int x = 0; x < TILE; x += LANES) {
-          const vec left = over_ ? most(all(1.0f) - load<vec>(cover + x), vec{}) : all(1.0f);
-          for (int c = 0; c < channels; c++) {
-            if (c < C_ ? E_ > 1 && c != e : c != C_ + e) continue;
-            float *canvas = b.canvas[c] + y * TILE + x;
-            store(canvas, load<vec>(values + (size_t)c * pitch + x) + left * load<vec>(canvas));
-          }
+          const vec value = value_at(c, x);
+          const vec left = over_ ? most(all(1.0f) - (c < C_ ? value_at(C_ + e, x) : value), vec{}) : all(1.0f);
+          store(canvas + x, value + left * load<vec>(canvas + x));
         }
       }
     }
@@ -804,22 +895,10 @@ class Composite {
       reaching.push_back(k);
       halo = std::max(halo, l.half);
     }
-    bool single = false;
-    int left = x0;  // where rows begin
-    if (!reaching.empty()) {
-      single = look_around(y0, x0, ceil_div(halo, CELL), b);
-      std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
-      left = floor_div(x0 - halo, BLOCK) * BLOCK;
-      const int across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
-      for (int y = y0 - halo; y < y0 + rows + halo; y++) {
-        read_row(y, left, across, single, light.data(), coc.data(), weight.data(), b);
-        for (auto *v : {&light, &coc, &weight})
-          for (float *&row : *v) row += pitch_;
-      }
-    }
+    const int top = y0 - halo, left = floor_div(x0 - halo, BLOCK) * BLOCK;  // of the window
+    const int height = rows + 2 * halo, across = ceil_div(x0 + columns + halo - left, BLOCK) * BLOCK;
+    if (!reaching.empty()) s_.independent ? read_window(top, height, left, across, b) : find_blocks(top, height, left, across, b);
     size_t next = 0;
-    std::vector<const float *> light(s_.count * C_), coc(s_.count), weight(s_.count);
-    std::vector<float *> term(C_ + 2);
     for (int r = (int)runs_.size() - 1; r >= 0; r--) {
       const Run &run = runs_[r];
       if (run.scale > 1) {
@@ -828,21 +907,41 @@ class Composite {
       }
       for (; next < reaching.size() && reaching[next] >= run.first; next++) {
         const Layer &l = layers_[reaching[next]];
-        const int spare = halo - l.half, width = columns + 2 * l.half;
-        for (int y = 0; y < rows + 2 * l.half; y++) {
-          const size_t from = (size_t)(y + spare) * pitch_ + x0 - l.half - left, to = (size_t)y * pitch_;
-          for (int i = 0; i < s_.count; i++) {
-            for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + from;
-            coc[i] = b.coc[i] + from;
-            weight[i] = b.weight[i] + from;
-          }
-          for (int c = 0; c < C_ + 2; c++) term[c] = b.term[c] + to;
-          row_terms(l, width, single, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
-        }
-        lay(b, l, rows, columns, 0);
+        const int first = halo - l.half, from = x0 - l.half - left, reach_rows = rows + 2 * l.half, reach_columns = columns + 2 * l.half;
+        if (s_.independent)
+          stack_terms(l, first, reach_rows, from, reach_columns, b);
+        else
+          window_terms(reaching[next], first, reach_rows, from, reach_columns, b);
+        lay(b, l, rows, columns, first, from);
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);
+  }
+
+  // All of a window, for surfaces that cover each other.
+  void read_window(int top, int rows, int left, int columns, Scratch &b) {
+    std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
+    for (int y = 0; y < rows; y++) {
+      read_row(top + y, left, columns, false, light.data(), coc.data(), weight.data(), b);
+      for (auto *v : {&light, &coc, &weight})
+        for (float *&row : *v) row += pitch_;
+    }
+  }
+
+  void stack_terms(const Layer &l, int first, int rows, int from, int columns, Scratch &b) {
+    std::vector<const float *> light(s_.count * C_), coc(s_.count), weight(s_.count);
+    std::vector<float *> term(C_ + 2);
+    for (int y = first; y < first + rows; y++) {
+      const size_t at = (size_t)y * pitch_ + from;
+      for (int i = 0; i < s_.count; i++) {
+        for (int c = 0; c < C_; c++) light[i * C_ + c] = b.light[i * C_ + c] + at;
+        coc[i] = b.coc[i] + at;
+        weight[i] = b.weight[i] + at;
+      }
+      for (int c = 0; c < C_ + 2; c++) term[c] = b.term[c] + at;
+      row_terms(l, columns, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
+    }
+    find_occupied(b, first, rows, from, columns);
   }
 
   bool look_around(int y0, int x0, int reach, Scratch &b) const {
@@ -852,7 +951,7 @@ class Composite {
   // The tile's canvas over what lies behind all layers, with the light of rays, to the picture.
   void finish(int which, int y0, int x0, int rows, int columns, Scratch &b) {
     const int C = C_, E = E_;
-    float *const traced = b.spread[0];  // [channels, TILE, TILE]: planes of spread lie side by side
+    float *const traced = b.traced;  // [channels, TILE, TILE]
     const bool has_rays = !job_.rays.empty() && ray_start_[which] < ray_start_[which + 1];
     if (has_rays) {
       memset(traced, 0, sizeof(float) * C * TILE_PIXELS);
@@ -939,18 +1038,26 @@ class Composite {
   float *out_;
   int H_, W_, C_, E_, N_;
   bool over_;
-  float low_, high_;  // the outermost nodes
   std::vector<Run> runs_;
   int window_, pitch_;
   std::vector<std::unique_ptr<Scratch>> scratches_;
-  int words_, cell_rows_, cell_columns_;
-  std::vector<uint64_t> cells_;            // layers that occur in each cell, a bit each
-  std::vector<uint8_t> single_;            // cells that show the first surface alone, whole
-  std::vector<Buffer<uint16_t>> intervals_;
+  LayerIndex index_;
+  std::vector<std::unique_ptr<Downsampled>> downsampled_;  // of each scale of the runs
   Border border_;
   Visibility visibility_;
   std::vector<int> ray_start_, ray_list_;
 };
+
+int LayerIndex::only_interval(size_t i) const {
+  int first = -1, last = -1;
+  for (int w = 0; w < words; w++) {
+    const uint64_t found = cell(i)[w];
+    if (!found) continue;
+    if (first < 0) first = 64 * w + __builtin_ctzll(found);
+    last = 64 * w + 63 - __builtin_clzll(found);
+  }
+  return last <= first + 1 ? first : -1;
+}
 
 void composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out) {
   Composite(job, ray_kernels, ray_halves, out).run();

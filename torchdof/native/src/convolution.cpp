@@ -1,13 +1,12 @@
-// Convolution of a window with one kernel: four rows and two vectors of columns at a time, kept in registers.
+// Convolution with one kernel: four rows and two vectors of columns at a time, kept in registers.
 #include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr int ROWS = 4;                  // of the output together
-constexpr int VECTORS = 2;  // of columns together
-constexpr int COLUMNS = VECTORS * LANES;
+constexpr int ROWS = STRIP_ROWS;
+constexpr int VECTORS = STRIP_COLUMNS / LANES;
 constexpr int SHORT = 10;  // half width up to which one sum in float32 is exact enough
 
 // Taps of a kernel for input row i and ROWS output rows: taps[(i + ROWS - 1) + d * stride - o] is for output row o and
@@ -74,25 +73,16 @@ Kernel make_kernel(const float *values, int half) {
   return k;
 }
 
-void convolve(const float *in, int pitch, const uint32_t *rows, const Kernel &kernel, int height, int width, float *out,
-              int out_pitch) {
-  const int half = kernel.half;
-  for (int x = 0; x < width; x += COLUMNS) {
-    uint32_t columns = 0;
-    for (int block = x / 16; block <= (x + COLUMNS - 1 + 2 * half) / 16; block++) columns |= 1u << std::min(block, 31);
-    for (int y = 0; y < height; y += ROWS) {
-      vec sum[ROWS][VECTORS] = {};
-      const float *from = in + (size_t)y * pitch + x;
-      if (kernel.symmetric && half <= SHORT)
-        rows_of<true, false>(from, pitch, rows + y, columns, kernel, sum);
-      else if (kernel.symmetric)
-        rows_of<true, true>(from, pitch, rows + y, columns, kernel, sum);
-      else
-        rows_of<false, true>(from, pitch, rows + y, columns, kernel, sum);
-      for (int o = 0; o < ROWS; o++)
-        for (int n = 0; n < VECTORS; n++) store(out + (size_t)(y + o) * out_pitch + x + n * LANES, sum[o][n]);
-    }
-  }
+void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out) {
+  vec sum[ROWS][VECTORS] = {};
+  if (kernel.symmetric && kernel.half <= SHORT)
+    rows_of<true, false>(in, pitch, rows, columns, kernel, sum);
+  else if (kernel.symmetric)
+    rows_of<true, true>(in, pitch, rows, columns, kernel, sum);
+  else
+    rows_of<false, true>(in, pitch, rows, columns, kernel, sum);
+  for (int o = 0; o < ROWS; o++)
+    for (int n = 0; n < VECTORS; n++) store(out + o * STRIP_COLUMNS + n * LANES, sum[o][n]);
 }
 
 }  // namespace TORCHDOF_SIMD

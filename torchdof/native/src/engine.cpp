@@ -191,11 +191,16 @@ static AnyJob *begin(const torchdof_scene &scene) { return new JobOf<Job>(scene)
 static void convolve_all(const float *in, int height, int width, const float *values, int half, float *out) {
   const Kernel kernel = make_kernel(values, half);
   const int rows = (height + 15) / 16 * 16, columns = (width + 15) / 16 * 16, pitch = columns + 2 * half + 16;
-  std::vector<float> window((size_t)(rows + 2 * half) * pitch), spread((size_t)rows * columns);
+  std::vector<float> window((size_t)(rows + 2 * half) * pitch);
+  float spread[STRIP];
   const std::vector<uint32_t> every(rows + 2 * half, ~0u);
   for (int y = 0; y < height; y++) memcpy(&window[(size_t)(y + half) * pitch + half], in + (size_t)y * width, width * sizeof(float));
-  convolve(window.data(), pitch, every.data(), kernel, rows, columns, spread.data(), columns);
-  for (int y = 0; y < height; y++) memcpy(out + (size_t)y * width, &spread[(size_t)y * columns], width * sizeof(float));
+  for (int y = 0; y < height; y += STRIP_ROWS)
+    for (int x = 0; x < width; x += STRIP_COLUMNS) {
+      convolve_strip(&window[(size_t)y * pitch + x], pitch, every.data(), ~0u, kernel, spread);
+      const size_t bytes = std::min(STRIP_COLUMNS, width - x) * sizeof(float);
+      for (int i = 0; i < std::min(STRIP_ROWS, height - y); i++) memcpy(out + (size_t)(y + i) * width + x, spread + i * STRIP_COLUMNS, bytes);
+    }
 }
 extern const Variant variant;
 const Variant variant = {begin, repair_edges, convolve_all};

@@ -46,6 +46,7 @@ inline float smallest(vec v) { return -largest(-v); }
 inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
 inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
 inline int ceil_div(int a, int b) { return (a + b - 1) / b; }
+inline int floor_div(int a, int b) { return a >= 0 ? a / b : -((-a + b - 1) / b); }
 
 // Memory that starts as it is found.
 template <typename T>
@@ -149,6 +150,32 @@ inline V axis(V coc, float low, float high) {
 inline float coc_at(double node) {
   const double beyond = (std::fabs(node) + IN_FOCUS) / 2;
   return (float)(node == 0 ? 0 : std::copysign(beyond + std::sqrt(beyond * (beyond + 2 * SQUARE_PX)), node));
+}
+
+constexpr float FOOT = 0.15f;                 // share up to which a ramp between layers rises by its square,
+constexpr float SLOPE = 1 / (1 - FOOT / 2);  // and how it goes on
+// A ramp from 0 to 1, exactly, whose foot is a parabola.
+template <typename V>
+inline V eased(V v) {
+  const V most = V{} + FOOT, foot = v < most ? v : most;
+  const V line = 1.0f - SLOPE * (1.0f - v), parabola = SLOPE / (2 * FOOT) * foot * foot;
+  return line > parabola ? line : parabola;
+}
+template <typename V>
+inline V ramp(V v, bool ease) {
+  const V zero = {}, one = zero + 1.0f;
+  v = v > zero ? v : zero;
+  v = v < one ? v : one;
+  return ease ? eased(v) : v;
+}
+// Of what lies at a place, the part of a layer and those behind it, and that of those behind it alone; eased under occlusion.
+template <typename V>
+inline V at_or_behind(const Layer &l, V place, bool ease) {
+  return ramp((place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f), ease);
+}
+template <typename V>
+inline V behind(const Layer &l, V place, bool ease) {
+  return ramp((place - l.at) * l.per_after, ease);
 }
 
 struct Job {
@@ -255,11 +282,66 @@ Visibility look_at(const Job &job);
 void splat(const Job &job, const Visibility &visibility, int y0, int x0, const int *rays, int count,
            const float *const *kernels, const int32_t *halves, float *tile);
 
-// Spreads n x n values (n a multiple of 16; of rows with a gap `pitch`) with a kernel; the input has its half more on
-// each side and begins there. Bit b of rows[y]: something is in columns 16 b to 16 b + 15 of input row y.
+// For each pixel of each surface the node before it, and for each cell the layers in it.
+struct LayerIndex {
+  float low, high;            // the outermost nodes
+  int words, rows, columns;   // words of bits of a cell; cells
+  std::vector<uint64_t> bits;    // layers that occur in each cell, a bit each
+  std::vector<uint8_t> single;   // cells that show the first surface alone, whole
+  std::vector<Buffer<uint16_t>> intervals;
+
+  const uint64_t *cell(size_t i) const { return &bits[i * words]; }
+  // The node before all pixels of a cell, or -1 where they lie between several.
+  int only_interval(size_t i) const;
+  // Places on the blur axis, within the nodes.
+  template <typename V>
+  V place(V coc) const { return axis(coc, low, high); }
+};
+
+// Parts of blocks of pixels that lie between two nodes, row by row of blocks: start[r] to start[r + 1] are those of row r.
+// values: weight and light; and these times how far between the nodes each pixel lies.
+struct Pieces {
+  std::vector<int> start, column;
+  std::vector<uint16_t> node;
+  std::vector<float> values;
+};
+
+// Means of the surfaces over blocks of `scale` x `scale` pixels, and around the frame; see downsampling.cpp.
+class Downsampled {
+ public:
+  Downsampled(const Job &job, int scale, int margin);
+  void take(const Job &job, const LayerIndex &index, const Border &border);
+
+  int scale, margin, rows, columns, channels, pitch, first_band;  // margin: blocks around the frame
+  std::vector<Pieces> pieces;  // of each band of BLOCK rows of pixels: what the planes have no place for
+  // of intervals between nodes: whether a layer here spreads them; lies before them; and the one that has their place
+  std::vector<uint8_t> wanted, behind;
+  std::vector<uint16_t> stands_for;
+  std::vector<uint8_t> near;  // blocks of BLOCK pixels that matter to the layers here
+
+  int stride() const { return 2 * (channels + 1); }  // of a piece's values
+  bool needed(int interval) const { return wanted[interval] || behind[interval]; }
+  // A row of a plane, from the frame's first block on. Planes: node before, weight, weight times how far between nodes,
+  // light, light times how far.
+  float *row(int plane, int y) const { return planes.data() + plane * size + (size_t)(y + margin) * pitch + margin; }
+
+ private:
+  size_t size;
+  Buffer<float> planes;
+};
+
+// What is spread at once: rows, and columns beside each other.
+constexpr int STRIP_ROWS = 4, STRIP_COLUMNS = 2 * LANES, STRIP = STRIP_ROWS * STRIP_COLUMNS;
 Kernel make_kernel(const float *values, int half);
-void convolve(const float *in, int pitch, const uint32_t *rows, const Kernel &kernel, int height, int width, float *out,
-              int out_pitch);
+// Columns from which a strip at column x is spread, counted from its input's first: a bit for each 16 of them.
+inline uint32_t strip_inputs(int x, int half) {
+  uint32_t columns = 0;
+  for (int block = x / 16; block <= (x + STRIP_COLUMNS - 1 + 2 * half) / 16; block++) columns |= 1u << std::min(block, 31);
+  return columns;
+}
+// Spreads values (of rows with a gap `pitch`) with a kernel to a strip: out [STRIP_ROWS, STRIP_COLUMNS]. The input has the
+// kernel's half more on each side and begins there. Input row i matters where rows[i] has one of the bits of `columns`.
+void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
 
 // Depth edges; edges.cpp
 void repair_edges(const torchdof_map &map);
