@@ -83,7 +83,12 @@ def behind_pixels(behind: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _place(pixel: Tensor, size: int, samples: int, step: int) -> Tensor:
     """Where pixels of an axis of the image lie on that of a map at every ``step``-th pixel. Both have one centre."""
-    return (pixel - (size - 1) / 2) / step + (samples - 1) / 2
+    return (pixel - _centre(size, pixel)) / step + _centre(samples, pixel)
+
+
+def _centre(size: int, like: Tensor) -> Tensor:
+    """Place of the middle of an axis; as a tensor, for graphs take no fractions of their sizes."""
+    return 0.5 * torch.scalar_tensor(size - 1, dtype=like.dtype, device=like.device)
 
 
 def _window(size: int, samples: int, step: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -167,8 +172,8 @@ def fill_hidden(
     cells = torch.cat([may_hide, wanted], 1).to(coc_px.dtype)
     cells = pixels.indices(_largest(cells, cell_rows, cell_columns, BEHIND_STEP).amin(1, keepdim=True) > 0)
     item, row, column = pixels.places(cells, cell_rows, cell_columns)
-    row = (row - (cell_rows - 1) / 2) * BEHIND_STEP + (height - 1) / 2
-    column = (column - (cell_columns - 1) / 2) * BEHIND_STEP + (width - 1) / 2
+    row = (row - _centre(cell_rows, coc_px)) * BEHIND_STEP + _centre(height, coc_px)
+    column = (column - _centre(cell_columns, coc_px)) * BEHIND_STEP + _centre(width, coc_px)
     cell_places = (item, row, column, pixels.pick(nearest, cells)[0])
     total, seen = _search(searched, *cell_places, farthest=True)
     shown = pixels.indices(total > 0)
