@@ -210,7 +210,7 @@ def _first_level(
 
     share = (row_share[:, None, :, None] * column_share[:, None]).flatten(-2).to(coc_px.dtype)  # [height, width, 9]
     coc_around = around(coc_px)
-    farthest = coc_around.detach().amax(-1, keepdim=True)
+    farthest = coc_around.amax(-1, keepdim=True)
     counts = around(weight) * (1.0 - _is_behind(farthest - coc_around)) * (share / 4.0)
     total = counts.sum(-1)
     known = total.clamp_min(1e-9)
@@ -220,7 +220,7 @@ def _first_level(
 
 def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """One step of the pyramid: of each four children, the mean of those that are farthest."""
-    farthest = functional.interpolate(functional.max_pool2d(coc_px.detach(), 2), scale_factor=2.0, mode="nearest")
+    farthest = functional.interpolate(functional.max_pool2d(coc_px, 2), scale_factor=2.0, mode="nearest")
     counts = weight * (1.0 - _is_behind(farthest - coc_px))
     total = downsampled(counts, 2)
     known = total.clamp_min(1e-9)

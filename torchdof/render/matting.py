@@ -111,7 +111,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     unexplained = colour - own_weight * own_mean - weight * other_mean
     moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
     item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
-    least, most = (light.detach().flatten(2).aminmax(dim=2)[i][item].t() / brightest for i in (0, 1))
+    least, most = (extreme[item].t() / brightest for extreme in light.flatten(2).aminmax(dim=2))
     moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
     own = (colour - moved) / own_weight
