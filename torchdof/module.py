@@ -200,7 +200,7 @@ class DepthOfField(nn.Module):
             >>> dof = DepthOfField(Camera(focus_m=1.0, f_number=1.0))
             >>> depth = torch.linspace(1, 9, 96).expand(1, 1, 64, 96)
             >>> print(dof.plan(torch.rand(1, 3, 64, 96), depth))  # doctest: +ELLIPSIS
-            6 layers, near to far, tolerance 1/255
+            7 layers, near to far, tolerance 1/255
               coc px  radius    at  pixels
             ...
         """

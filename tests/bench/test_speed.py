@@ -224,7 +224,7 @@ def test_alpha_is_left_out(tmp_path: Path) -> None:
         (["IMAGE", "DEPTH", "--truth", "."], "leave IMAGE and DEPTH out"),
         (["IMAGE", "DEPTH", "--out", "nowhere"], "no such folder"),
         (["IMAGE", "DEPTH", "--views", "4"], "name its folder with --truth"),
-        (["IMAGE", "DEPTH", "--f-number", "-1"], "f_number must be positive"),
+        (["IMAGE", "DEPTH", "--f-number", "-1"], "--f-number must be positive"),
         (["IMAGE", "DEPTH", "--depth-kind", "coc", "--focus-m", "2"], "takes no camera"),
         (["IMAGE", "SMALL"], "depth is 20 x 20 pixels but the image is 64 x 36"),
         (["TINY", "TINY", "--depth-kind", "z"], "from 16 pixels a side on"),

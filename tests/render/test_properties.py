@@ -108,7 +108,6 @@ def random_scene(seed: int, ways: Sequence[str], lamps: bool = True, multiple: i
         image = torch.where(uniform(1, 1, height, width) < 0.01, image * draw.choice([20.0, 200.0]), image)
     options: dict[str, Any] = {
         "table": draw.choice(TABLES),
-        "border": draw.choice(["normalize", "normalize", "extend"]),
     }
     way = draw.choice(ways)
     if way == "shallow":
