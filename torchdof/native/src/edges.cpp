@@ -28,7 +28,7 @@ struct Part {
 
 using Plane = std::vector<float>;
 
-// Each of the first values becomes the larger of two; `from` lies at or behind `to`, which it may overlap.
+// Each value becomes the larger of two; where `from` overlaps `to` it lies behind it.
 void raise(float *to, const float *from, int count) {
   int x = 0;
   for (; x + LANES <= count; x += LANES) store(to + x, most(load<vec>(to + x), load<vec>(from + x)));
@@ -73,14 +73,14 @@ void mean(const float *in, float *out, float *rows, int height, int width, int r
   for (int y = 0; y < height; y++) {
     const float *from = in + (size_t)y * width;
     float *to = rows + (size_t)y * width;
-    for (int x = 0; x < width; x++) {
-      float sum = 0;
-      if (x >= reach && x < width - reach)
-        for (int d = -reach; d <= reach; d++) sum += from[x + d];
-      else
-        for (int d = -reach; d <= reach; d++) sum += from[std::min(std::max(x + d, 0), width - 1)];
-      to[x] = sum * share;
+    const int first = std::min(reach, width), last = std::max(first, width - reach);
+    for (int x = 0; x < width; x++) to[x] = 0.0f;
+    for (int d = -reach; d <= reach; d++) {
+      for (int x = 0; x < first; x++) to[x] += from[std::min(std::max(x + d, 0), width - 1)];
+      for (int x = first; x < last; x++) to[x] += from[x + d];
+      for (int x = last; x < width; x++) to[x] += from[std::min(std::max(x + d, 0), width - 1)];
     }
+    for (int x = 0; x < width; x++) to[x] *= share;
   }
   for (int y = 0; y < height; y++) {
     float *to = out + (size_t)y * width;
@@ -253,7 +253,7 @@ class Repair {
     });
   }
 
-  // The largest change between neighbours in a part, and the least step.
+  // The largest change between neighbours in a part.
   float changes(const Part &part) const {
     Buffer<float> most(part.width);
     std::fill(most.data(), most.data() + part.width, 0.0f);
@@ -284,7 +284,8 @@ class Repair {
     const int bottom = inner.y0 + inner.height, right = inner.x0 + inner.width;
     const Part part = around(inner.y0, inner.x0, bottom, right, STEP_HALO);
     if (!(changes(part) > 0.09f * least_step(part))) return false;
-    if (!find_in(inner, part, false, steepness, middles)) find_in(inner, around(inner.y0, inner.x0, bottom, right, HALO), true, steepness, middles);
+    if (!find_in(inner, part, false, steepness, middles))
+      find_in(inner, around(inner.y0, inner.x0, bottom, right, HALO), true, steepness, middles);
     return true;
   }
 
@@ -303,7 +304,8 @@ class Repair {
       return taken;
     };
     float *value = plane(), *up = plane(), *down = plane(), *slope = plane(), *jump = plane(), *a = plane(), *b = plane();
-    float *rows = planes.data() + PLANES * size, *changes = rows + padded;  // from the pixel on the left, and from above
+    float *rows = planes.data() + PLANES * size;
+    float *across = rows + padded, *along = across + (size_t)(h + 1) * (w + 1);  // changes from the left and from above
     uint8_t *ok = marks.data(), *ramp = ok + size;
     for (int y = 0; y < h; y++)
       for (int x = 0; x < w; x++) {
@@ -315,8 +317,7 @@ class Repair {
         down[k] = ok[k] ? -v : -NONE;
       }
     const int wide = w + 1;
-    float *across = changes, *along = changes + (size_t)(h + 1) * wide;
-    std::fill(changes, changes + 2 * (size_t)(h + 1) * wide, 0.0f);
+    std::fill(across, across + 2 * (size_t)(h + 1) * wide, 0.0f);
     const auto known = [](float change) { return std::fabs(change) <= LARGEST ? change : 0.0f; };
     for (int y = 0; y < h; y++) {
       const float *at_row = map_.nearness + at(y, 0), *above = at_row - (y > 0 ? width_ : 0);
@@ -711,25 +712,23 @@ class Repair {
     });
   }
 
-  // `highest` of a whole frame, of its values times a sign, in strips.
+  // `highest` of a whole frame, of its values times a sign, by rows.
   void whole(const float *in, float *out, float *rows, int reach, float sign) const {
     parallel(height_, [&](int y) {
       const float *from = in + (size_t)y * width_;
-      float *to = rows + (size_t)y * width_;
-      for (int x = 0; x < width_; x++) {
-        float most = sign * from[x];
-        for (int u = std::max(0, x - reach); u <= std::min(width_ - 1, x + reach); u++) most = std::max(most, sign * from[u]);
-        to[x] = most;
-      }
+      int length = width_ + 2 * reach;
+      Buffer<float> row(length);
+      std::fill(row.data(), row.data() + reach, -NONE);
+      for (int x = 0; x < width_; x++) row[reach + x] = sign * from[x];
+      std::fill(row.data() + reach + width_, row.data() + length, -NONE);
+      widen(reach, [&](int by) { raise(row.data(), row.data() + by, length -= by); });
+      memcpy(rows + (size_t)y * width_, row.data(), width_ * sizeof(float));
     });
     parallel(height_, [&](int y) {
       float *to = out + (size_t)y * width_;
       const int first = std::max(0, y - reach), last = std::min(height_ - 1, y + reach);
       memcpy(to, rows + (size_t)first * width_, width_ * sizeof(float));
-      for (int v = first + 1; v <= last; v++) {
-        const float *from = rows + (size_t)v * width_;
-        for (int x = 0; x < width_; x++) to[x] = to[x] < from[x] ? from[x] : to[x];
-      }
+      for (int v = first + 1; v <= last; v++) raise(to, rows + (size_t)v * width_, width_);
     });
   }
 
@@ -739,11 +738,14 @@ class Repair {
     for (float &k : kernel) k /= sum;
     parallel(height_, [&](int y) {
       const float *from = in + (size_t)y * width_;
-      for (int x = 0; x < width_; x++) {
-        float total = 0;
-        for (int d = -BLUR_REACH; d <= BLUR_REACH; d++) total += kernel[d + BLUR_REACH] * from[std::min(std::max(x + d, 0), width_ - 1)];
-        rows[(size_t)y * width_ + x] = total;
-      }
+      Buffer<float> row(width_ + 2 * BLUR_REACH);
+      std::fill(row.data(), row.data() + BLUR_REACH, from[0]);
+      memcpy(row.data() + BLUR_REACH, from, width_ * sizeof(float));
+      std::fill(row.data() + BLUR_REACH + width_, row.data() + width_ + 2 * BLUR_REACH, from[width_ - 1]);
+      float *to = rows + (size_t)y * width_;
+      std::fill(to, to + width_, 0.0f);
+      for (int d = 0; d <= 2 * BLUR_REACH; d++)
+        for (int x = 0; x < width_; x++) to[x] += kernel[d] * row[x + d];
     });
     parallel(height_, [&](int y) {
       float *to = out + (size_t)y * width_;
