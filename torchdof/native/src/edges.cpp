@@ -19,7 +19,7 @@ constexpr int HALO = 21, STEP_HALO = RINGS + REACH;  // what a pixel shows depen
 constexpr float NONE = 1e30f;
 constexpr float LARGEST = 3.402823466e38f;
 constexpr int FLAT_REACH = 8, PLANES = 7 + 3 + 3 * RINGS;
-constexpr int SIDE = 2 * REACH + 1, WINDOW = SIDE * SIDE;
+constexpr int SIDE = 2 * REACH + 1, WINDOW = SIDE * SIDE, ROOM = (WINDOW + LANES - 1) / LANES * LANES;
 
 // A part of the frame and its surroundings, as far as the frame goes.
 struct Part {
@@ -90,6 +90,12 @@ void mean(const float *in, float *out, float *rows, int height, int width, int r
       for (int x = 0; x < width; x++) to[x] += from[x] * share;
     }
   }
+}
+
+float sum(vec v) {
+  float total = 0;
+  for (int i = 0; i < LANES; i++) total += v[i];
+  return total;
 }
 
 float logit(float p) { return std::log(p / (1.0f - p)); }
@@ -449,7 +455,7 @@ class Repair {
     falloff[WINDOW / 2] = 0.0f;  // none is its own witness
     const int chunk = 512;
     parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
-      std::vector<float> colours(2 * WINDOW * channels_), means(2 * channels_);
+      std::vector<float> colours(2 * ROOM * channels_), means(2 * channels_);
       for (size_t k = (size_t)part * chunk; k < std::min(pixels.size(), (size_t)(part + 1) * chunk); k++)
         judged[k] = judge_one(pixels[k], falloff, colours.data(), means.data());
     });
@@ -460,7 +466,7 @@ class Repair {
     const int y = i / width_, x = i % width_, C = channels_;
     const float near = near_[i], far = far_[i], per_gap = 1.0f / std::max(near - far, 1e-12f);
     int counts[2] = {0, 0};
-    float weights[2][WINDOW], values[2][WINDOW], alike[2][WINDOW], sums[2] = {0, 0};
+    float weights[2][ROOM], values[2][ROOM], alike[2][ROOM], sums[2] = {0, 0};
     for (int v = -REACH; v <= REACH; v++) {
       const size_t row = (size_t)std::min(std::max(y + v, 0), height_ - 1) * width_;
       const float *fall = falloff + (v + REACH) * SIDE + REACH;
@@ -472,22 +478,30 @@ class Repair {
         const int n = counts[side]++;
         weights[side][n] = weight;
         values[side][n] = given_[q];
-        for (int c = 0; c < C; c++) colours[(side * C + c) * WINDOW + n] = colour_[q * C + c];
+        for (int c = 0; c < C; c++) colours[(side * C + c) * ROOM + n] = colour_[q * C + c];
         sums[side] += weight;
       }
     }
     const bool known = sums[0] > 1e-3f && sums[1] > 1e-3f;
     if (!known) return {0.0f, 1.0f, near, far};  // the neighbours tell
+    for (int side = 0; side < 2; side++)
+      for (int &n = counts[side]; n % LANES; n++) {  // witnesses of no weight, up to whole vectors
+        weights[side][n] = values[side][n] = 0.0f;
+        for (int c = 0; c < C; c++) colours[(side * C + c) * ROOM + n] = 0.0f;
+      }
     float spread = 0, contrast = 0, noise = 0, apart[2] = {0, 0};
     for (int c = 0; c < C; c++) {
       const float own = colour_[(size_t)i * C + c];
       for (int side = 0; side < 2; side++) {
-        const float *colour = colours + (side * C + c) * WINDOW, *weight = weights[side];
-        float mean = 0, square = 0;
-        for (int n = 0; n < counts[side]; n++) mean += weight[n] * colour[n];
-        mean /= sums[side] + 1e-9f;
-        for (int n = 0; n < counts[side]; n++) square += weight[n] * (colour[n] - mean) * (colour[n] - mean);
-        spread += 0.5f * square / (sums[side] + 1e-9f);
+        const float *colour = colours + (side * C + c) * ROOM, *weight = weights[side];
+        vec weighted{}, square{};
+        for (int n = 0; n < counts[side]; n += LANES) weighted += load<vec>(weight + n) * load<vec>(colour + n);
+        const float mean = sum(weighted) / (sums[side] + 1e-9f);
+        for (int n = 0; n < counts[side]; n += LANES) {
+          const vec stray = load<vec>(colour + n) - mean;
+          square += load<vec>(weight + n) * stray * stray;
+        }
+        spread += 0.5f * sum(square) / (sums[side] + 1e-9f);
         means[side * C + c] = mean;
         apart[side] += (own - mean) * (own - mean);
       }
@@ -503,19 +517,20 @@ class Repair {
       float *like = alike[side];
       std::fill(like, like + count, 0.0f);
       for (int c = 0; c < C; c++) {
-        const float own = colour_[(size_t)i * C + c], *colour = colours + (side * C + c) * WINDOW;
+        const float own = colour_[(size_t)i * C + c], *colour = colours + (side * C + c) * ROOM;
         for (int n = 0; n < count; n++) like[n] += (colour[n] - own) * (colour[n] - own);
       }
-      float total = 0, share = 0, value = 0;
-      for (int n = 0; n < count; n++) {
-        const float t = 1.0f + like[n] * per_spread, l = 1.0f / (t * t), part = weights[side][n] * (l + 1e-3f);
-        total += weights[side][n] * l;
+      vec total{}, share{}, value{};
+      for (int n = 0; n < count; n += LANES) {
+        const vec t = 1.0f + load<vec>(like + n) * per_spread, l = 1.0f / (t * t);
+        const vec weight = load<vec>(weights[side] + n), part = weight * (l + 1e-3f);
+        total += weight * l;
         share += part;
-        value += part * (values[side][n] - near);
+        value += part * (load<vec>(values[side] + n) - near);
       }
       const float t = 1.0f + apart[side] * per_spread;
-      likelihood[side] = total / (sums[side] + 1e-9f) + 0.02f / (t * t) + 1e-9f;
-      surface[side] = near + value / std::max(share, 1e-12f);
+      likelihood[side] = sum(total) / (sums[side] + 1e-9f) + 0.02f / (t * t) + 1e-9f;
+      surface[side] = near + sum(value) / std::max(sum(share), 1e-12f);
     }
     const float tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
     return {clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), tells, surface[0], surface[1]};
