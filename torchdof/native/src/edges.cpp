@@ -128,6 +128,7 @@ class Repair {
     if (map_.automatic && (!is_related(sampled, judged) || !(is_soft || is_inexact(sampled)))) return;
     if (spares) find();
     const std::vector<int> pixels = list([&](size_t i) { return !map_.automatic || (ramp_[i] ? is_soft : wrong(i) > EXACT); });
+    if (pixels.empty() && !is_soft) return;
     judged = judge(pixels);
     decide(pixels, judged, evidence);
     std::vector<uint8_t> shows(pixels.size());
