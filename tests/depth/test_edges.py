@@ -178,6 +178,18 @@ def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
 
 
 @compiled
+@pytest.mark.parametrize(("kind", "is_exact"), [("exact", True), ("shift 1px", False), ("half-res", False)])
+def test_engines_agree_on_frames_of_which_a_part_decides(scene: Scene, kind: str, is_exact: bool) -> None:
+    image = scene.image.repeat(1, 1, 6, 5)
+    nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, 6, 5)
+    assert nearness.numel() > 4 * edges._SAMPLED
+    plain = edges._repair(image, nearness, torch.tensor(1.0), True)[0, 0]
+    fast = native.repair_edges(image[0], nearness[0, 0], torch.tensor(1.0), True)
+    assert torch.equal(fast, nearness[0, 0]) == torch.equal(plain, nearness[0, 0]) == is_exact
+    assert float(torch.isclose(fast, plain, rtol=1e-3, atol=1e-3).float().mean()) > 0.999
+
+
+@compiled
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 3), (65, 130)])
 def test_engines_agree_on_frames_of_any_size(size: tuple[int, int]) -> None:
     image, nearness = torch.rand(1, 2, *size), 9 * torch.rand(1, 1, *size)

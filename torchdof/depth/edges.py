@@ -45,7 +45,7 @@ _EXACT = 0.05  # share of wrong pixels up to which a map's steps count as exact
 _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
 _RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
 _SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
-_BLOCK = 16
+_BLOCK = 32
 _CHUNK = 40_000
 _NEVER = 1e30
 
@@ -145,17 +145,17 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     kind = _kind(given, edges)
     sampled_score = _judge(light, given, witness, edges, sampled)[0]
     prior = _calibrate(kind, sampled, sampled_score, len(given))[kind]
-    softness = edges.is_ramp.sum((1, 2, 3), keepdim=True) / edges.is_edge.sum((1, 2, 3), keepdim=True).clamp_min(1)
-    is_soft = softness > _SOFT
+    wrong = torch.where(is_near, 1.0 - prior, prior)
+    is_soft = _mean_of(edges.is_ramp.float(), edges.is_edge, sampled) > _SOFT
     if auto:
         is_related = _is_related(given, edges, sampled, sampled_score)
         is_soft = is_soft & is_related
+        is_inexact = is_related & (is_soft | (_mean_of(wrong, ~edges.is_ramp, sampled) > _EXACT))
 
     # which surface the doubtful pixels show
     doubtful = edges.is_edge
     if auto:
-        is_wrong = torch.where(is_near, 1.0 - prior, prior) > _EXACT
-        doubtful = doubtful & is_related & torch.where(edges.is_ramp, is_soft, is_wrong)
+        doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _EXACT)
     edge_pixels = pixels.indices(doubtful)
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0]) > 0
@@ -296,6 +296,14 @@ def _judge(
     known = _highest(pixels.put(torch.zeros_like(nearness), edge_pixels, evidence), 3)
     evidence = pixels.pick(known, edge_pixels)[0]
     return score, evidence, near, far
+
+
+def _mean_of(values: Tensor, mask: Tensor, sampled: Tensor) -> Tensor:
+    """Mean over those of an item's sampled pixels that are in a mask, ``[B, 1, 1, 1]``; 0 where there are none."""
+    item, weight = sampled // mask[0].numel(), pixels.pick(mask, sampled)[0].to(values.dtype)
+    weighted = weight * pixels.pick(values, sampled)[0]
+    sums = [weight.new_zeros(len(mask)).index_add(0, item, w) for w in (weight, weighted)]
+    return (sums[1] / sums[0].clamp_min(1.0)).view(-1, 1, 1, 1)
 
 
 def _is_related(nearness: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:

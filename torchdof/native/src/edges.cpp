@@ -13,10 +13,13 @@ namespace {
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
 constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f;
-constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 16, BLUR_REACH = 9;
-constexpr int AREA = 64, HALO = 21;  // what a pixel shows depends on what is so far around it
+constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9;
+constexpr int AREA = 64;
+constexpr int HALO = 21, STEP_HALO = RINGS + REACH;  // what a pixel shows depends on what is so far around it; without ramps
 constexpr float NONE = 1e30f;
-constexpr int SIDE = 2 * REACH + 1, WINDOW = SIDE * SIDE;
+constexpr float LARGEST = 3.402823466e38f;
+constexpr int FLAT_REACH = 8, PLANES = 7 + 3 + 3 * RINGS;
+constexpr int SIDE = 2 * REACH + 1, WINDOW = SIDE * SIDE, ROOM = (WINDOW + LANES - 1) / LANES * LANES;
 
 // A part of the frame and its surroundings, as far as the frame goes.
 struct Part {
@@ -25,26 +28,43 @@ struct Part {
 
 using Plane = std::vector<float>;
 
-// The largest of a square around each value.
+// Each value becomes the larger of two; where `from` overlaps `to` it lies behind it.
+void raise(float *to, const float *from, int count) {
+  int x = 0;
+  for (; x + LANES <= count; x += LANES) store(to + x, most(load<vec>(to + x), load<vec>(from + x)));
+  for (; x < count; x++) to[x] = to[x] < from[x] ? from[x] : to[x];
+}
+
+// The largest of 2 reach + 1 values, in place: of 2, of 4, ... and of two such that overlap.
+template <typename Merge>
+void widen(int reach, const Merge &merge) {
+  int covered = 1;
+  for (; 2 * covered <= 2 * reach + 1; covered *= 2) merge(covered);
+  if (covered < 2 * reach + 1) merge(2 * reach + 1 - covered);
+}
+
+// The largest of a square around each value; rows: scratch of height + 2 reach times width + 2 reach.
 void highest(const float *in, float *out, float *rows, int height, int width, int reach) {
+  const int wide = width + 2 * reach;
+  std::fill(rows, rows + (size_t)reach * wide, -NONE);
+  std::fill(rows + (size_t)(height + reach) * wide, rows + (size_t)(height + 2 * reach) * wide, -NONE);
   for (int y = 0; y < height; y++) {
-    const float *from = in + (size_t)y * width;
-    float *to = rows + (size_t)y * width;
-    memcpy(to, from, width * sizeof(float));
-    for (int d = 1; d <= reach; d++) {
-      for (int x = 0; x < width - d; x++) to[x] = to[x] < from[x + d] ? from[x + d] : to[x];
-      for (int x = d; x < width; x++) to[x] = to[x] < from[x - d] ? from[x - d] : to[x];
-    }
+    float *to = rows + (size_t)(y + reach) * wide;
+    std::fill(to, to + reach, -NONE);
+    memcpy(to + reach, in + (size_t)y * width, width * sizeof(float));
+    std::fill(to + reach + width, to + wide, -NONE);
+    int length = wide;
+    widen(reach, [&](int by) {
+      length -= by;
+      raise(to, to + by, length);
+    });
   }
-  for (int y = 0; y < height; y++) {
-    float *to = out + (size_t)y * width;
-    const int first = std::max(0, y - reach), last = std::min(height - 1, y + reach);
-    memcpy(to, rows + (size_t)first * width, width * sizeof(float));
-    for (int v = first + 1; v <= last; v++) {
-      const float *from = rows + (size_t)v * width;
-      for (int x = 0; x < width; x++) to[x] = to[x] < from[x] ? from[x] : to[x];
-    }
-  }
+  int count = height + 2 * reach;
+  widen(reach, [&](int by) {
+    count -= by;
+    for (int y = 0; y < count; y++) raise(rows + (size_t)y * wide, rows + (size_t)(y + by) * wide, width);
+  });
+  for (int y = 0; y < height; y++) memcpy(out + (size_t)y * width, rows + (size_t)y * wide, width * sizeof(float));
 }
 
 // The mean of a square around each value, which goes on beyond the border as it is at it.
@@ -53,14 +73,14 @@ void mean(const float *in, float *out, float *rows, int height, int width, int r
   for (int y = 0; y < height; y++) {
     const float *from = in + (size_t)y * width;
     float *to = rows + (size_t)y * width;
-    for (int x = 0; x < width; x++) {
-      float sum = 0;
-      if (x >= reach && x < width - reach)
-        for (int d = -reach; d <= reach; d++) sum += from[x + d];
-      else
-        for (int d = -reach; d <= reach; d++) sum += from[std::min(std::max(x + d, 0), width - 1)];
-      to[x] = sum * share;
+    const int first = std::min(reach, width), last = std::max(first, width - reach);
+    for (int x = 0; x < width; x++) to[x] = 0.0f;
+    for (int d = -reach; d <= reach; d++) {
+      for (int x = 0; x < first; x++) to[x] += from[std::min(std::max(x + d, 0), width - 1)];
+      for (int x = first; x < last; x++) to[x] += from[x + d];
+      for (int x = last; x < width; x++) to[x] += from[std::min(std::max(x + d, 0), width - 1)];
     }
+    for (int x = 0; x < width; x++) to[x] *= share;
   }
   for (int y = 0; y < height; y++) {
     float *to = out + (size_t)y * width;
@@ -70,6 +90,12 @@ void mean(const float *in, float *out, float *rows, int height, int width, int r
       for (int x = 0; x < width; x++) to[x] += from[x] * share;
     }
   }
+}
+
+float sum(vec v) {
+  float total = 0;
+  for (int i = 0; i < LANES; i++) total += v[i];
+  return total;
 }
 
 float logit(float p) { return std::log(p / (1.0f - p)); }
@@ -84,27 +110,24 @@ class Repair {
       : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width) {}
 
   void run() {
-    take();
-    find();
-    const std::vector<int> sampled = list([&](int y, int x, size_t i) {
-      const int64_t every = ((int64_t)area_ + SAMPLED - 1) / SAMPLED;
-      return edge_[i] && (y / SAMPLE_BLOCK + 3 * (x / SAMPLE_BLOCK)) % every == 0;
+    parallel(height_, [&](int y) {
+      memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
     });
+    allocate();
+    const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
+    const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
+    spares ? find_sample(every) : find();
+    const std::vector<int> sampled = sample(every);
     std::vector<Judgement> judged = judge(sampled);
     std::vector<float> evidence;
     decide(sampled, judged, evidence);
     calibrate(sampled, judged);
-    const bool related = !map_.automatic || is_related(sampled, judged);
-    const bool is_soft = related && (double)ramps_ > SOFT * (double)std::max<int64_t>(1, edges_);
-    const std::vector<int> pixels = list([&](int, int, size_t i) {
-      if (!map_.automatic) return true;
-      if (!related) return false;
-      const float prior = shares_[kind_[i]];
-      return ramp_[i] ? is_soft : (is_near(i) ? 1.0f - prior : prior) > EXACT;
-    });
-    parallel(height_, [&](int y) {
-      memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
-    });
+    int64_t ramps = 0;
+    for (const int i : sampled) ramps += ramp_[i];
+    bool is_soft = (double)ramps > SOFT * (double)sampled.size();
+    if (map_.automatic && (!is_related(sampled, judged) || !(is_soft || is_inexact(sampled)))) return;
+    if (spares) find();
+    const std::vector<int> pixels = list([&](size_t i) { return !map_.automatic || (ramp_[i] ? is_soft : wrong(i) > EXACT); });
     if (pixels.empty() && !is_soft) return;
     judged = judge(pixels);
     decide(pixels, judged, evidence);
@@ -129,21 +152,48 @@ class Repair {
 
   float step(size_t i) const { return map_.steps ? map_.steps[i] : map_.step; }
   bool is_near(size_t i) const { return 2.0f * given_[i] > near_[i] + far_[i]; }
+  float wrong(size_t i) const { return is_near(i) ? 1.0f - shares_[kind_[i]] : shares_[kind_[i]]; }
+
+  // Whether more of a sample's pixels at steps are wrong than exact maps have.
+  bool is_inexact(const std::vector<int> &sampled) const {
+    double found = 0, steps = 0;
+    for (const int i : sampled)
+      if (!ramp_[i]) {
+        found += wrong(i);
+        steps++;
+      }
+    return found > EXACT * steps;
+  }
 
   template <typename Chosen>
   std::vector<int> list(const Chosen &chosen) const {
     std::vector<int> found;
-    for (int y = 0; y < height_; y++)
-      for (int x = 0; x < width_; x++) {
-        const size_t i = (size_t)y * width_ + x;
-        if (edge_[i] && chosen(y, x, i)) found.push_back((int)i);
-      }
+    for (size_t i = 0; i < area_; i++)
+      if (edge_[i] && chosen(i)) found.push_back((int)i);
     return found;
   }
 
-  void take() {
+  // Calls body(top, left, bottom, right) for each block of a sample.
+  template <typename Body>
+  void each_sampled(int every, const Body &body) const {
+    for (int y = 0; y * SAMPLE_BLOCK < height_; y++)
+      for (int x = 0; x * SAMPLE_BLOCK < width_; x++)
+        if ((y + 3 * x) % every == 0)
+          body(y * SAMPLE_BLOCK, x * SAMPLE_BLOCK, std::min(height_, (y + 1) * SAMPLE_BLOCK), std::min(width_, (x + 1) * SAMPLE_BLOCK));
+  }
+
+  std::vector<int> sample(int every) const {
+    std::vector<int> found;
+    each_sampled(every, [&](int top, int left, int bottom, int right) {
+      for (int y = top; y < bottom; y++)
+        for (int x = left; x < right; x++)
+          if (const size_t i = (size_t)y * width_ + x; edge_[i]) found.push_back((int)i);
+    });
+    return found;
+  }
+
+  void allocate() {
     given_ = Buffer<float>(area_);
-    valid_ = Buffer<uint8_t>(area_);
     colour_ = Buffer<float>(area_ * channels_);
     near_ = Buffer<float>(area_);
     far_ = Buffer<float>(area_);
@@ -151,109 +201,182 @@ class Repair {
     edge_ = Buffer<uint8_t>(area_);
     ramp_ = Buffer<uint8_t>(area_);
     kind_ = Buffer<uint8_t>(area_);
-    parallel(height_, [&](int y) {
-      for (size_t i = (size_t)y * width_; i < (size_t)(y + 1) * width_; i++) {
+  }
+
+  void take(const Part &part) {
+    for (int y = part.y0; y < part.y0 + part.height; y++) {
+      const size_t from = (size_t)y * width_ + part.x0, to = from + part.width;
+      for (size_t i = from; i < to; i++) {
         const float v = map_.nearness[i];
-        valid_[i] = std::isfinite(v);
-        given_[i] = valid_[i] ? v : 0.0f;
-        edge_[i] = ramp_[i] = kind_[i] = 0;
-        witness_[i] = valid_[i] ? 1.0f : 0.0f;
-        near_[i] = far_[i] = given_[i];
+        const bool valid = std::fabs(v) <= LARGEST;
+        given_[i] = valid ? v : 0.0f;
+        witness_[i] = valid ? 1.0f : 0.0f;
       }
+      memset(edge_.data() + from, 0, part.width);
+      memset(ramp_.data() + from, 0, part.width);
+    }
+  }
+
+  void take_colours(const Part &part) {
+    for (int y = part.y0; y < part.y0 + part.height; y++)
       for (int c = 0; c < channels_; c++) {
-        const float *light = map_.light + c * area_ + (size_t)y * width_;
-        float *to = colour_.data() + (size_t)y * width_ * channels_ + c;
-        for (int x = 0; x < width_; x++) to[(size_t)x * channels_] = std::isfinite(light[x]) ? std::sqrt(std::max(light[x], 0.0f)) : 0.0f;
+        const size_t from = (size_t)y * width_ + part.x0;
+        const float *light = map_.light + c * area_ + from;
+        float *to = colour_.data() + from * channels_ + c;
+        for (int x = 0; x < part.width; x++) to[(size_t)x * channels_] = light[x] <= LARGEST && light[x] > 0 ? std::sqrt(light[x]) : 0.0f;
       }
-    });
+  }
+
+  Part around(int top, int left, int bottom, int right, int reach) const {
+    const int y0 = std::max(0, top - reach), x0 = std::max(0, left - reach);
+    return {y0, x0, std::min(height_, bottom + reach) - y0, std::min(width_, right + reach) - x0};
   }
 
   // Ramps and steps, and the two surfaces that meet there.
   void find() {
     const int rows = ceil_div(height_, AREA), columns = ceil_div(width_, AREA), parts = rows * columns;
     std::vector<double> steepness(parts, 0.0);
-    std::vector<int64_t> middles(parts, 0), ramps(parts, 0), edges(parts, 0);
+    std::vector<int64_t> middles(parts, 0);
     parallel(parts, [&](int p) {
       const int top = p / columns * AREA, left = p % columns * AREA;
-      const Part part = {std::max(0, top - HALO), std::max(0, left - HALO),
-                         std::min(height_, top + AREA + HALO) - std::max(0, top - HALO),
-                         std::min(width_, left + AREA + HALO) - std::max(0, left - HALO)};
-      find_in(part, top, left, steepness[p], middles[p], ramps[p], edges[p]);
+      const Part inner = around(top, left, top + AREA, left + AREA, 0);
+      take_colours(inner);
+      find_in(inner, steepness[p], middles[p]);
     });
     for (int p = 0; p < parts; p++) {
       steepness_ += steepness[p];
       middles_ += middles[p];
-      ramps_ += ramps[p];
-      edges_ += edges[p];
     }
   }
 
-  void find_in(const Part &part, int top, int left, double &steepness, int64_t &middles, int64_t &ramps, int64_t &edges) {
+  // The same, in the blocks of a sample and what is around them.
+  void find_sample(int every) {
+    std::vector<Part> blocks;
+    each_sampled(every, [&](int top, int left, int bottom, int right) { blocks.push_back(around(top, left, bottom, right, REACH)); });
+    parallel((int)blocks.size(), [&](int p) {
+      double steepness;
+      int64_t middles;
+      if (find_in(blocks[p], steepness, middles)) take_colours(blocks[p]);
+    });
+  }
+
+  // The largest change between neighbours in a part.
+  float changes(const Part &part) const {
+    Buffer<float> most(part.width);
+    std::fill(most.data(), most.data() + part.width, 0.0f);
+    for (int y = part.y0; y < part.y0 + part.height; y++) {
+      const float *at = map_.nearness + (size_t)y * width_ + part.x0, *above = y > part.y0 ? at - width_ : at;
+      for (int x = 0; x < part.width - 1; x++) {
+        const float change = std::fabs(at[x + 1] - at[x]), down = std::fabs(at[x] - above[x]);
+        most[x] = most[x] < change ? change : most[x];
+        most[x] = most[x] < down ? down : most[x];
+      }
+      const float down = std::fabs(at[part.width - 1] - above[part.width - 1]);
+      most[part.width - 1] = std::max(most[part.width - 1], down);
+    }
+    return *std::max_element(most.data(), most.data() + part.width);
+  }
+
+  float least_step(const Part &part) const {
+    if (!map_.steps) return map_.step;
+    float least = NONE;
+    for (int y = part.y0; y < part.y0 + part.height; y++)
+      for (int x = part.x0; x < part.x0 + part.width; x++) least = std::min(least, step((size_t)y * width_ + x));
+    return least;
+  }
+
+  // Returns whether there may be edges.
+  bool find_in(const Part &inner, double &steepness, int64_t &middles) {
+    take(inner);
+    const int bottom = inner.y0 + inner.height, right = inner.x0 + inner.width;
+    const Part part = around(inner.y0, inner.x0, bottom, right, STEP_HALO);
+    if (!(changes(part) > 0.09f * least_step(part))) return false;
+    if (!find_in(inner, part, false, steepness, middles))
+      find_in(inner, around(inner.y0, inner.x0, bottom, right, HALO), true, steepness, middles);
+    return true;
+  }
+
+  // Returns whether the part was enough of what is around.
+  bool find_in(const Part &inner, const Part &part, bool wide_enough, double &steepness, int64_t &middles) {
     const int h = part.height, w = part.width;
     const size_t size = (size_t)h * w;
     const auto at = [&](int y, int x) { return (size_t)(part.y0 + y) * width_ + part.x0 + x; };
-    float low = NONE, high = -NONE, least_step = NONE;
-    for (int y = 0; y < h; y++)
-      for (int x = 0; x < w; x++) {
-        const size_t i = at(y, x);
-        if (!valid_[i]) continue;
-        low = std::min(low, given_[i]);
-        high = std::max(high, given_[i]);
-        least_step = std::min(least_step, step(i));
-      }
-    if (!(high - low > least_step)) return;
-    Plane value(size), up(size), down(size), slope(size), steep(size), jump(size), a(size), b(size), rows(size);
-    std::vector<uint8_t> ok(size), ramp(size);
-    for (int y = 0; y < h; y++)
-      for (int x = 0; x < w; x++) {
-        const size_t i = at(y, x), k = (size_t)y * w + x;
-        value[k] = given_[i];
-        ok[k] = valid_[i];
-        up[k] = ok[k] ? value[k] : -NONE;
-        down[k] = ok[k] ? -value[k] : -NONE;
-      }
+    const size_t padded = (size_t)(h + 2 * FLAT_REACH) * (w + 2 * FLAT_REACH);
+    Buffer<float> planes(PLANES * size + padded + 2 * (h + 1) * (w + 1));
+    Buffer<uint8_t> marks(2 * size);
+    float *next = planes.data();
+    const auto plane = [&] {
+      float *taken = next;
+      next += size;
+      return taken;
+    };
+    float *value = plane(), *up = plane(), *down = plane(), *slope = plane(), *jump = plane(), *a = plane(), *b = plane();
+    float *rows = planes.data() + PLANES * size;
+    float *across = rows + padded, *along = across + (size_t)(h + 1) * (w + 1);  // changes from the left and from above
+    uint8_t *ok = marks.data(), *ramp = ok + size;
     for (int y = 0; y < h; y++)
       for (int x = 0; x < w; x++) {
         const size_t k = (size_t)y * w + x;
-        const auto change = [&](bool inside, size_t from, size_t to) {
-          return inside && ok[from] && ok[to] ? value[to] - value[from] : 0.0f;
-        };
-        const float x0 = change(x > 0, k - 1, k), x1 = change(x < w - 1, k, k + 1);
-        const float y0 = change(y > 0, k - w, k), y1 = change(y < h - 1, k, k + w);
-        const bool across = x0 * x1 > 0, along = y0 * y1 > 0;
-        const float sx = across ? std::min(std::fabs(x0), std::fabs(x1)) : 0.0f;
-        const float sy = along ? std::min(std::fabs(y0), std::fabs(y1)) : 0.0f;
-        slope[k] = std::max(sx, sy);
-        jump[k] = std::max(std::max(std::fabs(x0), std::fabs(x1)) - sx, std::max(std::fabs(y0), std::fabs(y1)) - sy);
-        const float mx = across ? 0.5f * (x0 + x1) : 0.0f, my = along ? 0.5f * (y0 + y1) : 0.0f;
-        steep[k] = std::sqrt(mx * mx + my * my);
+        const float v = map_.nearness[at(y, x)];
+        ok[k] = std::fabs(v) <= LARGEST;
+        value[k] = ok[k] ? v : 0.0f;
+        up[k] = ok[k] ? v : -NONE;
+        down[k] = ok[k] ? -v : -NONE;
       }
-    highest(up.data(), a.data(), rows.data(), h, w, REACH);
-    highest(down.data(), b.data(), rows.data(), h, w, REACH);
+    const int wide = w + 1;
+    std::fill(across, across + 2 * (size_t)(h + 1) * wide, 0.0f);
+    const auto known = [](float change) { return std::fabs(change) <= LARGEST ? change : 0.0f; };
+    for (int y = 0; y < h; y++) {
+      const float *at_row = map_.nearness + at(y, 0), *above = at_row - (y > 0 ? width_ : 0);
+      float *to_across = across + (size_t)y * wide, *to_along = along + (size_t)y * wide;
+      for (int x = 1; x < w; x++) to_across[x] = known(at_row[x] - at_row[x - 1]);
+      for (int x = 0; x < w; x++) to_along[x] = known(at_row[x] - above[x]);
+    }
+    for (int y = 0; y < h; y++) {
+      const float *x0 = across + (size_t)y * wide, *x1 = x0 + 1, *y0 = along + (size_t)y * wide, *y1 = y0 + wide;
+      float *to_slope = slope + (size_t)y * w, *to_jump = jump + (size_t)y * w;
+      for (int x = 0; x < w; x++) {
+        const float ax0 = std::fabs(x0[x]), ax1 = std::fabs(x1[x]), ay0 = std::fabs(y0[x]), ay1 = std::fabs(y1[x]);
+        const float lx = ax0 < ax1 ? ax0 : ax1, ly = ay0 < ay1 ? ay0 : ay1, mx = ax0 < ax1 ? ax1 : ax0, my = ay0 < ay1 ? ay1 : ay0;
+        const float sx = x0[x] * x1[x] > 0 ? lx : 0.0f, sy = y0[x] * y1[x] > 0 ? ly : 0.0f, jx = mx - sx, jy = my - sy;
+        to_slope[x] = sx < sy ? sy : sx;
+        to_jump[x] = jx < jy ? jy : jx;
+      }
+    }
+    highest(up, a, rows, h, w, REACH);
+    highest(down, b, rows, h, w, REACH);
+    // ramps no farther away than this reach into the inner part
+    const int top = inner.y0 - part.y0, left = inner.x0 - part.x0, bottom = top + inner.height, right = left + inner.width;
     bool any = false;
-    for (int y = 0; y < h; y++)
+    for (int y = 0; y < h; y++) {
+      const size_t k = (size_t)y * w;
+      bool any_here = false;
+      const bool is_close = y >= top - RINGS && y < bottom + RINGS;
       for (int x = 0; x < w; x++) {
-        const size_t k = (size_t)y * w + x;
-        const float span = a[k] + b[k], s = step(at(y, x));
-        ramp[k] = slope[k] > 0.1f * s && slope[k] > SHALLOW * span && span > s && ok[k];
-        any |= ramp[k];
+        const float span = a[k + x] + b[k + x], s = map_.steps ? map_.steps[at(y, x)] : map_.step;
+        const bool is_ramp = (slope[k + x] > 0.1f * s) & (slope[k + x] > SHALLOW * span) & (span > s) & (ok[k + x] != 0);
+        ramp[k + x] = is_ramp;
+        any_here |= is_ramp & (x >= left - RINGS) & (x < right + RINGS);
       }
+      any |= any_here && is_close;
+    }
+    if (any && !wide_enough) return false;
     if (any) {  // a ramp ends, a slope goes on
-      Plane flat(size);
-      mean(slope.data(), flat.data(), rows.data(), h, w, 2);
-      for (float &v : flat) v = -v;
-      highest(flat.data(), a.data(), rows.data(), h, w, 8);
+      float *flat = plane(), *up_end = plane(), *down_end = plane();
+      mean(slope, flat, rows, h, w, 2);
+      for (size_t k = 0; k < size; k++) flat[k] = -flat[k];
+      highest(flat, a, rows, h, w, FLAT_REACH);
       for (size_t k = 0; k < size; k++) ramp[k] &= -a[k] < 0.3f * slope[k];
       // the surfaces at both ends of a ramp
-      Plane up_end = up, down_end = down;
+      memcpy(up_end, up, size * sizeof(float));
+      memcpy(down_end, down, size * sizeof(float));
       for (int round = 0; round < RAMP_REACH; round++) {
-        highest(up_end.data(), a.data(), rows.data(), h, w, 1);
-        highest(down_end.data(), b.data(), rows.data(), h, w, 1);
-        for (size_t k = 0; k < size; k++)
-          if (ramp[k]) {
-            up_end[k] = a[k];
-            down_end[k] = b[k];
-          }
+        highest(up_end, a, rows, h, w, 1);
+        highest(down_end, b, rows, h, w, 1);
+        for (size_t k = 0; k < size; k++) {
+          up_end[k] = ramp[k] ? a[k] : up_end[k];
+          down_end[k] = ramp[k] ? b[k] : down_end[k];
+        }
       }
       for (int y = 0; y < h; y++)
         for (int x = 0; x < w; x++) {
@@ -264,22 +387,24 @@ class Repair {
             down[k] = down_end[k];
           }
         }
+    } else {
+      memset(ramp, 0, size);
     }
     // those at both sides of a step
-    Plane nears[RINGS], fars[RINGS], jumps[RINGS];
+    float *nears[RINGS], *fars[RINGS], *jumps[RINGS];
     for (int r = 0; r < RINGS; r++) {
-      nears[r].resize(size);
-      fars[r].resize(size);
-      highest(up.data(), nears[r].data(), rows.data(), h, w, r + 1);
-      jumps[r].resize(size);
-      highest(down.data(), fars[r].data(), rows.data(), h, w, r + 1);
-      highest(jump.data(), jumps[r].data(), rows.data(), h, w, r + 1);
+      nears[r] = plane();
+      fars[r] = plane();
+      jumps[r] = plane();
+      highest(r ? nears[r - 1] : up, nears[r], rows, h, w, 1);
+      highest(r ? fars[r - 1] : down, fars[r], rows, h, w, 1);
+      highest(r ? jumps[r - 1] : jump, jumps[r], rows, h, w, 1);
     }
     const auto clamped = [&](int y, int x) {
       return value[(size_t)std::min(std::max(y, 0), h - 1) * w + std::min(std::max(x, 0), w - 1)];
     };
-    for (int y = top - part.y0; y < std::min(h, top - part.y0 + AREA); y++)
-      for (int x = left - part.x0; x < std::min(w, left - part.x0 + AREA); x++) {
+    for (int y = top; y < bottom; y++)
+      for (int x = left; x < right; x++) {
         const size_t i = at(y, x), k = (size_t)y * w + x;
         const float s = step(i), least = std::max(0.6f * (nears[RINGS - 1][k] + fars[RINGS - 1][k]), s);
         int ring = RINGS + 1;
@@ -302,23 +427,24 @@ class Repair {
         edge_[i] = (ramp[k] || ring <= RINGS) && near - far > s && ok[k];
         const float gap = std::max(near - far, 1e-12f), level = (value[k] - far) / gap;
         if (ramp[k] && std::fabs(level - 0.5f) < 0.12f) {
-          steepness += steep[k] / gap;
+          const float *x0 = across + (size_t)y * wide + x, *y0 = along + (size_t)y * wide + x;
+          const float mx = x0[0] * x0[1] > 0 ? 0.5f * (x0[0] + x0[1]) : 0.0f, my = y0[0] * y0[wide] > 0 ? 0.5f * (y0[0] + y0[wide]) : 0.0f;
+          steepness += std::sqrt(mx * mx + my * my) / gap;
           middles++;
         }
-        ramps += ramp[k];
-        edges += edge_[i];
         if (!edge_[i]) continue;
-        float right = 0, below = 0;  // differences of means of 5 x 5, two pixels to each side
+        float beside = 0, below = 0;  // differences of means of 5 x 5, two pixels to each side
         for (int d = -2; d <= 2; d++)
           for (int e = 0; e <= 4; e++) {
-            right += clamped(y + d, x + e) - clamped(y + d, x - e);
+            beside += clamped(y + d, x + e) - clamped(y + d, x - e);
             below += clamped(y + e, x + d) - clamped(y - e, x + d);
           }
-        const int direction = std::fabs(right) > std::fabs(below) ? right > 0 : 2 + (below > 0);
+        const int direction = std::fabs(beside) > std::fabs(below) ? beside > 0 : 2 + (below > 0);
         const int place = ramp[k] ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1)
                                   : (level > 0.5f) * RINGS + std::min(ring, RINGS) - 1;
         kind_[i] = (uint8_t)(place * 4 + direction);
       }
+    return true;
   }
 
   // Which of two surfaces pixels show, by their colour.
@@ -330,7 +456,7 @@ class Repair {
     falloff[WINDOW / 2] = 0.0f;  // none is its own witness
     const int chunk = 512;
     parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
-      std::vector<float> colours(2 * WINDOW * channels_), means(2 * channels_);
+      std::vector<float> colours(2 * ROOM * channels_), means(2 * channels_);
       for (size_t k = (size_t)part * chunk; k < std::min(pixels.size(), (size_t)(part + 1) * chunk); k++)
         judged[k] = judge_one(pixels[k], falloff, colours.data(), means.data());
     });
@@ -341,7 +467,7 @@ class Repair {
     const int y = i / width_, x = i % width_, C = channels_;
     const float near = near_[i], far = far_[i], per_gap = 1.0f / std::max(near - far, 1e-12f);
     int counts[2] = {0, 0};
-    float weights[2][WINDOW], values[2][WINDOW], alike[2][WINDOW], sums[2] = {0, 0};
+    float weights[2][ROOM], values[2][ROOM], alike[2][ROOM], sums[2] = {0, 0};
     for (int v = -REACH; v <= REACH; v++) {
       const size_t row = (size_t)std::min(std::max(y + v, 0), height_ - 1) * width_;
       const float *fall = falloff + (v + REACH) * SIDE + REACH;
@@ -353,22 +479,30 @@ class Repair {
         const int n = counts[side]++;
         weights[side][n] = weight;
         values[side][n] = given_[q];
-        for (int c = 0; c < C; c++) colours[(side * C + c) * WINDOW + n] = colour_[q * C + c];
+        for (int c = 0; c < C; c++) colours[(side * C + c) * ROOM + n] = colour_[q * C + c];
         sums[side] += weight;
       }
     }
     const bool known = sums[0] > 1e-3f && sums[1] > 1e-3f;
     if (!known) return {0.0f, 1.0f, near, far};  // the neighbours tell
+    for (int side = 0; side < 2; side++)
+      for (int &n = counts[side]; n % LANES; n++) {  // witnesses of no weight, up to whole vectors
+        weights[side][n] = values[side][n] = 0.0f;
+        for (int c = 0; c < C; c++) colours[(side * C + c) * ROOM + n] = 0.0f;
+      }
     float spread = 0, contrast = 0, noise = 0, apart[2] = {0, 0};
     for (int c = 0; c < C; c++) {
       const float own = colour_[(size_t)i * C + c];
       for (int side = 0; side < 2; side++) {
-        const float *colour = colours + (side * C + c) * WINDOW, *weight = weights[side];
-        float mean = 0, square = 0;
-        for (int n = 0; n < counts[side]; n++) mean += weight[n] * colour[n];
-        mean /= sums[side] + 1e-9f;
-        for (int n = 0; n < counts[side]; n++) square += weight[n] * (colour[n] - mean) * (colour[n] - mean);
-        spread += 0.5f * square / (sums[side] + 1e-9f);
+        const float *colour = colours + (side * C + c) * ROOM, *weight = weights[side];
+        vec weighted{}, square{};
+        for (int n = 0; n < counts[side]; n += LANES) weighted += load<vec>(weight + n) * load<vec>(colour + n);
+        const float mean = sum(weighted) / (sums[side] + 1e-9f);
+        for (int n = 0; n < counts[side]; n += LANES) {
+          const vec stray = load<vec>(colour + n) - mean;
+          square += load<vec>(weight + n) * stray * stray;
+        }
+        spread += 0.5f * sum(square) / (sums[side] + 1e-9f);
         means[side * C + c] = mean;
         apart[side] += (own - mean) * (own - mean);
       }
@@ -384,19 +518,20 @@ class Repair {
       float *like = alike[side];
       std::fill(like, like + count, 0.0f);
       for (int c = 0; c < C; c++) {
-        const float own = colour_[(size_t)i * C + c], *colour = colours + (side * C + c) * WINDOW;
+        const float own = colour_[(size_t)i * C + c], *colour = colours + (side * C + c) * ROOM;
         for (int n = 0; n < count; n++) like[n] += (colour[n] - own) * (colour[n] - own);
       }
-      float total = 0, share = 0, value = 0;
-      for (int n = 0; n < count; n++) {
-        const float t = 1.0f + like[n] * per_spread, l = 1.0f / (t * t), part = weights[side][n] * (l + 1e-3f);
-        total += weights[side][n] * l;
+      vec total{}, share{}, value{};
+      for (int n = 0; n < count; n += LANES) {
+        const vec t = 1.0f + load<vec>(like + n) * per_spread, l = 1.0f / (t * t);
+        const vec weight = load<vec>(weights[side] + n), part = weight * (l + 1e-3f);
+        total += weight * l;
         share += part;
-        value += part * (values[side][n] - near);
+        value += part * (load<vec>(values[side] + n) - near);
       }
       const float t = 1.0f + apart[side] * per_spread;
-      likelihood[side] = total / (sums[side] + 1e-9f) + 0.02f / (t * t) + 1e-9f;
-      surface[side] = near + value / std::max(share, 1e-12f);
+      likelihood[side] = sum(total) / (sums[side] + 1e-9f) + 0.02f / (t * t) + 1e-9f;
+      surface[side] = near + sum(value) / std::max(sum(share), 1e-12f);
     }
     const float tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
     return {clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), tells, surface[0], surface[1]};
@@ -586,32 +721,30 @@ class Repair {
     parallel(height_, [&](int y) {
       for (int x = 0; x < width_; x++) {
         const size_t i = (size_t)y * width_ + x;
-        if (!valid_[i] || brightest[i] <= 4.0f * usual[i] || brightest[i] <= 0.1f * around[i] || a[i] + b[i] <= 0.5f * step(i)) continue;
+        if (!(std::fabs(map_.nearness[i]) <= LARGEST) || brightest[i] <= 4.0f * usual[i] || brightest[i] <= 0.1f * around[i] || a[i] + b[i] <= 0.5f * step(i)) continue;
         const Line line = regress(blurred.data(), (int)i);
         map_.out[i] += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - map_.out[i], 0.0f);
       }
     });
   }
 
-  // `highest` of a whole frame, of its values times a sign, in strips.
+  // `highest` of a whole frame, of its values times a sign, by rows.
   void whole(const float *in, float *out, float *rows, int reach, float sign) const {
     parallel(height_, [&](int y) {
       const float *from = in + (size_t)y * width_;
-      float *to = rows + (size_t)y * width_;
-      for (int x = 0; x < width_; x++) {
-        float most = sign * from[x];
-        for (int u = std::max(0, x - reach); u <= std::min(width_ - 1, x + reach); u++) most = std::max(most, sign * from[u]);
-        to[x] = most;
-      }
+      int length = width_ + 2 * reach;
+      Buffer<float> row(length);
+      std::fill(row.data(), row.data() + reach, -NONE);
+      for (int x = 0; x < width_; x++) row[reach + x] = sign * from[x];
+      std::fill(row.data() + reach + width_, row.data() + length, -NONE);
+      widen(reach, [&](int by) { raise(row.data(), row.data() + by, length -= by); });
+      memcpy(rows + (size_t)y * width_, row.data(), width_ * sizeof(float));
     });
     parallel(height_, [&](int y) {
       float *to = out + (size_t)y * width_;
       const int first = std::max(0, y - reach), last = std::min(height_ - 1, y + reach);
       memcpy(to, rows + (size_t)first * width_, width_ * sizeof(float));
-      for (int v = first + 1; v <= last; v++) {
-        const float *from = rows + (size_t)v * width_;
-        for (int x = 0; x < width_; x++) to[x] = to[x] < from[x] ? from[x] : to[x];
-      }
+      for (int v = first + 1; v <= last; v++) raise(to, rows + (size_t)v * width_, width_);
     });
   }
 
@@ -621,11 +754,14 @@ class Repair {
     for (float &k : kernel) k /= sum;
     parallel(height_, [&](int y) {
       const float *from = in + (size_t)y * width_;
-      for (int x = 0; x < width_; x++) {
-        float total = 0;
-        for (int d = -BLUR_REACH; d <= BLUR_REACH; d++) total += kernel[d + BLUR_REACH] * from[std::min(std::max(x + d, 0), width_ - 1)];
-        rows[(size_t)y * width_ + x] = total;
-      }
+      Buffer<float> row(width_ + 2 * BLUR_REACH);
+      std::fill(row.data(), row.data() + BLUR_REACH, from[0]);
+      memcpy(row.data() + BLUR_REACH, from, width_ * sizeof(float));
+      std::fill(row.data() + BLUR_REACH + width_, row.data() + width_ + 2 * BLUR_REACH, from[width_ - 1]);
+      float *to = rows + (size_t)y * width_;
+      std::fill(to, to + width_, 0.0f);
+      for (int d = 0; d <= 2 * BLUR_REACH; d++)
+        for (int x = 0; x < width_; x++) to[x] += kernel[d] * row[x + d];
     });
     parallel(height_, [&](int y) {
       float *to = out + (size_t)y * width_;
@@ -641,10 +777,10 @@ class Repair {
   const int height_, width_, channels_;
   const size_t area_;
   Buffer<float> given_, colour_, near_, far_, witness_;
-  Buffer<uint8_t> valid_, edge_, ramp_, kind_;
+  Buffer<uint8_t> edge_, ramp_, kind_;
   std::vector<float> shares_;
   double steepness_ = 0;
-  int64_t middles_ = 0, ramps_ = 0, edges_ = 0;
+  int64_t middles_ = 0;
 };
 
 }  // namespace
