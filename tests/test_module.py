@@ -274,9 +274,7 @@ def test_a_looser_tolerance_stays_within_it(way: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "way",
     [
-        pytest.param(
-            WAYS[0], marks=pytest.mark.xfail(strict=True, reason="the pyramid of hidden surfaces has a corner")
-        ),
+        WAYS[0],
         WAYS[1],
         WAYS[3],
     ],

@@ -68,7 +68,10 @@ def test_a_shipped_peer_blurs_by_the_circle_of_confusion_that_it_is_given(name: 
         (lambda image, coc: image, "a dot at 6 px is blurred as by a disc of 0.00 px"),
         (lambda image, coc: layered_fft(image, 1.3 * coc), "a dot at 6 px is blurred as by a disc of 7.78"),
         (lambda image, coc: layered_fft(image, coc.clamp_min(0)), "a dot at -6 px is blurred as by a disc of 0.00 px"),
-        (lambda image, coc: layered_fft(image, torch.full_like(coc, 6)), "a dot at 0 px is blurred as by a disc of 5.98"),
+        (
+            lambda image, coc: layered_fft(image, torch.full_like(coc, 6)),
+            "a dot at 0 px is blurred as by a disc of 5.98",
+        ),
         (lambda image, coc: 0.9 * layered_fft(image, coc), "a dot at 0 px keeps 0.9"),
         (lambda image, coc: layered_fft(image, coc).roll(1, -1), "a dot at 0 px moves by 1.00, 0.00 px"),
         (lambda image, coc: layered_fft(image, coc).roll(-1, -2), "a dot at 0 px moves by 0.00, -1.00 px"),
