@@ -233,7 +233,6 @@ def scene_of(content: bytes) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]
     occlusion = bool(flags & 1)
     options = {
         "occlusion": occlusion,
-        "border": "extend" if flags & 2 else "normalize",
         "check": bool(flags & 4),
         "normalize": occlusion or bool(flags & 8),
         "tolerance": "preview" if flags & 64 else "final",

@@ -44,7 +44,6 @@ def rendering(seed: int) -> torch.Tensor:
         rng.choice(TABLES),
         tolerance=rng.choice(("draft", "preview", "final")),
         occlusion=rng.random() < 0.7,
-        border=rng.choice(("normalize", "extend")),
         check=rng.random() < 0.7,
     )
     with torch.inference_mode():

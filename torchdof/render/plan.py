@@ -180,7 +180,8 @@ class Plan:
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
-        reach = abs(coc_px) * math.sqrt(self.tolerance * 255.0)
+        # rounded: whether a coc is in float32 or float64 does not decide
+        reach = round(abs(coc_px) * math.sqrt(self.tolerance * 255.0), 4)
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
