@@ -145,7 +145,8 @@ def _powers_and_targets(spectrum: Callable[[Tensor], Tensor]) -> tuple[Tensor, T
             size = torch.hypot(y, x)
             power = (torch.sinc(y) * torch.sinc(x)) ** 2 / size.clamp_min(1 / PERIOD) ** 2
             psf = spectrum(size)
-            sums = [total + power * factor for total, factor in zip(sums, (1.0, psf, psf**2), strict=True)]
+            terms = (power, power * psf, power * psf**2)
+            sums = [total + term for total, term in zip(sums, terms, strict=True)]
     return sums[0], sums[1], sums[2]
 
 

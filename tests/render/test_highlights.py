@@ -81,8 +81,8 @@ def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) 
     wanted = torch.zeros_like(hidden)
     for k in range(int(20 * stretch)):
         parts = ((coc_px, covers), (other_px, others - HIDDEN_WEIGHT))
-        layer = sum(part * (1.0 - (place - hiding.low - k).abs()).clamp_min(0.0) for place, part in parts)
-        layer = layer.expand(len(source), -1, -1, -1)
+        layers = [part * (1.0 - (place - hiding.low - k).abs()).clamp_min(0.0) for place, part in parts]
+        layer = torch.stack(layers).sum(0).expand(len(source), -1, -1, -1)
         scale = (1.0 - (hiding.low + k) / coc)[:, None]
         y, x = row[:, None] + step * scale, column[:, None] + step * scale
         y, x = (y * 2 / (height - 1) - 1)[:, :, None], (x * 2 / (width - 1) - 1)[:, None, :]

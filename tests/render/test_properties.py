@@ -30,7 +30,7 @@ class Scene:
     options: dict[str, Any]
 
     def blurred(self, dtype: torch.dtype, tolerance: float, step_px: float | Tensor = 0.0) -> Tensor:
-        options = {k: v.to(dtype) if isinstance(v, Tensor) else v for k, v in self.options.items()}
+        options: dict[str, Any] = {k: v.to(dtype) if isinstance(v, Tensor) else v for k, v in self.options.items()}
         coc_px = (self.coc_px + step_px).to(dtype)
         return blur_by_coc(self.image.to(dtype), coc_px, tolerance=tolerance, **options).double()
 

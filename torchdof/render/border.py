@@ -82,8 +82,8 @@ def _beyond(line: Tensor, weight: Tensor, reach: int, farthest: int) -> Tensor:
         means.append((window[:, :-1] / torch.where(total > 0, total, 1.0)).to(line.dtype))
     distance = torch.arange(1, reach + 1, device=line.device)
     powers = torch.tensor([2**level for level in range(1, len(means))], device=line.device)
-    level = (distance[:, None] >= powers).sum(1)
+    octave = (distance[:, None] >= powers).sum(1)
     stack = torch.stack(means, 2)  # [B, C, levels, n]
-    part = (distance / 2**level - 1.0).to(line.dtype)[:, None]
-    mean = torch.lerp(stack.index_select(2, level), stack.index_select(2, level + 1), part)
+    part = (distance / 2**octave - 1.0).to(line.dtype)[:, None]
+    mean = torch.lerp(stack.index_select(2, octave), stack.index_select(2, octave + 1), part)
     return torch.lerp(line[:, :, None], mean, 0.5)

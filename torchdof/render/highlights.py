@@ -187,8 +187,9 @@ class _Hiding:
         # how many cells of 8 px above and left of each place show something in a bin
         self.sums = []
         for k in self.bins:
-            covered = sum(((place.detach() - k).abs() < 1.0) & (cover > 0) for place, cover in self.shown)
-            cells = functional.max_pool2d(covered.clamp(max=1).to(torch.float32), _COARSE_CELL, ceil_mode=True)[:, 0]
+            covered = torch.cat([((place.detach() - k).abs() < 1.0) & (cover > 0) for place, cover in self.shown], 1)
+            any_covered = covered.any(1, keepdim=True).to(torch.float32)
+            cells = functional.max_pool2d(any_covered, _COARSE_CELL, ceil_mode=True)[:, 0]
             self.sums.append(functional.pad(cells.cumsum(-1).cumsum(-2), (1, 0, 1, 0)))
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor, farthest: float) -> Tensor:
