@@ -50,7 +50,10 @@ def test_changed_chunks_of_a_png_can_have_right_checksums(tmp_path: Path) -> Non
     corpus = list(_beside("targets").seeds(TARGETS["png"], tmp_path))
     path, rng, said = tmp_path / "x.png", random.Random(0), []
     for _ in range(200):
-        path.write_bytes(_beside("mutate").mutated(corpus[0], corpus, ".png", rng))
+        content = _beside("mutate").mutated(corpus[0], corpus, ".png", rng)
+        if not content:  # refused before its parts are looked at
+            continue
+        path.write_bytes(content)
         try:
             png.check(path)
         except OSError as error:

@@ -44,9 +44,9 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     def normalised(layer: Tensor) -> Tensor:
         """Colour and coverage, from scattered ``m_k I``, ``m_k`` and ``M_k``."""
         light_and_weight, visible = layer.tensor_split((colours + each,), 1)
-        little = visible.clamp(max=_KNOWN)
-        visible = visible - little + 0.5 * (_KNOWN + little * little / _KNOWN)
-        return light_and_weight / (visible if each == 1 else visible.repeat(1, 2, 1, 1))
+        lacking = (_KNOWN - visible).clamp_min(0.0)
+        known = visible + lacking * lacking * (0.5 / _KNOWN)
+        return light_and_weight / (known if each == 1 else known.repeat(1, 2, 1, 1))
 
     def composited(front: Tensor, behind: Tensor) -> Tensor:
         left = (1.0 - front[:, colours:]).clamp_min(0.0)

@@ -68,7 +68,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     own_coc, colour = pixels.pick(coc_px, edge_pixels)[0], pixels.pick(light, edge_pixels)
     window = pixels.around(edge_pixels, coc_px, 1)
     window_light, window_coc = pixels.pick(light, window), pixels.pick(coc_px, window)[0]  # [C, 9, P], [9, P]
-    brightest = window_light.detach().amax((0, 1)).clamp_min(torch.finfo(light.dtype).tiny)
+    brightest = window_light.detach().abs().amax((0, 1)).clamp_min(torch.finfo(light.dtype).tiny)
     colour, window_light = colour / brightest, window_light / brightest
     near = far = window_coc
     if known is not None:

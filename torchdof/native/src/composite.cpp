@@ -790,10 +790,10 @@ class Composite {
       // colour = light / room, coverage = share / room
       float *const canvas = b.canvas[C_ + e] + at;
       for (int i = 0; i < STRIP; i += LANES) {
-        const vec one = all(1.0f), all_room = load<vec>(room + i), little = least(all_room, all(KNOWN));
-        const vec per_room = one / (all_room - little + 0.5f * (all(KNOWN) + little * little / KNOWN));
-        const vec cover = load<vec>(share + i) * per_room;
-        const vec its_left = most(one - cover, vec{});
+        const vec all_room = load<vec>(room + i), its_share = load<vec>(share + i), lacking = most(all(KNOWN) - all_room, vec{});
+        const vec known = all_room + lacking * lacking * (0.5f / KNOWN), per_room = all(1.0f) / known, cover = its_share * per_room;
+        // a whole layer leaves nothing of what is behind it, however bright that is
+        const vec its_left = its_share < known ? most(all(1.0f) - cover, vec{}) : vec{};
         store(gain + i, per_room);
         store(left + i, its_left);
         float *to = canvas + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;

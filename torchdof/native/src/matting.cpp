@@ -127,7 +127,10 @@ void split(const Job &job, Window &w, int y, int x, const f4 *falloff, const Blo
   const size_t first = (size_t)y * PITCH + x;
   float scale = 1.17549435e-38f;
   for (int c = 0; c < channels; c++)
-    for (int r = 0; r < AROUND; r++) scale = std::max(scale, largest(load<f4>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH)));
+    for (int r = 0; r < AROUND; r++) {
+      const f4 v = load<f4>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH);
+      scale = std::max(scale, std::max(largest(v), largest(-v)));
+    }
   f4 nearer[AROUND], farther[AROUND];
   for (int r = 0; r < AROUND; r++) {
     const size_t in_coc = (size_t)(y + 1 + r) * PITCH + x + 1;
