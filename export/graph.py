@@ -82,7 +82,8 @@ class _Pinned(BlurTable):
         self.unit = "relative"  # to the plan: not tied to the width
 
     def _px_per_unit(self, width: float) -> float:
-        return getattr(self, "_scale", 1.0)
+        # the plan tells the width of a coarser layer as a part of 1: there the same lengths have fewer pixels
+        return getattr(self, "_scale", 1.0) * min(width, 1.0)
 
 
 def pinned(table: BlurTable, width: int | None) -> BlurTable:

@@ -55,9 +55,6 @@ def test_all_in_focus_is_returned_bit_for_bit(layered: Any) -> None:
     assert torch.equal(out, image)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="kernels of a table tied to a width differ by up to 0.01 in coarse layers of a file"
-)
 def test_a_file_may_take_the_circle_of_confusion_and_a_single_channel(tmp_path: Path) -> None:
     table = torchdof.BlurTable.load("double_gauss_50mm_f2")
     dof = torchdof.DepthOfField(CAMERA, table, **{**SIMPLE, "max_coc_px": 3.0})
