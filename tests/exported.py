@@ -4,6 +4,7 @@ import dataclasses
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,13 +17,18 @@ from torchdof.export.verification import session
 from torchdof.render.plan import Plan
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
+GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # as a file takes it
 MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
     # with occlusion, by convolution at resolutions down to a sixteenth
-    "layered": lambda: torchdof.DepthOfField(CAMERA, tolerance=64 / 255, max_coc_px=32.0, check=False),
+    "layered": lambda: torchdof.DepthOfField(CAMERA, **GIVEN, tolerance=64 / 255, max_coc_px=32.0, check=False),
     # with occlusion, by the literal scatter
-    "fold": lambda: torchdof.DepthOfField(CAMERA, tolerance=16 / 255, max_coc_px=2.5, method="fold", check=False),
+    "fold": lambda: torchdof.DepthOfField(
+        CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, method="fold", check=False
+    ),
     # without occlusion, which is traced in a few seconds
-    "plain": lambda: torchdof.DepthOfField(CAMERA, tolerance=16 / 255, max_coc_px=2.5, occlusion=False, check=False),
+    "plain": lambda: torchdof.DepthOfField(
+        CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, occlusion=False, check=False
+    ),
 }
 
 
