@@ -11,14 +11,29 @@ from ..depth.inspect import inspect_depth, panels
 from ..depth.sanity import depth_doubts
 from ..io.images import read_image
 from ..io.sheet import write_sheet
+from .arguments import (
+    DEPTH,
+    LENS,
+    ApertureRadiusM,
+    DepthChannel,
+    DepthOffset,
+    DepthScale,
+    DepthUnknown,
+    FarM,
+    FNumber,
+    FocalLengthMm,
+    FovDeg,
+    NearM,
+    RelativeKind,
+    SensorWidthMm,
+    ValueRange,
+)
 from .doubts import Said
 from .frame import read_metres
 from .render import parse_fill, parse_point, parse_range
 from .settings import RenderSettings
 
 __all__ = ["inspect"]
-
-_LENS, _DEPTH = "Focus and lens", "Depth map"
 
 
 def inspect(
@@ -31,59 +46,37 @@ def inspect(
         typer.Option("--out", "-o", help="Picture to write; default: IMAGE's name with .inspect.png, in this folder."),
     ] = None,
     focus_m: Annotated[
-        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=_LENS)
+        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=LENS)
     ] = None,
     focus_at: Annotated[
-        str | None, typer.Option(metavar="X,Y", help="Focus on what is seen at this pixel.", rich_help_panel=_LENS)
+        str | None, typer.Option(metavar="X,Y", help="Focus on what is seen at this pixel.", rich_help_panel=LENS)
     ] = None,
-    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_LENS)] = None,
-    focal_length_mm: Annotated[float | None, typer.Option(help="Real focal length.", rich_help_panel=_LENS)] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_LENS)] = None,
-    fov_deg: Annotated[
-        float | None, typer.Option(help="Horizontal field of view of a rendered image.", rich_help_panel=_LENS)
-    ] = None,
-    aperture_radius_m: Annotated[
-        float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=_LENS)
-    ] = None,
+    f_number: FNumber = None,
+    focal_length_mm: FocalLengthMm = None,
+    sensor_width_mm: SensorWidthMm = None,
+    fov_deg: FovDeg = None,
+    aperture_radius_m: ApertureRadiusM = None,
     depth_kind: Annotated[
         Literal["z", "distance", "disparity", "inverse", "relative"],
-        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=_DEPTH),
+        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=DEPTH),
     ] = "z",
-    depth_scale: Annotated[
-        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_DEPTH)
-    ] = None,
-    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_DEPTH)] = 0.0,
-    near_m: Annotated[
-        float | None, typer.Option(help="Distance of the nearest value of relative depth.", rich_help_panel=_DEPTH)
-    ] = None,
-    far_m: Annotated[
-        float | None, typer.Option(help="Distance of its farthest value (inf allowed).", rich_help_panel=_DEPTH)
-    ] = None,
-    relative_kind: Annotated[
-        Literal["disparity", "inverse", "depth"] | None,
-        typer.Option(help="What relative depth is, as for torchdof render.", rich_help_panel=_DEPTH),
-    ] = None,
-    value_range: Annotated[
-        str | None,
-        typer.Option(metavar="LOW,HIGH", help="Smallest and largest value of relative depth.", rich_help_panel=_DEPTH),
-    ] = None,
-    depth_unknown: Annotated[
-        float | None, typer.Option(help="A value that means 'not measured'.", rich_help_panel=_DEPTH)
-    ] = None,
+    depth_scale: DepthScale = None,
+    depth_offset: DepthOffset = 0.0,
+    near_m: NearM = None,
+    far_m: FarM = None,
+    relative_kind: RelativeKind = None,
+    value_range: ValueRange = None,
+    depth_unknown: DepthUnknown = None,
     fill_depth: Annotated[
         str | None,
         typer.Option(
-            metavar="nearest|far|METRES", help="Look at the map with its holes filled.", rich_help_panel=_DEPTH
+            metavar="nearest|far|METRES", help="Look at the map with its holes filled.", rich_help_panel=DEPTH
         ),
     ] = None,
-    depth_channel: Annotated[
-        str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=_DEPTH)
-    ] = None,
+    depth_channel: DepthChannel = None,
     strict: Annotated[
         bool,
-        typer.Option(
-            "--strict", help="End with an error where something looks like a mistake.", rich_help_panel=_DEPTH
-        ),
+        typer.Option("--strict", help="End with an error where something looks like a mistake.", rich_help_panel=DEPTH),
     ] = False,
 ) -> None:
     """Tell what a depth map holds and what a camera makes of it, before anything is rendered.

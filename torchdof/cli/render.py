@@ -25,6 +25,23 @@ from ..depth.sanity import Doubt
 from ..depth.steady import SteadyFrames
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
+from .arguments import (
+    DEPTH,
+    LENS,
+    ApertureRadiusM,
+    DepthChannel,
+    DepthOffset,
+    DepthScale,
+    DepthUnknown,
+    FarM,
+    FNumber,
+    FocalLengthMm,
+    FovDeg,
+    NearM,
+    RelativeKind,
+    SensorWidthMm,
+    ValueRange,
+)
 from .doubts import Said
 from .frame import Frame, read_frame, render_frame
 from .settings import RenderSettings, load_table, pick_device
@@ -36,7 +53,7 @@ _EACH_ITS_OWN = Doubt(
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH",
 )
-_LENS, _DEPTH, _BLUR, _FILES = "Focus and lens", "Depth map", "Blur", "Files and frames"
+_BLUR, _FILES = "Blur", "Files and frames"
 
 
 def render(
@@ -56,7 +73,7 @@ def render(
         typer.Option(
             help="Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between "
             "them 1/distance is linear, so that the blur changes evenly.",
-            rich_help_panel=_LENS,
+            rich_help_panel=LENS,
         ),
     ] = None,
     focus_at: Annotated[
@@ -64,21 +81,14 @@ def render(
         typer.Option(
             metavar="X,Y",
             help="Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame.",
-            rich_help_panel=_LENS,
+            rich_help_panel=LENS,
         ),
     ] = None,
-    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_LENS)] = None,
-    focal_length_mm: Annotated[
-        float | None, typer.Option(help="Real focal length, not the 35 mm equivalent.", rich_help_panel=_LENS)
-    ] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_LENS)] = None,
-    fov_deg: Annotated[
-        float | None,
-        typer.Option(help="Horizontal field of view of a rendered image, instead of a lens.", rich_help_panel=_LENS),
-    ] = None,
-    aperture_radius_m: Annotated[
-        float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=_LENS)
-    ] = None,
+    f_number: FNumber = None,
+    focal_length_mm: FocalLengthMm = None,
+    sensor_width_mm: SensorWidthMm = None,
+    fov_deg: FovDeg = None,
+    aperture_radius_m: ApertureRadiusM = None,
     depth_kind: Annotated[
         Literal["z", "distance", "disparity", "inverse", "relative", "coc"],
         typer.Option(
@@ -86,63 +96,38 @@ def render(
             "(value + offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as "
             "estimators give it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is "
             "near).",
-            rich_help_panel=_DEPTH,
+            rich_help_panel=DEPTH,
         ),
     ] = "z",
-    depth_scale: Annotated[
-        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_DEPTH)
-    ] = None,
-    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_DEPTH)] = 0.0,
-    near_m: Annotated[
-        float | None, typer.Option(help="Distance of the nearest value of relative depth.", rich_help_panel=_DEPTH)
-    ] = None,
-    far_m: Annotated[
-        float | None, typer.Option(help="Distance of its farthest value (inf allowed).", rich_help_panel=_DEPTH)
-    ] = None,
-    relative_kind: Annotated[
-        Literal["disparity", "inverse", "depth"] | None,
-        typer.Option(
-            help="What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the "
-            "default), or depth, larger is farther (Marigold).",
-            rich_help_panel=_DEPTH,
-        ),
-    ] = None,
-    value_range: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LOW,HIGH",
-            help="Smallest and largest value of relative depth; default: those of each frame.",
-            rich_help_panel=_DEPTH,
-        ),
-    ] = None,
+    depth_scale: DepthScale = None,
+    depth_offset: DepthOffset = 0.0,
+    near_m: NearM = None,
+    far_m: FarM = None,
+    relative_kind: RelativeKind = None,
+    value_range: ValueRange = None,
     strict: Annotated[
         bool,
         typer.Option(
-            "--strict", help="Refuse what looks like a wrong unit or scale, instead of warning.", rich_help_panel=_DEPTH
+            "--strict", help="Refuse what looks like a wrong unit or scale, instead of warning.", rich_help_panel=DEPTH
         ),
     ] = False,
-    depth_unknown: Annotated[
-        float | None,
-        typer.Option(help="A value that means 'not measured', such as 0, -1 or inf.", rich_help_panel=_DEPTH),
-    ] = None,
+    depth_unknown: DepthUnknown = None,
     fill_depth: Annotated[
         str | None,
         typer.Option(
             metavar="nearest|far|METRES",
             help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see "
             "lies behind), or with a distance (inf for a sky). Without this they are refused.",
-            rich_help_panel=_DEPTH,
+            rich_help_panel=DEPTH,
         ),
     ] = None,
-    depth_channel: Annotated[
-        str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=_DEPTH)
-    ] = None,
+    depth_channel: DepthChannel = None,
     depth_edges: Annotated[
         Literal["auto", "repair", "as-given"],
         typer.Option(
             help="Move and sharpen the edges of the depth to where IMAGE has them: unless they prove exact, each one, "
             "or not at all.",
-            rich_help_panel=_DEPTH,
+            rich_help_panel=DEPTH,
         ),
     ] = "auto",
     table: Annotated[
@@ -197,7 +182,7 @@ def render(
         typer.Option(
             "--steady",
             help="Filter the depth of a sequence along time, where neither image nor depth moved.",
-            rich_help_panel=_DEPTH,
+            rich_help_panel=DEPTH,
         ),
     ] = False,
     resume: Annotated[

@@ -1,0 +1,71 @@
+"""Options that several commands take alike: what lens took the image, and what the numbers of its depth map are."""
+
+from typing import Annotated, Literal
+
+import typer
+
+__all__ = [
+    "DEPTH",
+    "LENS",
+    "ApertureRadiusM",
+    "DepthChannel",
+    "DepthOffset",
+    "DepthScale",
+    "DepthUnknown",
+    "FNumber",
+    "FarM",
+    "FocalLengthMm",
+    "FovDeg",
+    "NearM",
+    "RelativeKind",
+    "SensorWidthMm",
+    "ValueRange",
+]
+
+LENS, DEPTH = "Focus and lens", "Depth map"
+"""Panels of the help that these options stand in."""
+
+FNumber = Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=LENS)]
+FocalLengthMm = Annotated[
+    float | None, typer.Option(help="Real focal length, not the 35 mm equivalent.", rich_help_panel=LENS)
+]
+SensorWidthMm = Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=LENS)]
+FovDeg = Annotated[
+    float | None,
+    typer.Option(help="Horizontal field of view of a rendered image, instead of a lens.", rich_help_panel=LENS),
+]
+ApertureRadiusM = Annotated[
+    float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=LENS)
+]
+
+DepthScale = Annotated[float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=DEPTH)]
+DepthOffset = Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=DEPTH)]
+NearM = Annotated[
+    float | None, typer.Option(help="Distance of the nearest value of relative depth.", rich_help_panel=DEPTH)
+]
+FarM = Annotated[
+    float | None, typer.Option(help="Distance of its farthest value (inf allowed).", rich_help_panel=DEPTH)
+]
+RelativeKind = Annotated[
+    Literal["disparity", "inverse", "depth"] | None,
+    typer.Option(
+        help="What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the "
+        "default), or depth, larger is farther (Marigold).",
+        rich_help_panel=DEPTH,
+    ),
+]
+ValueRange = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LOW,HIGH",
+        help="Smallest and largest value of relative depth; default: those of each frame.",
+        rich_help_panel=DEPTH,
+    ),
+]
+DepthUnknown = Annotated[
+    float | None,
+    typer.Option(help="A value that means 'not measured', such as 0, -1 or inf.", rich_help_panel=DEPTH),
+]
+DepthChannel = Annotated[
+    str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=DEPTH)
+]
