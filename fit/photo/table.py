@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.psf import FAMILIES, LENGTHS, profile, support
+from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
 
 from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
@@ -143,7 +142,7 @@ def fit_captures(
             progress(done, total, f"{pair.distance_m:g} m")
 
     ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
-    radius_px = [math.sqrt(2) * rms_radius(f) for f in ordered]
+    radius_px = [f.radius for f in ordered]
     captures = replace(captures, width_px=frame_width(captures, radius_px))
     check_agreement(captures, radius_px)
     coc_px, scale = _keys(captures, radius_px, scale_of)
@@ -213,14 +212,6 @@ def _keys(captures: Captures, radius_px: list[float], scale_of: TableFit | None)
         return [float(scale_of.coc_per_dioptre_px * d) for d in defocus], scale_of.scale
     factor = float(np.abs(defocus) @ np.array(radius_px) / (defocus @ defocus))
     return [float(factor * d) for d in defocus], "measured"
-
-
-def rms_radius(fit: BlurFit) -> float:
-    """Root of a kernel's mean squared radius, in the fit's unit; over a uniform disc it is its radius / sqrt(2)."""
-    params = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
-    r = np.linspace(0, support(fit.family, params) + 1e-9, 4001)
-    f = profile(fit.family, torch.from_numpy(r), params).numpy()
-    return float(np.sqrt((f * r**3).sum() / (f * r).sum()))
 
 
 def _table(

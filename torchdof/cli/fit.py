@@ -14,7 +14,7 @@ from rich.table import Table
 
 from torchdof import BlurTable
 from torchdof.fit.photo.manifest import Captures, read_captures
-from torchdof.fit.photo.table import TableFit, fit_captures, rms_radius
+from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.problems import FitError, FitWarning
 
 __all__ = ["fit"]
@@ -144,9 +144,9 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
         shown.add_column(column, justify="right")
     for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True):
         values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
-        ratio, radius = fitted.residual_over_noise, math.sqrt(2) * rms_radius(fitted)
+        ratio = fitted.residual_over_noise
         shown.add_row(
-            f"{pair.distance_m:g}", f"{coc:+.2f}", f"{radius:.2f}", *values, f"{100 * fitted.residual:.2f}",
+            f"{pair.distance_m:g}", f"{coc:+.2f}", f"{fitted.radius:.2f}", *values, f"{100 * fitted.residual:.2f}",
             "" if math.isnan(ratio) else f"{ratio:.2f}", f"{fitted.magnification:.4f}",
         )  # fmt: skip
     console.print(shown)
