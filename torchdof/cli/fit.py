@@ -13,19 +13,24 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from torchdof import BlurTable
-from torchdof.fit.photo.manifest import Captures, read_captures
+from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
+from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
+from torchdof.fit.photo.target import SQUARE_MM, Paper, write_target
 from torchdof.fit.problems import FitError, FitWarning
 
 __all__ = ["fit"]
 
-_CAPTURE, _LENS, _OUT = "From photographs", "From a lens prescription", "Result"
+_TARGET, _CAPTURE, _LENS, _OUT = "With the printed target", "From photographs", "From a lens prescription", "Result"
 
 
 def fit(
     captures: Annotated[
         Path | None,
-        typer.Argument(help="Folder with photographs of a dot and their capture.toml.", show_default=False),
+        typer.Argument(
+            help="Folder with photographs: of a dot with their capture.toml, or of the printed target as they come.",
+            show_default=False,
+        ),
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="The table to write (JSON).", rich_help_panel=_OUT)
@@ -44,6 +49,14 @@ def fit(
             rich_help_panel=_CAPTURE,
         ),
     ] = "manifest",
+    target: Annotated[
+        Path | None,
+        typer.Option(help="Write the target to print (PDF), and nothing else.", rich_help_panel=_TARGET),
+    ] = None,
+    paper: Annotated[Paper, typer.Option(help="Its paper.", rich_help_panel=_TARGET)] = "a4",
+    square_mm: Annotated[
+        float, typer.Option(help="Side of the target's square as printed.", rich_help_panel=_TARGET)
+    ] = SQUARE_MM,
     root: Annotated[
         Path | None,
         typer.Option(
@@ -69,11 +82,23 @@ def fit(
 
         torchdof fit my-lens/ -o my-lens.json --plots pictures/
 
+    Or print a target, photograph it, and let the pictures tell the rest (see docs/phone.md):
+
+        torchdof fit --target target.pdf
+
+        torchdof fit photographs/ -o my-phone.json
+
     Or trace a lens:
 
         torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
     """
     console = Console(soft_wrap=True)
+    if target is not None:
+        if captures is not None or lens is not None:
+            raise FitError("--target writes the page to print; give it alone, and the photographs afterwards")
+        write_target(target, paper)
+        console.print(f"{target}: print it at 100 %, photograph it as it says, then: torchdof fit FOLDER -o table.json")
+        return
     if (captures is None) == (lens is None):
         raise FitError("give either a folder of captures or --lens FILE")
     if root is not None and lens is not None:
@@ -88,6 +113,15 @@ def fit(
         _write(table, output, console)
         if plots is not None:
             _draw_table(table, plots, output.stem, console)
+        return
+    if captures is not None and captures.is_dir() and not (captures / MANIFEST).is_file():
+        photographs = read_photographs(captures, square_mm=square_mm)
+        _tell(photographs, console)
+        command = f"torchdof fit {captures.name} --family {family} --accuracy-db {accuracy_db:g}"
+        result, messages = _fit_with_progress(photographs.captures, family, accuracy_db, command, None, console)
+        _summary(photographs.captures, result, messages, console)
+        _write(result.table, output, console)
+        _draw_sheet(photographs, result, output.with_suffix(".png"), console)
         return
     capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots, root=root)
     first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
@@ -111,6 +145,35 @@ def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Cons
 
     with console.status(f"tracing {nodes} distances"):
         return trace_table(Lens.read(lens), f_number=f_number, focus_m=focus_m, nodes=nodes)
+
+
+def _tell(photographs: Photographs, console: Console) -> None:
+    """What was found in the photographs, and what to do better, on one screen."""
+    shown = Table(title="the target in the photographs", title_justify="left")
+    for column in ("file", "distance m", "square px", "paper %", "edge px", ""):
+        shown.add_column(column, justify="right")
+    sharp = photographs.captures.notes["sharp"]
+    for picture in photographs.pictures:
+        shown.add_row(
+            picture.file, f"{picture.distance_m:.3f}", f"{picture.target.side_px:.0f}",
+            f"{100 * picture.target.white:.0f}", f"{1 / picture.sharpness:.1f}",
+            "in focus" if picture.file == sharp else "",
+        )  # fmt: skip
+    console.print(shown)
+    for sentence in photographs.advice:
+        console.print(f"better: {sentence}", style="cyan", markup=False, highlight=False)
+
+
+def _draw_sheet(photographs: Photographs, result: TableFit, target: Path, console: Console) -> None:
+    """Draws what was found, fitted and made of it; without matplotlib it says so."""
+    try:
+        from torchdof.fit.sheet import sheet_of_photographs
+
+        sheet_of_photographs(photographs, result).savefig(target)
+    except ModuleNotFoundError as error:
+        console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
+        return
+    console.print(str(target), markup=False, highlight=False)
 
 
 def _fit_with_progress(
