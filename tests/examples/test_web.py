@@ -30,7 +30,7 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def used(layered: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
+def used(plain: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
     """The folder with the page and what was saved from it, and what was seen while it was used."""
     folder = shared_folder / "page"
     environment = os.environ | {"TORCHDOF_NODE_FOLDER": str(NODE_FOLDER), "PYTHON": sys.executable}
@@ -38,7 +38,7 @@ def used(layered: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
         if not (folder / "results.json").exists():
             folder.mkdir(exist_ok=True)
             build = ["node", str(ROOT / "examples" / "web" / "build.mjs"), "--out", str(folder / "dist")]
-            run([*build, "--model", str(layered.path)], environment)
+            run([*build, "--model", str(plain.path)], environment)
             use = ["node", str(Path(__file__).with_name("web.mjs"))]
             run([*use, str(folder / "dist"), str(folder), str(CHROMIUM)], environment)
     return folder, json.loads((folder / "results.json").read_text())
@@ -69,9 +69,9 @@ def expected(exported: Any, folder: Path, u: float, v: float, f_number: float) -
 
 
 @pytest.mark.parametrize("name, u, v", [("near", 0.55, 0.6), ("far", 0.2, 0.12)])
-def test_a_click_gives_the_picture_of_the_file(layered: Any, used: Any, name: str, u: float, v: float) -> None:
+def test_a_click_gives_the_picture_of_the_file(plain: Any, used: Any, name: str, u: float, v: float) -> None:
     folder, seen = used
-    picture, focus_m = expected(layered, folder, u, v, 2 ** (-3 / 6))
+    picture, focus_m = expected(plain, folder, u, v, 2 ** (-3 / 6))
     assert seen[f"{name}Focus"] == f"{focus_m:.2f} m"
     saved = np.rint(255 * pixels(folder / f"{name}.png")[..., :3])
     assert saved.shape == picture.shape

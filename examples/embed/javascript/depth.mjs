@@ -160,7 +160,7 @@ function depthOfNpy(bytes) {
   const [height, width] = sides
   const size = width * height * Values.BYTES_PER_ELEMENT
   if (bytes.length < end + size) throw new Error('the NumPy file ends before its last number: it is damaged')
-  const values = new Values(bytes.slice(end, end + size).buffer)
+  const values = new Values(Uint8Array.from(bytes.subarray(end, end + size)).buffer)
   const fullScale = type[1] === 'f' ? null : 2 ** (8 * Values.BYTES_PER_ELEMENT) - 1
   return new DepthMap(Float32Array.from(values), width, height, fullScale)
 }

@@ -247,8 +247,8 @@ function describeLens() {
   const largest = Math.max(Math.abs(radius(scene.nearM)), Math.abs(radius(scene.farM)))
   $('blur-note').textContent =
     largest > camera.max_coc_px
-      ? `Discs up to ${camera.max_coc_px} pixels in radius; more than this page renders.`
-      : `Discs up to ${largest.toFixed(largest < 10 ? 1 : 0)} pixels in radius.`
+      ? `Blur of up to ${largest.toFixed(0)} pixels in radius; this page renders ${camera.max_coc_px} at most.`
+      : `Blur of up to ${largest.toFixed(largest < 10 ? 1 : 0)} pixels in radius.`
   showView()
 }
 
