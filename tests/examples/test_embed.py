@@ -1,4 +1,4 @@
-"""The samples of `examples/embed` give the pixels of the file that they run; what a machine lacks is said by the skip."""
+"""The samples of `examples/embed` give the pixels of the file that they run."""
 
 import importlib.util
 import os
@@ -108,8 +108,8 @@ def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path, kin
 
 @pytest.mark.skipif(
     header_folder() is None,
-    reason="onnxruntime's C++ headers are not installed: Debian's libonnxruntime-dev, or set TORCHDOF_ONNXRUNTIME to an "
-    "unpacked release",
+    reason="onnxruntime's C++ headers are not installed: Debian's libonnxruntime-dev, or an unpacked release in "
+    "TORCHDOF_ONNXRUNTIME",
 )
 @pytest.mark.skipif(shutil.which("cmake") is None or shutil.which("c++") is None, reason="no CMake or C++ compiler")
 def test_cpp_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> None:
