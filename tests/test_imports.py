@@ -28,6 +28,7 @@ FLOORS = {
     "module": {"validation", "batch", "optics", "depth", "options", "render"},
     "fit": {"validation", "io", "optics"},
     "export": {"validation", "io", "optics", "options", "render", "module"},
+    "augmentation": {"validation", "io", "optics", "options", "module"},
     "bench": {"validation", "io", "optics", "depth", "options", "render", "reference", "module", "export"},
     "cli": {
         *("validation", "native", "io", "optics", "depth", "options", "reference", "module", "fit", "export", "bench"),
