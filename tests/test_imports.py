@@ -29,6 +29,7 @@ FLOORS = {
     "fit": {"validation", "io", "optics"},
     "export": {"validation", "io", "optics", "options", "render", "module"},
     "augmentation": {"validation", "io", "optics", "options", "module"},
+    "distributed": {"validation", "io", "optics", "depth", "options", "augmentation"},
     "bench": {"validation", "io", "optics", "depth", "options", "render", "reference", "module", "export"},
     "cli": {
         *("validation", "native", "io", "optics", "depth", "options", "reference", "module", "fit", "export", "bench"),
