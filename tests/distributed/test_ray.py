@@ -38,9 +38,8 @@ def test_killed_and_resumed_it_ends_with_the_same_shards(photos: Path) -> None:
     command = [sys.executable, str(ROOT / "examples" / "defocus_dataset.py"), "--workers", "2", "--per-shard", "2"]
     command += ["--images", str(photos / "images"), "--depths", str(photos / "depths"), "--out", str(photos / "out")]
     home = {**os.environ, "HOME": str(photos), "PYTHONPATH": str(ROOT), "RAY_DISABLE_IMPORT_WARNING": "1"}
-    first = subprocess.Popen(
-        command, env=home, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
+    with (photos / "first.log").open("w") as log:
+        first = subprocess.Popen(command, env=home, start_new_session=True, stdout=log, stderr=log)
     shards = photos / "out"
     wait_until = time.monotonic() + 180
     while len(list(shards.glob("shard-*.tar"))) < 2 and first.poll() is None and time.monotonic() < wait_until:
@@ -53,6 +52,7 @@ def test_killed_and_resumed_it_ends_with_the_same_shards(photos: Path) -> None:
     time.sleep(2)  # workers of the dead cluster end; what they still write is whole
     done |= {path.name: path.stat().st_mtime_ns for path in shards.glob("shard-*.tar")}
     told = subprocess.run(command, env=home, capture_output=True, text=True, timeout=240, check=True).stdout
+    print(told)
     assert f"{len(done)} of 12 shards are there already" in told
     assert told.count(" is complete") == 12 - len(done)
     assert "left out: " in told and "05.png" in told and "images/s" in told

@@ -149,6 +149,7 @@ def test_parquet_holds_the_same(pairs: list[Pair], tmp_path: Path) -> None:
         assert row["focus_m"] == json.loads(files[f"{row['key']}.json"])["focus_m"]
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it leaves its files to be closed
 def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
     webdataset = pytest.importorskip("webdataset", reason="webdataset is not installed")
     made(tmp_path / "out", shard_rows(pairs, per_shard=5))

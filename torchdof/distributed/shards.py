@@ -90,7 +90,7 @@ class RenderShards:
 
     Args:
         out: Folder of the shards; it must be there.
-        blur: Draws focus, f-number and lens, and renders; its ``p`` does not count: every sample is blurred.
+        blur: Draws focus, f-number and lens, and renders; its ``p`` does not count, every sample is blurred.
         depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`.
         format: "webdataset" or "parquet" (which needs pyarrow).
         keep: What is written of each sample: of "blurred", "sharp" and "depth".
@@ -251,7 +251,7 @@ class RenderShards:
         own = hashlib.sha256(f"{self.seed} {sample['key']}".encode()).digest()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int.from_bytes(own[:8], "little") >> 1)
-            drawn = self.blur.forward_parameters(shape)
+            drawn = self.blur.generate_parameters(shape)
         for name in ("focus_m", "f_number"):
             if sample[name] is not None:
                 drawn[name] = torch.tensor([sample[name]])
