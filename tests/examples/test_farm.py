@@ -1,6 +1,7 @@
 """The templates for render farms: they call options that there are, and their own validators take them."""
 
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -50,7 +51,9 @@ def test_openjd_takes_its_template() -> None:
 def test_opencue_takes_its_job(tmp_path: Path) -> None:
     command = [sys.executable, str(FARM / "cue_job.py"), "--image", "/s/b.####.exr", "--out", "/s/o.####.exr"]
     command += ["--frames", "1-48", "--chunk", "5", "--print", "--", "--focus-m", "2"]
-    told = subprocess.run(command, capture_output=True, text=True, check=True, env={"HOME": str(tmp_path)}).stdout
+    told = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(tmp_path)}
+    ).stdout
     layer = ElementTree.fromstring(told[told.index("<spec>") :]).find("./job/layers/layer")
     assert layer is not None
     assert (layer.findtext("range"), layer.findtext("chunk")) == ("1-48", "5")
