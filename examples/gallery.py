@@ -29,9 +29,7 @@ TABLES = ("disc", "gaussian", "sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4"
 
 def motorcycle() -> tuple[Tensor, Tensor]:
     """The photograph, ``[1, 3, 500, 741]`` in linear light, and its depth in metres."""
-    depth = read_depth(
-        MOTORCYCLE / "motorcycle_disp.npz", kind="disparity", scale=192.03, offset=31.086, fill="far"
-    )
+    depth = read_depth(MOTORCYCLE / "motorcycle_disp.npz", kind="disparity", scale=192.03, offset=31.086, fill="far")
     return read_image(MOTORCYCLE / "motorcycle_left.png").pixels, depth
 
 
