@@ -127,15 +127,13 @@ def draw_layers(path: Path) -> None:
 
 
 def draw_truth(path: Path) -> None:
-    """Two ray-traced cut-outs: sharp, torchdof, and the path-traced picture through the lens."""
-    shown = {}
-    for scene in read_scenes(SCENES):
-        if not scene.name.startswith("room"):
-            m = scene.margin_px
-            rendered = torchdof.depth_of_field(scene.image, scene.depth, scene.camera)
-            for name, pixels in (("sharp", scene.image), ("torchdof", rendered), ("path-traced", scene.truth)):
-                inner = pixels[..., m : pixels.shape[-2] - m, m : pixels.shape[-1] - m][..., :112, :144]
-                shown[f"{scene.name}, {name}"] = functional.interpolate(inner, scale_factor=1.6, mode="nearest")
+    """A ray-traced cut-out: sharp, torchdof, and the path-traced picture through the lens."""
+    (scene,) = read_scenes(SCENES / {"truth_lamps": "highlights", "truth_bars": "planes"}[path.stem])
+    rendered = torchdof.depth_of_field(scene.image, scene.depth, scene.camera)
+    shown, m = {}, scene.margin_px
+    for name, pixels in {"sharp": scene.image, "torchdof": rendered, "path-traced": scene.truth}.items():
+        inner = pixels[..., m : pixels.shape[-2] - m, m : pixels.shape[-1] - m]
+        shown[name] = functional.interpolate(inner, scale_factor=2.0, mode="nearest")
     write_sheet(path, shown)
 
 
@@ -165,7 +163,8 @@ GALLERY: dict[str, Callable[[Path], None]] = {
     "inspect.jpg": draw_inspect,
     "lenses.jpg": draw_lenses,
     "layers.jpg": draw_layers,
-    "truth.jpg": draw_truth,
+    "truth_lamps.jpg": draw_truth,
+    "truth_bars.jpg": draw_truth,
     "thin_lens.png": draw_thin_lens,
 }
 

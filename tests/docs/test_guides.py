@@ -18,6 +18,7 @@ from torchdof.reference.metrics import display, psnr
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = [ROOT / "README.md", ROOT / "docs" / "speed.md", *sorted((ROOT / "docs" / "guides").glob("*.md"))]
+RUN += [ROOT / "docs" / "index.md"]
 """Pages whose blocks are run from top to bottom, but for those below a comment that says why not."""
 
 _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
@@ -98,7 +99,7 @@ def test_readme_is_short_and_names_folders_and_extras_that_exist() -> None:
 
 
 _GALLERY = runpy.run_path(str(ROOT / "examples" / "gallery.py"))["GALLERY"]
-_QUICK = ("lenses.jpg", "truth.jpg")
+_QUICK = ("lenses.jpg", "truth_lamps.jpg", "truth_bars.jpg")
 
 
 def test_every_picture_of_the_documentation_has_a_script() -> None:
