@@ -303,11 +303,17 @@ def test_json_says_for_programs_what_the_line_says(scene: Path) -> None:
     assert frames[0]["largest_coc_px"] == pytest.approx(radius) and frames[0]["table"] == "disc"
 
 
-def test_attention_keeps_the_tolerance_where_the_viewer_looks(scene: Path) -> None:
-    arguments = ("image.exr", "depth.npy", "--focus-m", "2", *LENS, "--attention", "18,8,4")
-    assert json.loads(run(*arguments, "-o", "out.exr", "--json"))["attention"] == [18.0, 8.0, 4.0]
-    expected = torchdof.depth_of_field(image(), depth(), lens(2.0), attention=(18.0, 8.0, 4.0))
+def test_attention_loosens_the_tolerance_elsewhere(scene: Path) -> None:
+    slope = torch.linspace(2.0, 9.0, WIDTH).expand(1, 1, HEIGHT, WIDTH)
+    np.save("depth.npy", slope.numpy())
+    arguments = ("image.exr", "depth.npy", "--focus-m", "2", *LENS)
+    printed = run(*arguments, "-o", "out.exr", "--json", "--attention", "18,8,4")
+    assert json.loads(printed)["attention"] == [18.0, 8.0, 4.0]
+    run(*arguments, "-o", "everywhere.exr")
+    expected = torchdof.depth_of_field(image(), slope, lens(2.0), attention=(18.0, 8.0, 4.0))
     torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+    difference = (pixels("out.exr") - pixels("everywhere.exr")).abs()
+    assert float(difference[..., 8, 18].max()) < 1e-5 < float(difference[..., :8].max())
 
 
 def test_jpeg_in_jpeg_out_keeps_metadata(scene: Path) -> None:

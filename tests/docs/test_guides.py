@@ -22,7 +22,7 @@ RUN += [ROOT / "docs" / "index.md"]
 """Pages whose blocks are run from top to bottom, but for those below a comment that says why not."""
 
 _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
-_COMMAND = re.compile(r"(?:^|`)\s*((?:python -m )?torchdof (?:[a-z]+)(?: [^`\n]*(?:\\\n[^`\n]*)*)?)", re.M)
+_COMMAND = re.compile(r"(?:^|`)\s*((?:python -m )?torchdof (?:[a-z]+)(?: [^`\n\\]*(?:\\\n[^`\n\\]*)*)?)", re.M)
 _LINK = re.compile(r"""\]\((?P<link>[^)\s]+)\)|src="(?P<source>[^"]+)\"""")
 _ALIKE_DB = 33.0  # of a JPEG with what it was made from, and then some
 
