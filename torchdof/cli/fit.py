@@ -95,12 +95,14 @@ def fit(
             _draw_table(table, plots, out.stem, console)
         return
     capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots, root=root)
+    first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
     for i, capture_set in enumerate(capture_sets):
         target = out if len(capture_sets) == 1 else out.with_name(f"{out.stem}_{i:02d}.json")
         if len(capture_sets) > 1:
             console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
-        result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, console)
+        result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
+        first = first or result
         _summary(capture_set, result, messages, console)
         _write(result.table, target, console)
         if as_json:
@@ -119,7 +121,7 @@ def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Cons
 
 
 def _fit_with_progress(
-    captures: Captures, family: str, accuracy_db: float, command: str, console: Console
+    captures: Captures, family: str, accuracy_db: float, command: str, scale_of: TableFit | None, console: Console
 ) -> tuple[TableFit, list[str]]:
     """Fits one set of captures behind a progress bar; returns the fit and the warnings, each once."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -132,6 +134,7 @@ def _fit_with_progress(
             accuracy_db=accuracy_db,
             progress=lambda done, total, what: bar.update(job, completed=done, total=total, description=what),
             command=command,
+            scale_of=scale_of,
         )
     # "auto" fits a picture several times; what it says twice is said once
     return result, list(dict.fromkeys(str(w.message) for w in caught))
@@ -144,13 +147,13 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
         title_justify="left",
     )
     names = [n for n in result.fits[0].params if n != "values"]
-    for column in ("distance m", "coc px", *names, "residual %", "x noise", "magnification"):
+    for column in ("distance m", "coc px", "measured", *names, "residual %", "x noise", "magnification"):
         shown.add_column(column, justify="right")
     for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True):
         values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
         ratio = fitted.residual_over_noise
         shown.add_row(
-            f"{pair.distance_m:g}", f"{coc:+.2f}", *values, f"{100 * fitted.residual:.2f}",
+            f"{pair.distance_m:g}", f"{coc:+.2f}", f"{fitted.radius:.2f}", *values, f"{100 * fitted.residual:.2f}",
             "" if math.isnan(ratio) else f"{ratio:.2f}", f"{fitted.magnification:.4f}",
         )  # fmt: skip
     console.print(shown)
