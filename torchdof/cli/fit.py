@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -13,6 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from torchdof import BlurTable
+from torchdof.cli.arguments import AsJson
+from torchdof.cli.printed import json_line
 from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
 from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
@@ -32,9 +34,9 @@ def fit(
             show_default=False,
         ),
     ] = None,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="The table to write (JSON).", rich_help_panel=_OUT)
-    ] = Path("table.json"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="The table to write (JSON).", rich_help_panel=_OUT)] = Path(
+        "table.json"
+    ),
     family: Annotated[
         Literal["auto", "gaussian", "ring", "disc", "softm", "radial"],
         typer.Option(help="Kernel family; auto takes the cheapest that is accurate enough.", rich_help_panel=_CAPTURE),
@@ -71,9 +73,20 @@ def fit(
     f_number: Annotated[float, typer.Option(help="Aperture of the lens.", rich_help_panel=_LENS)] = 2.0,
     focus_m: Annotated[float, typer.Option(help="Focus distance in metres; inf allowed.", rich_help_panel=_LENS)] = 2.0,
     nodes: Annotated[int, typer.Option(help="Distances traced.", rich_help_panel=_LENS)] = 33,
+    field_deg: Annotated[
+        float, typer.Option(help="Angle from the axis, degrees: 0 is the frame's centre.", rich_help_panel=_LENS)
+    ] = 0.0,
+    wavelengths: Annotated[
+        str | None,
+        typer.Option(
+            help="One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
+            rich_help_panel=_LENS,
+        ),
+    ] = None,
     plots: Annotated[
         Path | None, typer.Option(help="Folder for pictures of the fits and the table.", rich_help_panel=_OUT)
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a blur table from photographs of a dot, or from a lens prescription.
 
@@ -92,7 +105,7 @@ def fit(
 
         torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
     """
-    console = Console(soft_wrap=True)
+    console = Console(soft_wrap=True, quiet=as_json)
     if target is not None:
         if captures is not None or lens is not None:
             raise FitError("--target writes the page to print; give it alone, and the photographs afterwards")
@@ -103,16 +116,18 @@ def fit(
         raise FitError("give either a folder of captures or --lens FILE")
     if root is not None and lens is not None:
         raise FitError("--root is the folder of photographs; leave it out with --lens")
-    if output.suffix != ".json":
-        raise FitError(f"the table is written as JSON: name it {output.with_suffix('.json')}", file=str(output))
+    if out.suffix != ".json":
+        raise FitError(f"the table is written as JSON: name it {out.with_suffix('.json')}", file=str(out))
     if plots is not None:
         plots.mkdir(parents=True, exist_ok=True)
     if lens is not None:
-        table = _trace(lens, f_number, focus_m, nodes, console)
+        table = _trace(lens, f_number, focus_m, nodes, field_deg, wavelengths, console)
         _lens_summary(table, console)
-        _write(table, output, console)
+        _write(table, out, console)
+        if as_json:
+            typer.echo(json_line({"out": str(out), "family": table.family, **table.provenance}))
         if plots is not None:
-            _draw_table(table, plots, output.stem, console)
+            _draw_table(table, plots, out.stem, console)
         return
     if captures is not None and captures.is_dir() and not (captures / MANIFEST).is_file():
         photographs = read_photographs(captures, square_mm=square_mm)
@@ -120,31 +135,60 @@ def fit(
         command = f"torchdof fit {captures.name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(photographs.captures, family, accuracy_db, command, None, console)
         _summary(photographs.captures, result, messages, console)
-        _write(result.table, output, console)
-        _draw_sheet(photographs, result, output.with_suffix(".png"), console)
+        _write(result.table, out, console)
+        _draw_sheet(photographs, result, out.with_suffix(".png"), console)
+        if as_json:
+            facts = _facts(photographs.captures, result, messages)
+            typer.echo(json_line({"out": str(out), **facts, "advice": list(photographs.advice)}))
         return
     capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots, root=root)
     first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
     for i, capture_set in enumerate(capture_sets):
-        target = output if len(capture_sets) == 1 else output.with_name(f"{output.stem}_{i:02d}.json")
+        table_file = out if len(capture_sets) == 1 else out.with_name(f"{out.stem}_{i:02d}.json")
         if len(capture_sets) > 1:
             console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
         first = first or result
         _summary(capture_set, result, messages, console)
-        _write(result.table, target, console)
+        _write(result.table, table_file, console)
+        if as_json:
+            typer.echo(json_line({"out": str(table_file), **_facts(capture_set, result, messages)}))
         if plots is not None:
-            _draw_fits(capture_set, result, plots, target.stem, console)
-            _draw_table(result.table, plots, target.stem, console)
+            _draw_fits(capture_set, result, plots, table_file.stem, console)
+            _draw_table(result.table, plots, table_file.stem, console)
 
 
-def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Console) -> BlurTable:
-    from torchdof.fit.lens.lens import Lens
+def _trace(
+    source: str,
+    f_number: float,
+    focus_m: float,
+    nodes: int,
+    field_deg: float,
+    wavelengths: str | None,
+    console: Console,
+) -> BlurTable:
+    from torchdof.fit.lens.lens import RGB_UM, Lens
     from torchdof.fit.lens.trace import trace_table
 
+    lens = Lens.read(source)
+    try:
+        lines = RGB_UM if wavelengths == "rgb" else tuple(map(float, wavelengths.split(","))) if wavelengths else None
+    except ValueError:
+        raise FitError(f"--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45; got {wavelengths}") from None
+    if not 0 <= field_deg < 90:
+        raise FitError(f"--field-deg must be 0 to 90 degrees from the axis, got {field_deg:g}")
+    focal = lens.paraxial().focal_length
+    image_mm = focal if math.isinf(focus_m) else focal / (1 - focal / 1000 / focus_m)
     with console.status(f"tracing {nodes} distances"):
-        return trace_table(Lens.read(lens), f_number=f_number, focus_m=focus_m, nodes=nodes)
+        return trace_table(
+            lens,
+            f_number=f_number,
+            focus_m=focus_m,
+            nodes=nodes,
+            field_mm=image_mm * math.tan(math.radians(field_deg)),
+            wavelengths_um=lines,
+        )
 
 
 def _tell(photographs: Photographs, console: Console) -> None:
@@ -221,6 +265,24 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
     )
     for message in messages:
         console.print(f"warning: {message}", style="yellow", markup=False, highlight=False)
+
+
+def _facts(captures: Captures, result: TableFit, messages: list[str]) -> dict[str, Any]:
+    """What :func:`_summary` prints, for programs."""
+    fits = [
+        {
+            "distance_m": pair.distance_m,
+            "coc_px": coc,
+            "params": fitted.params,
+            "stderr": fitted.stderr,
+            "residual": fitted.residual,
+            "residual_over_noise": fitted.residual_over_noise,
+            "magnification": fitted.magnification,
+        }
+        for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True)
+    ]
+    chosen = {"name": captures.name, "family": result.table.family, "why": result.why, "scale": result.scale}
+    return {**chosen, "focus_m": captures.focus_m, "fits": fits, "warnings": messages}
 
 
 def _lens_summary(table: BlurTable, console: Console) -> None:
