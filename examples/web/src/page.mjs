@@ -114,6 +114,8 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
     group.hidden = !group.dataset.for.includes($('kind').value)
   }
   if (!photo || !depthFile) {
+    stage.endProgress()
+    if (photo) stage.showSharp(photo)
     say(photo ? 'Now add the depth map of this photo.' : 'Now add the photo of this depth map.')
     return
   }
@@ -281,7 +283,9 @@ function say(text) {
 function complain(message) {
   $('problem').hidden = message === null
   $('problem').textContent = message ?? ''
-  if (message !== null) say('')
+  if (message === null) return
+  say('')
+  $('problem').scrollIntoView({ block: 'nearest' })
 }
 
 /* Controls ----------------------------------------------------------------------------------------------------- */
