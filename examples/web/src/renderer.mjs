@@ -3,7 +3,7 @@
 export class Renderer {
   /**
    * @param handlers.onSharp ({rgba, width, height}): the photograph at the size of the result.
-   * @param handlers.onBegin (expectedMs or null, isHalf): a picture has been begun.
+   * @param handlers.onBegin (expectedMs or null, isHalf, isReady): a picture has been begun, or waits until all is loaded.
    * @param handlers.onPicture ({rgba, width, height, half, ms}): it is there.
    * @param handlers.onFailed (message).
    */
@@ -46,7 +46,7 @@ export class Renderer {
   #next() {
     this.running = { ...this.wanted, sceneId: this.sceneId, began: performance.now() }
     this.wanted = null
-    this.handlers.onBegin(this.isReady ? this.#expectedMs(this.running.half) : null, this.running.half)
+    this.handlers.onBegin(this.isReady ? this.#expectedMs(this.running.half) : null, this.running.half, this.isReady)
     this.worker.postMessage({ type: 'render', ...this.running })
   }
 
