@@ -25,7 +25,7 @@ class Summary:
         samples: Samples that were written.
         shards: Shards that hold them.
         broken: Image file and error of each sample that could not be made.
-        seconds: Sum over the samples of the time each took, in one process.
+        seconds: Of the processor, over all samples.
     """
 
     samples: int
@@ -183,7 +183,7 @@ them.
 | samples | {summary.samples}, {settings["copies"]} of each image |
 | shards | {summary.shards}, {settings["format"]} |
 | inputs left out | {len(summary.broken)}, listed in broken.txt |
-| time | {pace} a sample, one core |
+| time | {pace} of one core a sample |
 | focus | {focus[0]:g} to {focus[1]:g} m, evenly in 1 / metres |
 | opening | f/{opening[0]:g} to f/{opening[1]:g}, evenly in stops |
 | camera | {settings["camera"]}, but for focus and opening |
