@@ -17,7 +17,7 @@ from .optics.camera import CAMERA_NUMBERS, Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import pipeline
 from .render.attention import Attention
-from .render.plan import Plan
+from .render.plan import Plan, tolerance_within
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -222,7 +222,7 @@ class DepthOfField(nn.Module):
             ...
         """
         coc = flattened(leading_axes(image), "coc_px", self.coc_px(image, depth, focus_m, f_number))
-        return Plan.of_scene(coc, self.options.tolerance).of_pixels(coc)
+        return Plan.of_scene(coc, tolerance_within(coc, self.options.tolerance)).of_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""

@@ -1,13 +1,15 @@
-"""Options that several commands take alike: what lens took the image, and what the numbers of its depth map are."""
+"""Options that several commands take alike: the lens, the numbers of a depth map, the blur, and what is printed."""
 
 from typing import Annotated, Literal
 
 import typer
 
 __all__ = [
+    "BLUR",
     "DEPTH",
     "LENS",
     "ApertureRadiusM",
+    "AsJson",
     "DepthChannel",
     "DepthOffset",
     "DepthScale",
@@ -16,13 +18,18 @@ __all__ = [
     "FarM",
     "FocalLengthMm",
     "FovDeg",
+    "FillDepth",
+    "MethodName",
     "NearM",
+    "NoOcclusion",
     "RelativeKind",
     "SensorWidthMm",
+    "TableName",
+    "ToleranceText",
     "ValueRange",
 ]
 
-LENS, DEPTH = "Focus and lens", "Depth map"
+LENS, DEPTH, BLUR = "Focus and lens", "Depth map", "Blur"
 """Panels of the help that these options stand in."""
 
 FNumber = Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=LENS)]
@@ -69,3 +76,33 @@ DepthUnknown = Annotated[
 DepthChannel = Annotated[
     str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=DEPTH)
 ]
+FillDepth = Annotated[
+    str | None,
+    typer.Option(
+        metavar="nearest|far|METRES",
+        help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see "
+        "lies behind), or with a distance (inf for a sky).",
+        rich_help_panel=DEPTH,
+    ),
+]
+
+TableName = Annotated[
+    str, typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=BLUR)
+]
+ToleranceText = Annotated[
+    str,
+    typer.Option(
+        help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
+        "exact.",
+        rich_help_panel=BLUR,
+    ),
+]
+NoOcclusion = Annotated[
+    bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=BLUR)
+]
+MethodName = Annotated[
+    Literal["layered", "fold"],
+    typer.Option(help="fold is the literal scatter: exact, slow, for small radii.", rich_help_panel=BLUR),
+]
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print what is printed as JSON, for programs: one object a line.")]

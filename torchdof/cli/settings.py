@@ -19,6 +19,7 @@ from ..io.sequence import focus_at_frame
 from ..io.transfer import Transfer
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
+from ..optics.table_file import shipped
 from ..options import Method
 from ..validation import number, show
 
@@ -32,6 +33,7 @@ _OPTIONS = {
     "fov_x_deg": "--fov-deg",
     "aperture_radius_m": "--aperture-radius-m",
 }
+_IDEAL = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 
 
@@ -62,6 +64,7 @@ class RenderSettings:
         depth_edges: What is done to depth edges, as in :class:`torchdof.DepthOfField`.
         table: Blur table.
         tolerance: Accepted RMS error, as in :class:`torchdof.DepthOfField`.
+        attention: Where the viewer looks, (x, y, radius) in pixels.
         occlusion: False for the paper's single pass without occlusion.
         method: "layered" or "fold".
         device: Where to compute.
@@ -96,6 +99,7 @@ class RenderSettings:
     depth_edges: DepthEdges = "auto"
     table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
     tolerance: float = 1 / 255
+    attention: tuple[float, float, float] | None = None
     occlusion: bool = True
     method: Method = "layered"
     device: torch.device = torch.device("cpu")
@@ -211,12 +215,17 @@ def load_table(name: str) -> BlurTable:
     """A blur table by name ("disc", "gaussian", a shipped one) or by the path of its JSON file.
 
     Raises:
-        ValueError: If there is no such table or it is not valid.
+        ValueError: If it is not valid.
+        FileNotFoundError: If there is no such table; the message lists those there are.
         OSError: If the file cannot be read.
     """
-    if name in ("disc", "gaussian"):
-        return BlurTable.disc() if name == "disc" else BlurTable.gaussian()
-    return BlurTable.load(name)
+    if isinstance(name, str) and name in _IDEAL:
+        return _IDEAL[name]()
+    try:
+        return BlurTable.load(name)
+    except FileNotFoundError:
+        names = ", ".join([*_IDEAL, *shipped()])
+        raise FileNotFoundError(f"no blur table {show(name)}: neither a file nor one of {names}") from None
 
 
 def pick_device(name: str) -> torch.device:

@@ -9,7 +9,7 @@ from typing import Any
 from ..io.atomic import whole_file
 from ..validation import show
 
-__all__ = ["fields_of", "find", "read", "stamped", "write"]
+__all__ = ["fields_of", "find", "read", "shipped", "stamped", "write"]
 
 SCHEMA = "torchdof/blur-table"
 VERSION = 1
@@ -32,9 +32,17 @@ def find(source: str | os.PathLike[str]) -> Path:
     if not path.suffix and not path.exists():
         path = _SHIPPED / f"{path}.json"
     if not path.is_file():
-        shipped = ", ".join(sorted(p.stem for p in _SHIPPED.glob("*.json")))
-        raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({shipped})")
+        names = ", ".join(shipped())
+        raise FileNotFoundError(
+            f"no blur table {str(source)!r}: neither a file nor one of the shipped ({names}); "
+            "ideal lenses are BlurTable.disc() and BlurTable.gaussian()"
+        )
     return path
+
+
+def shipped() -> list[str]:
+    """Names of the tables that come with torchdof, sorted."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.json"))
 
 
 def read(path: Path) -> Any:
