@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+import torchdof.augmentation
 import torchdof.io.transfer
 from torchdof import BlurTable, Camera, depth_of_field
 from torchdof.augmentation import DepthAugmentationSequential, RandomDepthOfField
@@ -42,6 +43,21 @@ def test_it_is_the_rendering_of_what_was_drawn() -> None:
     )
     assert torch.equal(out[chosen], expected)
     assert torch.equal(out[~chosen], image[~chosen])
+
+
+def test_images_that_are_left_out_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered = []
+
+    def noted(image: Tensor, *arguments: Any, **options: Any) -> Tensor:
+        rendered.append(len(image))
+        return depth_of_field(image, *arguments, **options)
+
+    monkeypatch.setattr(torchdof.augmentation, "depth_of_field", noted)
+    image, depth = sample()
+    drawn = {**random_dof().forward_parameters(tuple(image.shape)), "batch_prob": torch.tensor([0.0, 1.0, 0.0, 0.0])}
+    random_dof(p=0.5)(image, depth, params=drawn)
+    random_dof(p=0.0)(image, depth)
+    assert rendered == [1]
 
 
 def test_encoded_images_are_blurred_in_linear_light() -> None:
