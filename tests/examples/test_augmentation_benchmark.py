@@ -1,9 +1,10 @@
 from pathlib import Path
 
 import pytest
-import torch
+from torch import Tensor
 
 from examples.benchmarks import augmentation
+from torchdof.augmentation import RandomDepthOfField
 
 DATA = Path(__file__).parents[2] / "examples" / "data" / "motorcycle"
 
@@ -19,10 +20,11 @@ def test_it_prints_a_line_for_each_blur(monkeypatch: pytest.MonkeyPatch, capsys:
 
 
 def test_a_wrong_picture_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def brighter(self: RandomDepthOfField, image: Tensor, depth: Tensor) -> Tensor:
+        self._params = self.forward_parameters(tuple(image.shape))
+        return image + 0.1
+
     monkeypatch.setattr(augmentation, "_SIDE_PX", 32)
-    image, depth = augmentation.crops(DATA, 2)
-    monkeypatch.setattr(augmentation.RandomDepthOfField, "forward", lambda self, image, depth: (
-        setattr(self, "_params", self.forward_parameters(tuple(image.shape))), image + 0.1
-    )[1])  # fmt: skip
+    monkeypatch.setattr(RandomDepthOfField, "forward", brighter)
     with pytest.raises(RuntimeError, match="final: the picture is not the rendering of its parameters"):
-        augmentation.works(image, torch.flip(depth, [-1]))
+        augmentation.works(*augmentation.crops(DATA, 2))

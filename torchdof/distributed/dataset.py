@@ -98,12 +98,11 @@ def make_dataset(
     summary = summary_of(out)
     _describe(out, summary, settings)
     if made:
-        seconds = time.perf_counter() - start
         say(
             f"{made} samples in {seconds:.1f} s: {made / seconds:.2f} images/s, {made / seconds / workers:.2f} a worker"
         )
-    for image, error in summary.broken:
-        say(f"left out: {error}" if error.startswith(image) else f"left out: {image}: {error}")
+    for image, problem in summary.broken:
+        say(f"left out: {problem}" if problem.startswith(image) else f"left out: {image}: {problem}")
     return summary
 
 
