@@ -16,7 +16,6 @@ from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
-from ..optics.blur_table import BlurTable
 from ..options import Options
 from ..validation import coc_of_lens, image_and_map, same_aspect
 from .doubts import Said
@@ -120,7 +119,7 @@ def render_frame(
         table = settings.table
         if picture.has_alpha and table.channels > 1:  # alpha is blurred as green is
             params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
-            table = BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
+            table = table.replace(params=params)
         options = Options(
             table, settings.tolerance, settings.occlusion, method=settings.method, depth_edges=settings.depth_edges
         ).arguments()

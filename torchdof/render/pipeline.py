@@ -1,6 +1,7 @@
 """The chain: an image's surfaces and its highlights, the layers they lie in, scattered and composited."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
@@ -217,7 +218,9 @@ def _composite(
     frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
-        scatter = convolve if layered else fold
+        aperture = options.table.aperture
+        turned = aperture is not None and not aperture.is_round
+        scatter = functools.partial(convolve, turned=turned) if layered else fold
         if options.occlusion:
             out = composite.over(frame, blurs, scatter)
             return out if splats is None else out + splats

@@ -160,7 +160,8 @@ class Plan:
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
-        scales = tuple(self._scale(coc) if coarse else 1 for coc in self.coc_px)
+        finest = 1.0 if table.aperture is None else table.aperture.finest
+        scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
         if torch.compiler.is_compiling():  # no names of this process's, such as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
@@ -191,7 +192,7 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> T
     Each is interpolated between those of whole 1/32 px where no gradient asks for more. They are cut to what reaches
     within a frame whose longer side is ``longest`` pixels.
     """
-    if torch.is_grad_enabled() and coc_px.requires_grad:
+    if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
         kernels = table.kernels(coc_px, width)
     else:
         steps = coc_px.double() * KERNELS_PER_PX
@@ -213,6 +214,8 @@ def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, 
             coc *= shrink(table, coc, width / scale, scale)
         return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0].clone()
 
+    if torch.is_grad_enabled() and table.requires_grad:
+        return made()
     return _kernels.get((lens, coc_px, width, scale, window), made)
 
 
