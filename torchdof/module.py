@@ -139,11 +139,12 @@ class DepthOfField(nn.Module):
         options = self.options
         depth = validation.stack(rgba, depth_m, options.check)
         batch, count, _, height, width = rgba.shape
-        maps = depth.expand(batch, -1, 1, height, width).transpose(1, 2).flatten(2, 3)  # [B, 1, N * H, W]
+        maps = depth.expand(batch, -1, 1, height, width)
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
-        coc = self._coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number, "depth_m")
-        return _rendered(pipeline.blur_stack, rgba, coc.unflatten(2, (count, height)).transpose(1, 2), options)
+        frame = rgba.new_empty(batch, 1, height, width)
+        cocs = [self._coc_px(frame, layer, focus_m, f_number, "depth_m") for layer in maps.unbind(1)]
+        return _rendered(pipeline.blur_stack, rgba, torch.stack(cocs, 1), options)
 
     def coc_px(
         self,

@@ -33,6 +33,7 @@ NAMED = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
 """For looking around, for judging a picture, and one that differs by less than a display shows."""
 
 _DISC = BlurTable.disc()  # one for all: what was computed of a table is kept with it
+_LATER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # of the camera; older states lack them
 _Spelled = TypeVar("_Spelled")
 
 
@@ -211,6 +212,7 @@ def read_state(state: Any) -> tuple[Camera, Options]:
     camera = state["camera"]
     if not isinstance(camera, Mapping):
         raise ValueError(f"camera of the state must be a dict, got {show(camera)}")
+    camera = {**_LATER_NUMBERS, **camera}
     _fields("camera of the state", camera, list(Camera.__dataclass_fields__))
     try:
         restored_camera = Camera(**camera)
