@@ -1,13 +1,18 @@
 """Options that several commands take alike: what lens took the image, and what the numbers of its depth map are."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 __all__ = [
+    "BLUR",
     "DEPTH",
     "LENS",
+    "ApertureImage",
     "ApertureRadiusM",
+    "Blades",
+    "Curvature",
     "DepthChannel",
     "DepthOffset",
     "DepthScale",
@@ -18,11 +23,13 @@ __all__ = [
     "FovDeg",
     "NearM",
     "RelativeKind",
+    "Rotation",
     "SensorWidthMm",
+    "Squeeze",
     "ValueRange",
 ]
 
-LENS, DEPTH = "Focus and lens", "Depth map"
+LENS, DEPTH, BLUR = "Focus and lens", "Depth map", "Blur"
 """Panels of the help that these options stand in."""
 
 FNumber = Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=LENS)]
@@ -36,6 +43,20 @@ FovDeg = Annotated[
 ]
 ApertureRadiusM = Annotated[
     float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=LENS)
+]
+
+Blades = Annotated[int, typer.Option(help="Aperture blades, from 3; 0 is a round lens.", rich_help_panel=BLUR)]
+Rotation = Annotated[
+    float,
+    typer.Option(help="Degrees by which blades or image are turned, counter-clockwise.", rich_help_panel=BLUR),
+]
+Curvature = Annotated[float, typer.Option(help="Of the blades: 0 straight, 1 a circle.", rich_help_panel=BLUR)]
+Squeeze = Annotated[
+    float, typer.Option(help="Height of the blur over its width; 2 for an anamorphic lens.", rich_help_panel=BLUR)
+]
+ApertureImage = Annotated[
+    Path | None,
+    typer.Option(metavar="IMAGE", help="Picture of the opening, bright where light passes.", rich_help_panel=BLUR),
 ]
 
 DepthScale = Annotated[float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=DEPTH)]

@@ -105,10 +105,16 @@ def render_frame(
         coc_px = camera.coc_px(values, width)
         coc_of_lens(coc_px, values, settings.stated(camera))
         said.say(depth or image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
+        focus = f"{camera.focus_m:.4g}"
+        if camera.focus_range_m is not None:
+            focus = " to ".join(f"{end:.4g}" for end in camera.focus_range_m)
         parts.append(
-            f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
+            f"focus {focus} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
             f"{camera.sensor_width_mm:.4g} mm"
         )
+        for name, angle in (("tilt", camera.tilt_deg), ("swing", camera.swing_deg)):
+            if angle != 0.0:
+                parts.append(f"{name} {angle:.4g} degrees")
     parts.append(f"blur radius up to {float(coc_px.abs().max()):.1f} px")
     pixels = picture.pixels.to(settings.device)
     if settings.show_focus:
@@ -129,6 +135,8 @@ def render_frame(
             else:
                 pixels = depth_of_field(pixels, values, camera, **options)
         parts.append(f"{settings.table.name or settings.table.family}, {settings.method}")
+        if settings.table.aperture is not None:
+            parts.append(repr(settings.table.aperture).removeprefix("Aperture(").removesuffix(")"))
         if not settings.occlusion:
             parts.append("no occlusion")
     write_image(out, dataclasses.replace(picture, pixels=pixels), settings.out_transfer, settings.sample)

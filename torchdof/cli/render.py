@@ -26,9 +26,13 @@ from ..depth.steady import SteadyFrames
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
 from .arguments import (
+    BLUR,
     DEPTH,
     LENS,
+    ApertureImage,
     ApertureRadiusM,
+    Blades,
+    Curvature,
     DepthChannel,
     DepthOffset,
     DepthScale,
@@ -39,12 +43,14 @@ from .arguments import (
     FovDeg,
     NearM,
     RelativeKind,
+    Rotation,
     SensorWidthMm,
+    Squeeze,
     ValueRange,
 )
 from .doubts import Said
 from .frame import Frame, read_frame, render_frame
-from .settings import RenderSettings, load_table, pick_device
+from .settings import RenderSettings, load_aperture, load_table, pick_device
 
 __all__ = ["parse_fill", "parse_point", "parse_range", "render"]
 
@@ -53,7 +59,7 @@ _EACH_ITS_OWN = Doubt(
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH",
 )
-_BLUR, _FILES = "Blur", "Files and frames"
+_FILES = "Files and frames"
 
 
 def render(
@@ -84,6 +90,25 @@ def render(
             rich_help_panel=LENS,
         ),
     ] = None,
+    focus_range: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NEAR,FAR",
+            help="In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
+            rich_help_panel=LENS,
+        ),
+    ] = None,
+    tilt: Annotated[
+        float,
+        typer.Option(
+            help="Degrees by which the lens is tilted down: focus comes nearer towards the bottom.",
+            rich_help_panel=LENS,
+        ),
+    ] = 0.0,
+    swing: Annotated[
+        float,
+        typer.Option(help="Degrees to the right: focus comes nearer towards the right.", rich_help_panel=LENS),
+    ] = 0.0,
     f_number: FNumber = None,
     focal_length_mm: FocalLengthMm = None,
     sensor_width_mm: SensorWidthMm = None,
@@ -132,30 +157,35 @@ def render(
     ] = "auto",
     table: Annotated[
         str,
-        typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=_BLUR),
+        typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=BLUR),
     ] = "disc",
+    blades: Blades = 0,
+    rotation: Rotation = 0.0,
+    curvature: Curvature = 0.0,
+    squeeze: Squeeze = 1.0,
+    aperture: ApertureImage = None,
     tolerance: Annotated[
         str,
         typer.Option(
             help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
             "exact.",
-            rich_help_panel=_BLUR,
+            rich_help_panel=BLUR,
         ),
     ] = "final",
     no_occlusion: Annotated[
-        bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=_BLUR)
+        bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=BLUR)
     ] = False,
     method: Annotated[
         Literal["layered", "fold"],
-        typer.Option(help="fold is the literal scatter: exact, slow.", rich_help_panel=_BLUR),
+        typer.Option(help="fold is the literal scatter: exact, slow.", rich_help_panel=BLUR),
     ] = "layered",
     show_focus: Annotated[
         bool,
         typer.Option(
-            "--show-focus", help="Don't blur: tint near orange, in focus green, far blue.", rich_help_panel=_BLUR
+            "--show-focus", help="Don't blur: tint near orange, in focus green, far blue.", rich_help_panel=BLUR
         ),
     ] = False,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=_BLUR)] = "auto",
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=BLUR)] = "auto",
     transfer: Annotated[
         Literal["linear", "srgb"] | None,
         typer.Option(help="How IMAGE is encoded. Default: integers srgb, floats linear.", rich_help_panel=_FILES),
@@ -206,6 +236,10 @@ def render(
     --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
     rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
 
+    Seven blades on an anamorphic lens, all from 1.5 to 2.2 m in focus:
+
+        torchdof render shot.exr -o out.exr --focus-range 1.5,2.2 --blades 7 --rotation 15 --squeeze 2
+
     A stereo disparity map with holes (scale: baseline in metres * focal length in pixels):
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
@@ -221,6 +255,9 @@ def render(
     settings = RenderSettings(
         focus=None if focus_m is None else parse_focus(focus_m),
         focus_at=None if focus_at is None else parse_point(focus_at),
+        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
+        tilt_deg=tilt,
+        swing_deg=swing,
         f_number=f_number,
         focal_length_mm=focal_length_mm,
         sensor_width_mm=sensor_width_mm,
@@ -234,10 +271,10 @@ def render(
         near_m=near_m,
         far_m=far_m,
         relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range),
+        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
         fill=None if fill_depth is None else parse_fill(fill_depth),
         depth_edges="as given" if depth_edges == "as-given" else depth_edges,
-        table=load_table(table),
+        table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture)),
         tolerance=tolerance_of_text(tolerance),
         occlusion=not no_occlusion,
         method=method,
@@ -359,16 +396,16 @@ def parse_point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def parse_range(text: str) -> tuple[float, float]:
-    """Reads ``LOW,HIGH``.
+def parse_range(text: str, option: str, example: str) -> tuple[float, float]:
+    """Reads two numbers, as of an option's example.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If these are none.
     """
     try:
         low, high = (float(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"--value-range expects LOW,HIGH such as 0,255, got {text!r}") from None
+        raise ValueError(f"{option} expects two numbers such as {example}, got {text!r}") from None
     return low, high
 
 

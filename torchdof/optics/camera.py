@@ -77,7 +77,9 @@ class Camera:
         if self.focus_range_m is not None:
             near, far = _checked_range(self.focus_range_m)
             object.__setattr__(self, "focus_range_m", (near, far))
-            object.__setattr__(self, "focus_m", 2.0 / (1.0 / near + 1.0 / far))
+            dioptres = 1.0 / near + 1.0 / far
+            halfway = 2.0 / dioptres if isinstance(dioptres, Tensor) or dioptres > 0 else math.inf
+            object.__setattr__(self, "focus_m", halfway)
         for name in ("tilt_deg", "swing_deg"):
             _check_angle(name, getattr(self, name))
         for name in CAMERA_NUMBERS:
@@ -195,7 +197,7 @@ class Camera:
         """
         if "focus_m" in changes and changes.get("focus_range_m", self.focus_range_m) is not None:
             raise ValueError(
-                f"focus_m is told by the camera's focus_range_m, got focus_m = {_show(changes['focus_m'])} as well; "
+                "focus_m is told by the camera's focus_range_m, got focus_m as well; "
                 "change focus_range_m, or take it away with camera.replace(focus_range_m=None)"
             )
         return dataclasses.replace(self, **changes)

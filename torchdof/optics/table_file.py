@@ -9,7 +9,7 @@ from typing import Any
 from ..io.atomic import whole_file
 from ..validation import show
 
-__all__ = ["fields_of", "find", "read", "stamped", "write"]
+__all__ = ["fields_of", "find", "read", "shipped", "stamped", "write"]
 
 SCHEMA = "torchdof/blur-table"
 VERSION = 2
@@ -33,9 +33,14 @@ def find(source: str | os.PathLike[str]) -> Path:
     if not path.suffix and not path.exists():
         path = _SHIPPED / f"{path}.json"
     if not path.is_file():
-        shipped = ", ".join(sorted(p.stem for p in _SHIPPED.glob("*.json")))
-        raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({shipped})")
+        names = ", ".join(shipped())
+        raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({names})")
     return path
+
+
+def shipped() -> list[str]:
+    """Names of the tables that come with the package."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.json"))
 
 
 def read(path: Path) -> Any:
