@@ -462,12 +462,12 @@ def test_python_dash_m_is_the_command(scene: Path) -> None:
 def test_options_shape_the_blur_and_the_focus(scene: Path) -> None:
     line = run(
         *("image.exr", "depth.npy", "-o", "out.exr", "--focus-range", "1.5,1.8", "--tilt", "3", "--swing", "-1", *LENS),
-        *("--blades", "5", "--rotation", "15", "--curvature", "0.2", "--squeeze", "1.5"),
+        *("--blades", "5", "--rotation", "15", "--curvature", "0.2", "--squeeze", "1.5", "--vignetting", "0.3"),
     )
     assert "focus 1.5 to 1.8 m" in line and "tilt 3 degrees" in line and "swing -1 degrees" in line
-    assert "5 blades, curvature 0.2, turned by 15, squeeze 1.5" in line
+    assert "5 blades, curvature 0.2, turned by 15, squeeze 1.5, vignetting 0.3" in line
     camera = lens(1.0).replace(focus_range_m=(1.5, 1.8), tilt_deg=3.0, swing_deg=-1.0)
-    table = torchdof.BlurTable.polygon(5, 15.0, 0.2, squeeze=1.5)
+    table = torchdof.BlurTable.polygon(5, 15.0, 0.2, squeeze=1.5, vignetting=0.3)
     expected = torchdof.depth_of_field(image(), depth(), camera, table=table)
     torch.testing.assert_close(read_image("out.exr").pixels, expected, rtol=0, atol=1e-6)
 

@@ -27,6 +27,7 @@ __all__ = [
     "SensorWidthMm",
     "Squeeze",
     "ValueRange",
+    "Vignetting",
 ]
 
 LENS, DEPTH, BLUR = "Focus and lens", "Depth map", "Blur"
@@ -53,6 +54,9 @@ Rotation = Annotated[
 Curvature = Annotated[float, typer.Option(help="Of the blades: 0 straight, 1 a circle.", rich_help_panel=BLUR)]
 Squeeze = Annotated[
     float, typer.Option(help="Height of the blur over its width; 2 for an anamorphic lens.", rich_help_panel=BLUR)
+]
+Vignetting = Annotated[
+    float, typer.Option(help="Cat's eyes towards the corners: 0 none, 1 closed.", rich_help_panel=BLUR)
 ]
 ApertureImage = Annotated[
     Path | None,

@@ -47,6 +47,7 @@ from .arguments import (
     SensorWidthMm,
     Squeeze,
     ValueRange,
+    Vignetting,
 )
 from .doubts import Said
 from .frame import Frame, read_frame, render_frame
@@ -164,6 +165,7 @@ def render(
     curvature: Curvature = 0.0,
     squeeze: Squeeze = 1.0,
     aperture: ApertureImage = None,
+    vignetting: Vignetting = 0.0,
     tolerance: Annotated[
         str,
         typer.Option(
@@ -274,7 +276,7 @@ def render(
         value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
         fill=None if fill_depth is None else parse_fill(fill_depth),
         depth_edges="as given" if depth_edges == "as-given" else depth_edges,
-        table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture)),
+        table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)),
         tolerance=tolerance_of_text(tolerance),
         occlusion=not no_occlusion,
         method=method,

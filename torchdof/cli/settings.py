@@ -252,7 +252,7 @@ def load_table(name: str, aperture: Aperture | None = None) -> BlurTable:
 
 
 def load_aperture(
-    blades: int, rotation: float, curvature: float, squeeze: float, image: Path | None
+    blades: int, rotation: float, curvature: float, squeeze: float, image: Path | None, vignetting: float = 0.0
 ) -> Aperture | None:
     """The opening that these options mean; None if they mean a round one.
 
@@ -272,10 +272,16 @@ def load_aperture(
         light = picture.pixels[0, :-1] if picture.has_alpha else picture.pixels[0]
         mask = light.mean(0)
     with _by_option(
-        {"blades": "--blades", "rotation_deg": "--rotation", "curvature": "--curvature", "squeeze": "--squeeze"}
+        {
+            "blades": "--blades",
+            "rotation_deg": "--rotation",
+            "curvature": "--curvature",
+            "squeeze": "--squeeze",
+            "vignetting": "--vignetting",
+        }
     ):
-        aperture = Aperture(blades, rotation, curvature, squeeze, mask)
-    return None if aperture.is_round and squeeze == 1.0 else aperture
+        aperture = Aperture(blades, rotation, curvature, squeeze, mask, vignetting)
+    return None if aperture.is_round and squeeze == 1.0 and not aperture.depends_on_place else aperture
 
 
 def pick_device(name: str) -> torch.device:

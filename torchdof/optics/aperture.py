@@ -44,6 +44,10 @@ class Aperture:
             is the blur's height. A float, or a tensor ``[]`` that a gradient is taken to.
         mask: Transmission ``[H, W]`` >= 0 of the square around the opening, in place of blades: the longer side spans
             it. Images of more than 128 pixels are averaged down. It is turned by bilinear interpolation.
+        vignetting: How far towards the corners of the frame the lens's rim moves before the opening, and cuts a
+            cat's eye of it: in the corner by this share of the opening's diameter, from 0 to 1. With a second number,
+            the rim's radius over the opening's, from 1: the larger, the farther out it begins
+            (:mod:`torchdof.render.vignetting`).
 
     Raises:
         ValueError: If a number is out of its range, or the mask is dark or has blades as well.
@@ -60,6 +64,7 @@ class Aperture:
     curvature: float = 0.0
     squeeze: Number = 1.0
     mask: Tensor | None = None
+    vignetting: float | tuple[float, float] = 0.0
 
     def __post_init__(self) -> None:
         if self.blades != 0 or isinstance(self.blades, bool):
@@ -69,6 +74,13 @@ class Aperture:
         if isinstance(self.curvature, Tensor):
             raise ValueError(f"curvature must be a number from 0 to 1, got {show(self.curvature)}")
         _check("curvature", self.curvature, 0.0, 1.0)
+        if isinstance(self.vignetting, tuple | list):
+            if len(self.vignetting) != 2:
+                got = show(self.vignetting)
+                raise ValueError(f"vignetting must be a number from 0 to 1, or it and a rim's radius, got {got}")
+            object.__setattr__(self, "vignetting", tuple(self.vignetting))
+        _check("vignetting", self.rim[0], 0.0, 1.0)
+        _check("radius of the rim in vignetting", self.rim[1], 1.0, 10.0)
         if self.mask is None:
             if self.blades == 0 and self.curvature != 0.0:
                 raise ValueError(f"curvature is that of blades; give their number too, got {self.curvature:g}")
@@ -78,8 +90,18 @@ class Aperture:
         object.__setattr__(self, "mask", _checked_mask(self.mask))
 
     @property
+    def depends_on_place(self) -> bool:
+        """Whether kernels differ across the frame."""
+        return self.rim[0] > 0.0
+
+    @property
+    def rim(self) -> tuple[float, float]:
+        """How far the lens's rim moves towards the corners, in diameters of the opening, and its radius over that one's."""
+        return self.vignetting if isinstance(self.vignetting, tuple) else (self.vignetting, 1.0)
+
+    @property
     def is_round(self) -> bool:
-        """Whether nothing but the squeeze tells the opening from a round one."""
+        """Whether nothing but the squeeze tells the opening, in the middle of the frame, from a round one."""
         return self.blades == 0 and self.mask is None
 
     @property
@@ -132,6 +154,7 @@ class Aperture:
     def to_dict(self) -> dict[str, Any]:
         """The aperture as JSON-like data, the inverse of :meth:`from_dict`."""
         fields: dict[str, Any] = {"rotation_deg": _plain(self.rotation_deg), "squeeze": _plain(self.squeeze)}
+        fields["vignetting"] = list(self.rim)
         if self.mask is not None:
             return {**fields, "mask": self.mask.tolist()}
         return {"blades": self.blades, "curvature": float(self.curvature), **fields}
@@ -166,6 +189,8 @@ class Aperture:
         for name, value, usual in (("turned by", self.rotation_deg, 0.0), ("squeeze", self.squeeze, 1.0)):
             if _plain(value) != usual:
                 parts.append(f"{name} {_plain(value):g}")
+        if self.depends_on_place:
+            parts.append(f"vignetting {self.rim[0]:g}")
         return f"Aperture({', '.join(parts) or 'round'})"
 
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:

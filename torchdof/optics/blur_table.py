@@ -147,6 +147,7 @@ class BlurTable:
         *,
         squeeze: Number = 1.0,
         rim: float = 0.0,
+        vignetting: float | tuple[float, float] = 0.0,
     ) -> "BlurTable":
         """A lens whose aperture blades leave a polygon open, inscribed in the circle of confusion.
 
@@ -159,6 +160,8 @@ class BlurTable:
                 height. A float, or a tensor ``[]`` that a gradient is taken to.
             rim: How much brighter the blur is at the circle around the opening than in its middle, as that of an
                 over-corrected lens is (spherical aberration); >= -1, and negative where it is darker.
+            vignetting: How much the lens cuts cat's eyes towards the corners of the frame, 0 to 1; with a second
+                number, the radius of its rim over that of the opening (:class:`torchdof.optics.aperture.Aperture`).
 
         Raises:
             ValueError: If a number is out of its range.
@@ -167,11 +170,18 @@ class BlurTable:
             >>> BlurTable.polygon(6, rotation_deg=15.0, squeeze=2.0)
             BlurTable('polygon', disc, 1 node, Aperture(6 blades, turned by 15, squeeze 2))
         """
-        return cls._of_rim(rim, "polygon").with_aperture(Aperture(blades, rotation_deg, curvature, squeeze))
+        opening = Aperture(blades, rotation_deg, curvature, squeeze, vignetting=vignetting)
+        return cls._of_rim(rim, "polygon").with_aperture(opening)
 
     @classmethod
     def from_aperture(
-        cls, image: Tensor, rotation_deg: Number = 0.0, *, squeeze: Number = 1.0, rim: float = 0.0
+        cls,
+        image: Tensor,
+        rotation_deg: Number = 0.0,
+        *,
+        squeeze: Number = 1.0,
+        rim: float = 0.0,
+        vignetting: float | tuple[float, float] = 0.0,
     ) -> "BlurTable":
         """A lens with any opening: each point out of focus is drawn as this image, as large as its circle of confusion.
 
@@ -181,6 +191,7 @@ class BlurTable:
             rotation_deg: As in :meth:`polygon`.
             squeeze: As in :meth:`polygon`.
             rim: As in :meth:`polygon`.
+            vignetting: As in :meth:`polygon`.
 
         Raises:
             ValueError: If the image is no transmission, or a number is out of its range.
@@ -189,7 +200,7 @@ class BlurTable:
             >>> BlurTable.from_aperture(torch.eye(9))
             BlurTable('aperture', disc, 1 node, Aperture(mask 9 x 9))
         """
-        opening = Aperture(rotation_deg=rotation_deg, squeeze=squeeze, mask=image)
+        opening = Aperture(rotation_deg=rotation_deg, squeeze=squeeze, mask=image, vignetting=vignetting)
         return cls._of_rim(rim, "aperture").with_aperture(opening)
 
     @classmethod
@@ -276,7 +287,8 @@ class BlurTable:
     def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
         """Kernels at a signed coc: what the PSF does to a picture made of pixels (:mod:`torchdof.optics.psf`).
 
-        In front of the focus plane an opening that is not round shows turned by half.
+        They are those of the middle of the frame. In front of the focus plane an opening that is not round shows turned
+        by half.
 
         In focus the kernel is a single pixel, for what is in focus is as sharp in the image as it shall be. Where the
         table has a blur of its own there, that fades in with the square of the coc until ``|coc_px| = 1``.

@@ -15,6 +15,7 @@ from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
+from .vignetting import CatsEye
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
@@ -25,10 +26,14 @@ _kernels = KernelCache(256 * 2**20)
 
 @dataclasses.dataclass(frozen=True)
 class Blur:
-    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels."""
+    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
+
+    Where the lens's barrel shows, ``cats_eye`` tells what becomes of the kernel across the frame.
+    """
 
     kernel: Tensor
     scale: int
+    cats_eye: CatsEye | None = None
 
     @property
     def half(self) -> int:
@@ -177,7 +182,14 @@ class Plan:
                 reach_px = _kernels.get((lens, coc, width, scale), reach)
                 window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
-        return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        if table.aperture is None or not table.aperture.depends_on_place:
+            return blurs
+        frame = (int(size[0]), int(size[1]))
+        return [
+            dataclasses.replace(blur, cats_eye=CatsEye(table.aperture, coc / blur.scale, blur.scale, frame))
+            for blur, coc in zip(blurs, self.coc_px, strict=True)
+        ]
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
