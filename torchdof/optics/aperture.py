@@ -96,7 +96,7 @@ class Aperture:
 
     @property
     def rim(self) -> tuple[float, float]:
-        """How far the lens's rim moves towards the corners, in diameters of the opening, and its radius over that one's."""
+        """How far the rim moves towards the corners, in diameters of the opening, and its radius over the opening's."""
         return self.vignetting if isinstance(self.vignetting, tuple) else (self.vignetting, 1.0)
 
     @property
