@@ -1,5 +1,6 @@
 """The command from the outside: files in, files out, one line that says what was done, exit code 2 for wrong input."""
 
+import json
 import math
 import os
 import re
@@ -264,13 +265,56 @@ def test_table_of_three_colours_blurs_alpha_like_green(scene: Path) -> None:
     assert not torch.allclose(out[:, 0], out[:, 1], atol=1e-3)
 
 
-def test_show_focus_tints_near_sharp_and_far(scene: Path) -> None:
+def test_show_focus_draws_outlines_by_zone_and_keeps_all_other_colours(scene: Path) -> None:
+    colours = torch.tensor([0.3, 0.1, 0.2])[:, None, None].expand(1, 3, HEIGHT, WIDTH).clone()
+    colours[..., 8:, :] *= 0.2  # an outline across all three zones
+    write_image("photo.exr", Picture(colours, sample="float"))
+    np.save("coc.npy", np.tile(np.repeat([-4.0, 0.0, 4.0], WIDTH // 3), (HEIGHT, 1)))
+    line = run("photo.exr", "coc.npy", "-o", "tint.exr", "--depth-kind", "coc", "--show-focus")
+    tinted = pixels("tint.exr")
+    assert tinted[0, :, 7].argmax(dim=0).tolist() == [0] * 8 + [1] * 8 + [2] * 8
+    for columns in (slice(0, 7), slice(9, 15), slice(17, 24)):  # away from where zones meet
+        for rows in (slice(0, 7), slice(9, 16)):  # and from the outline
+            torch.testing.assert_close(tinted[..., rows, columns], colours[..., rows, columns])
+    assert "focus shown" in line
+
+
+def test_show_focus_makes_a_grey_picture_a_coloured_one(scene: Path) -> None:
     write_image("white.png", Picture(torch.full((1, 1, HEIGHT, WIDTH), 0.3), ("Y",)))
     np.save("coc.npy", np.tile(np.repeat([-4.0, 0.0, 4.0], WIDTH // 3), (HEIGHT, 1)))
-    line = run("white.png", "coc.npy", "-o", "tint.png", "--depth-kind", "coc", "--show-focus")
-    strongest = pixels("tint.png")[0, :, 0].argmax(dim=0)
-    assert strongest.tolist() == [0] * 8 + [1] * 8 + [2] * 8
-    assert "focus shown" in line
+    run("white.png", "coc.npy", "-o", "tint.png", "--depth-kind", "coc", "--show-focus")
+    tinted = pixels("tint.png")
+    assert tinted[0, :, 0, [7, 8, 15, 16]].argmax(dim=0).tolist() == [0, 1, 1, 2]
+    assert torch.equal(tinted[0, 0, :, :6], tinted[0, 2, :, :6])
+
+
+def test_json_says_for_programs_what_the_line_says(scene: Path) -> None:
+    sequence()
+    run("shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "2", "--frames", "1-1", *LENS)
+    printed = run(
+        "shot.####.exr", "depth.####.npy", "-o", "out.####.exr", "--focus-m", "inf", *LENS, "--resume", "--json"
+    )
+    there, *frames = [json.loads(line) for line in printed.splitlines()]
+    assert there == {"out": "out.0001.exr", "is_there_already": True}
+    assert [frame["out"] for frame in frames] == ["out.0002.exr", "out.0003.exr"]
+    camera = {"focus_m": "inf", "f_number": 1.4, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
+    straight = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}
+    assert frames[0]["camera"] == {**camera, **straight} and frames[0]["assumed"] == []
+    radius = float(lens(math.inf).coc_px(depth(), WIDTH).abs().max())
+    assert frames[0]["largest_coc_px"] == pytest.approx(radius) and frames[0]["table"] == "disc"
+
+
+def test_attention_loosens_the_tolerance_elsewhere(scene: Path) -> None:
+    slope = torch.linspace(2.0, 9.0, WIDTH).expand(1, 1, HEIGHT, WIDTH)
+    np.save("depth.npy", slope.numpy())
+    arguments = ("image.exr", "depth.npy", "--focus-m", "2", *LENS)
+    printed = run(*arguments, "-o", "out.exr", "--json", "--attention", "18,8,4")
+    assert json.loads(printed)["attention"] == [18.0, 8.0, 4.0]
+    run(*arguments, "-o", "everywhere.exr")
+    expected = torchdof.depth_of_field(image(), slope, lens(2.0), attention=(18.0, 8.0, 4.0))
+    torch.testing.assert_close(pixels("out.exr"), expected, rtol=0, atol=1e-6)
+    difference = (pixels("out.exr") - pixels("everywhere.exr")).abs()
+    assert float(difference[..., 8, 18].max()) < 1e-5 < float(difference[..., :8].max())
 
 
 def test_jpeg_in_jpeg_out_keeps_metadata(scene: Path) -> None:
@@ -387,7 +431,12 @@ def test_missing_depth_frame_is_found_before_anything_is_rendered(scene: Path) -
         (("image.exr", "depth.npy", "--focus-m", "2", "--fov-deg", "40"), "--fov-deg needs the opening of the lens"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--aperture-radius-m", "0.1"), "goes with --fov-deg"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--fov-deg", "40", "--focal-length-mm", "50"), "say the same"),
-        (("image.exr", "depth.npy", "--focus-m", "2", "--table", "nowhere"), "nowhere"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--table", "nowhere"),
+            "no blur table 'nowhere': neither a file nor one of disc, gaussian, double_gauss_50mm_f2, ",
+        ),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--attention", "3,4"), "--attention expects X,Y,RADIUS"),
+        (("image.exr", "depth.npy", "--focus-m", "2", "--attention", "3,4,0"), "(x, y, radius) in pixels, radius > 0"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--tolerance", "-1"), "tolerance must be"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--tolerance", "best"), "one of 'draft', 'preview', 'final'"),
         (("image.exr", "depth.npy", "--focus-m", "2", "--device", "warp"), "--device warp: there is no such device"),

@@ -38,5 +38,16 @@ def test_the_picture_shows_kernels_in_front_above_and_behind_below(
         assert (left > right) != behind  # the triangle's corner points left behind focus
 
 
-def test_a_table_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_json_tells_programs_the_same() -> None:
+    facts = json.loads(run("double_gauss_50mm_f2", "--json"))
+    assert (facts["table"], facts["family"], facts["nodes"], facts["unit"]) == (
+        "double_gauss_50mm_f2",
+        "radial",
+        33,
+        "mm",
+    )
+    assert facts["coc"][0] < 0 < facts["coc"][1] and facts["aperture"] is None
+
+
+def test_a_table_that_is_none_is_refused() -> None:
     assert "no blur table 'nothing'" in run("nothing", code=2)

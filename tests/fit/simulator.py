@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
 from torchdof.optics.psf import pixel_kernels
@@ -49,6 +50,11 @@ class Simulator:
         srgb: leave both pictures sRGB encoded.
         jpeg: JPEG quality the sRGB-encoded pictures are stored at and decoded from; None for none.
         edge_sigma: softness of the sharp picture in px, in both pictures.
+        misfocus: blur (a Gaussian's sigma in px) of the sharp picture alone.
+        texture: contrast of the paper's and the dot's grain, a few px large, the same in both pictures.
+        uneven: how much brighter the light is at the window's right edge than at its left.
+        tone: strength of an S-curve over the encoded levels that nobody undoes, 0 to 1.
+        bayer: record one colour a pixel and demosaic it bilinearly, as the mean of the colours that comes back.
     """
 
     size: int = 101
@@ -66,6 +72,11 @@ class Simulator:
     srgb: bool = False
     jpeg: int | None = None
     edge_sigma: float = 0.0
+    misfocus: float = 0.0
+    texture: float = 0.0
+    uneven: float = 0.0
+    tone: float = 0.0
+    bayer: bool = False
 
     def pair(self, family: str, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
@@ -74,6 +85,13 @@ class Simulator:
         moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, self.shift), self.size)
         if self.edge_sigma:
             sharp, moved = (blur(p, "gaussian", {"sigma": self.edge_sigma}) for p in (sharp, moved))
+        if self.texture:
+            grain = gaussian_filter(np.random.default_rng(7).normal(size=moved.shape), 2.0)
+            grain = 1 + self.texture * grain / grain.std()
+            moved = moved * grain
+            sharp = sharp * grain[self.size : 2 * self.size, self.size : 2 * self.size]
+        if self.misfocus:
+            sharp = blur(sharp, "gaussian", {"sigma": self.misfocus})
         blurred = blur(moved, family, params)[self.size : 2 * self.size, self.size : 2 * self.size]
         still, defocused = self.level * sharp, self.level * self.exposure * blurred + self.offset
         return self.record(still, rng), self.record(defocused, rng)
@@ -81,12 +99,18 @@ class Simulator:
     def record(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """What the file holds of a picture in linear light, decoded to linear light unless `srgb`."""
         picture = np.maximum(light, 0.0) + self.black
+        picture = picture * (1 + self.uneven * np.linspace(-0.5, 0.5, picture.shape[1]))
         if self.full_well is not None:
             picture = rng.poisson(picture * self.full_well) / self.full_well
         if self.snr_db is not None:
             picture = picture + rng.normal(0.0, 10 ** (-self.snr_db / 20), picture.shape)
+        if self.bayer:
+            picture = demosaiced(picture)
         if self.clip is not None:
             picture = np.minimum(picture, self.clip)
+        if self.tone:
+            encoded = encode_srgb(picture)
+            picture = decode_srgb((1 - self.tone) * encoded + self.tone * encoded**2 * (3 - 2 * encoded))
         if self.jpeg is not None:
             return decode_srgb(_through_jpeg(encode_srgb(picture), self.jpeg))
         if self.srgb:
@@ -95,6 +119,19 @@ class Simulator:
             levels = 2**self.bits - 1
             picture = np.round(np.clip(picture, 0, 1) * levels) / levels
         return picture
+
+
+def demosaiced(mosaic: np.ndarray) -> np.ndarray:
+    """Mean of the three colours of a grey scene seen through a Bayer pattern (RGGB), interpolated bilinearly."""
+    from scipy.ndimage import convolve
+
+    rows, columns = np.indices(mosaic.shape)
+    red, blue = (rows % 2 == 0) & (columns % 2 == 0), (rows % 2 == 1) & (columns % 2 == 1)
+    cross = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
+    square = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
+    green = convolve(np.where(red | blue, 0.0, mosaic), cross, mode="mirror")
+    others = sum(convolve(np.where(colour, mosaic, 0.0), square, mode="mirror") for colour in (red, blue))
+    return (green + others) / 3
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:

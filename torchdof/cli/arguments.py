@@ -1,4 +1,4 @@
-"""Options that several commands take alike: what lens took the image, and what the numbers of its depth map are."""
+"""Options that several commands take alike: the lens, the numbers of a depth map, the blur, and what is printed."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,6 +11,7 @@ __all__ = [
     "LENS",
     "ApertureImage",
     "ApertureRadiusM",
+    "AsJson",
     "Blades",
     "Curvature",
     "DepthChannel",
@@ -21,11 +22,16 @@ __all__ = [
     "FarM",
     "FocalLengthMm",
     "FovDeg",
+    "FillDepth",
+    "MethodName",
     "NearM",
+    "NoOcclusion",
     "RelativeKind",
     "Rotation",
     "SensorWidthMm",
     "Squeeze",
+    "TableName",
+    "ToleranceText",
     "ValueRange",
     "Vignetting",
 ]
@@ -94,3 +100,33 @@ DepthUnknown = Annotated[
 DepthChannel = Annotated[
     str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=DEPTH)
 ]
+FillDepth = Annotated[
+    str | None,
+    typer.Option(
+        metavar="nearest|far|METRES",
+        help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see "
+        "lies behind), or with a distance (inf for a sky).",
+        rich_help_panel=DEPTH,
+    ),
+]
+
+TableName = Annotated[
+    str, typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=BLUR)
+]
+ToleranceText = Annotated[
+    str,
+    typer.Option(
+        help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
+        "exact.",
+        rich_help_panel=BLUR,
+    ),
+]
+NoOcclusion = Annotated[
+    bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=BLUR)
+]
+MethodName = Annotated[
+    Literal["layered", "fold"],
+    typer.Option(help="fold is the literal scatter: exact, slow, for small radii.", rich_help_panel=BLUR),
+]
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print what is printed as JSON, for programs: one object a line.")]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -13,6 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from torchdof import BlurTable
+from torchdof.cli.arguments import AsJson
+from torchdof.cli.printed import json_line
 from torchdof.fit.photo.manifest import Captures, read_captures
 from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.problems import FitError, FitWarning
@@ -27,9 +29,9 @@ def fit(
         Path | None,
         typer.Argument(help="Folder with photographs of a dot and their capture.toml.", show_default=False),
     ] = None,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="The table to write (JSON).", rich_help_panel=_OUT)
-    ] = Path("table.json"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="The table to write (JSON).", rich_help_panel=_OUT)] = Path(
+        "table.json"
+    ),
     family: Annotated[
         Literal["auto", "gaussian", "ring", "disc", "softm", "radial"],
         typer.Option(help="Kernel family; auto takes the cheapest that is accurate enough.", rich_help_panel=_CAPTURE),
@@ -61,6 +63,7 @@ def fit(
     plots: Annotated[
         Path | None, typer.Option(help="Folder for pictures of the fits and the table.", rich_help_panel=_OUT)
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a blur table from photographs of a dot, or from a lens prescription.
 
@@ -73,31 +76,37 @@ def fit(
 
         torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
     """
-    console = Console(soft_wrap=True)
+    console = Console(soft_wrap=True, quiet=as_json)
     if (captures is None) == (lens is None):
         raise FitError("give either a folder of captures or --lens FILE")
     if root is not None and lens is not None:
         raise FitError("--root is the folder of photographs; leave it out with --lens")
-    if output.suffix != ".json":
-        raise FitError(f"the table is written as JSON: name it {output.with_suffix('.json')}", file=str(output))
+    if out.suffix != ".json":
+        raise FitError(f"the table is written as JSON: name it {out.with_suffix('.json')}", file=str(out))
     if plots is not None:
         plots.mkdir(parents=True, exist_ok=True)
     if lens is not None:
         table = _trace(lens, f_number, focus_m, nodes, console)
         _lens_summary(table, console)
-        _write(table, output, console)
+        _write(table, out, console)
+        if as_json:
+            typer.echo(json_line({"out": str(out), "family": table.family, **table.provenance}))
         if plots is not None:
-            _draw_table(table, plots, output.stem, console)
+            _draw_table(table, plots, out.stem, console)
         return
     capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots, root=root)
+    first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
     for i, capture_set in enumerate(capture_sets):
-        target = output if len(capture_sets) == 1 else output.with_name(f"{output.stem}_{i:02d}.json")
+        target = out if len(capture_sets) == 1 else out.with_name(f"{out.stem}_{i:02d}.json")
         if len(capture_sets) > 1:
             console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
-        result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, console)
+        result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
+        first = first or result
         _summary(capture_set, result, messages, console)
         _write(result.table, target, console)
+        if as_json:
+            typer.echo(json_line({"out": str(target), **_facts(capture_set, result, messages)}))
         if plots is not None:
             _draw_fits(capture_set, result, plots, target.stem, console)
             _draw_table(result.table, plots, target.stem, console)
@@ -112,7 +121,7 @@ def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Cons
 
 
 def _fit_with_progress(
-    captures: Captures, family: str, accuracy_db: float, command: str, console: Console
+    captures: Captures, family: str, accuracy_db: float, command: str, scale_of: TableFit | None, console: Console
 ) -> tuple[TableFit, list[str]]:
     """Fits one set of captures behind a progress bar; returns the fit and the warnings, each once."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -125,6 +134,7 @@ def _fit_with_progress(
             accuracy_db=accuracy_db,
             progress=lambda done, total, what: bar.update(job, completed=done, total=total, description=what),
             command=command,
+            scale_of=scale_of,
         )
     # "auto" fits a picture several times; what it says twice is said once
     return result, list(dict.fromkeys(str(w.message) for w in caught))
@@ -137,13 +147,13 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
         title_justify="left",
     )
     names = [n for n in result.fits[0].params if n != "values"]
-    for column in ("distance m", "coc px", *names, "residual %", "x noise", "magnification"):
+    for column in ("distance m", "coc px", "measured", *names, "residual %", "x noise", "magnification"):
         shown.add_column(column, justify="right")
     for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True):
         values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
         ratio = fitted.residual_over_noise
         shown.add_row(
-            f"{pair.distance_m:g}", f"{coc:+.2f}", *values, f"{100 * fitted.residual:.2f}",
+            f"{pair.distance_m:g}", f"{coc:+.2f}", f"{fitted.radius:.2f}", *values, f"{100 * fitted.residual:.2f}",
             "" if math.isnan(ratio) else f"{ratio:.2f}", f"{fitted.magnification:.4f}",
         )  # fmt: skip
     console.print(shown)
@@ -155,6 +165,24 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
     )
     for message in messages:
         console.print(f"warning: {message}", style="yellow", markup=False, highlight=False)
+
+
+def _facts(captures: Captures, result: TableFit, messages: list[str]) -> dict[str, Any]:
+    """What :func:`_summary` prints, for programs."""
+    fits = [
+        {
+            "distance_m": pair.distance_m,
+            "coc_px": coc,
+            "params": fitted.params,
+            "stderr": fitted.stderr,
+            "residual": fitted.residual,
+            "residual_over_noise": fitted.residual_over_noise,
+            "magnification": fitted.magnification,
+        }
+        for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True)
+    ]
+    chosen = {"name": captures.name, "family": result.table.family, "why": result.why, "scale": result.scale}
+    return {**chosen, "focus_m": captures.focus_m, "fits": fits, "warnings": messages}
 
 
 def _lens_summary(table: BlurTable, console: Console) -> None:

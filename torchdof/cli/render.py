@@ -31,6 +31,7 @@ from .arguments import (
     LENS,
     ApertureImage,
     ApertureRadiusM,
+    AsJson,
     Blades,
     Curvature,
     DepthChannel,
@@ -38,22 +39,28 @@ from .arguments import (
     DepthScale,
     DepthUnknown,
     FarM,
+    FillDepth,
     FNumber,
     FocalLengthMm,
     FovDeg,
+    MethodName,
     NearM,
+    NoOcclusion,
     RelativeKind,
     Rotation,
     SensorWidthMm,
     Squeeze,
+    TableName,
+    ToleranceText,
     ValueRange,
     Vignetting,
 )
 from .doubts import Said
 from .frame import Frame, read_frame, render_frame
+from .printed import json_line
 from .settings import RenderSettings, load_aperture, load_table, pick_device
 
-__all__ = ["parse_fill", "parse_point", "parse_range", "render"]
+__all__ = ["parse_attention", "parse_fill", "parse_point", "parse_range", "render"]
 
 _EACH_ITS_OWN = Doubt(
     "range",
@@ -138,15 +145,7 @@ def render(
         ),
     ] = False,
     depth_unknown: DepthUnknown = None,
-    fill_depth: Annotated[
-        str | None,
-        typer.Option(
-            metavar="nearest|far|METRES",
-            help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see "
-            "lies behind), or with a distance (inf for a sky). Without this they are refused.",
-            rich_help_panel=DEPTH,
-        ),
-    ] = None,
+    fill_depth: FillDepth = None,
     depth_channel: DepthChannel = None,
     depth_edges: Annotated[
         Literal["auto", "repair", "as-given"],
@@ -156,35 +155,31 @@ def render(
             rich_help_panel=DEPTH,
         ),
     ] = "auto",
-    table: Annotated[
-        str,
-        typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=BLUR),
-    ] = "disc",
+    table: TableName = "disc",
     blades: Blades = 0,
     rotation: Rotation = 0.0,
     curvature: Curvature = 0.0,
     squeeze: Squeeze = 1.0,
     aperture: ApertureImage = None,
     vignetting: Vignetting = 0.0,
-    tolerance: Annotated[
-        str,
+    tolerance: ToleranceText = "final",
+    attention: Annotated[
+        str | None,
         typer.Option(
-            help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
-            "exact.",
+            metavar="X,Y,RADIUS",
+            help="Where the viewer looks, in pixels from the top left: the tolerance is kept there, and elsewhere a "
+            "draft's is enough.",
             rich_help_panel=BLUR,
         ),
-    ] = "final",
-    no_occlusion: Annotated[
-        bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=BLUR)
-    ] = False,
-    method: Annotated[
-        Literal["layered", "fold"],
-        typer.Option(help="fold is the literal scatter: exact, slow.", rich_help_panel=BLUR),
-    ] = "layered",
+    ] = None,
+    no_occlusion: NoOcclusion = False,
+    method: MethodName = "layered",
     show_focus: Annotated[
         bool,
         typer.Option(
-            "--show-focus", help="Don't blur: tint near orange, in focus green, far blue.", rich_help_panel=BLUR
+            "--show-focus",
+            help="Don't blur: draw the outlines of what is near orange, in focus green, far blue.",
+            rich_help_panel=BLUR,
         ),
     ] = False,
     device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=BLUR)] = "auto",
@@ -220,6 +215,7 @@ def render(
     resume: Annotated[
         bool, typer.Option("--resume", help="Render only the frames that OUT lacks.", rich_help_panel=_FILES)
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Blur IMAGE by its DEPTH as a lens would.
 
@@ -252,7 +248,7 @@ def render(
 
     The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
     that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
-    like a wrong unit is said on standard error; with --strict it is refused.
+    like a wrong unit is said on standard error; with --strict it is refused. --json prints one JSON object a frame.
     """
     settings = RenderSettings(
         focus=None if focus_m is None else parse_focus(focus_m),
@@ -278,6 +274,7 @@ def render(
         depth_edges="as given" if depth_edges == "as-given" else depth_edges,
         table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)),
         tolerance=tolerance_of_text(tolerance),
+        attention=None if attention is None else parse_attention(attention),
         occlusion=not no_occlusion,
         method=method,
         device=pick_device(device),
@@ -289,7 +286,7 @@ def render(
         strict=strict,
     )
     if FramePattern.matches(image):
-        _render_sequence(image, depth, out, settings, frames, resume, steady)
+        _render_sequence(image, depth, out, settings, frames, resume, steady, as_json)
         return
     sequences = FramePattern.is_padded(out) and not FramePattern.is_padded(image) and FramePattern.matches(out)
     if sequences or (depth is not None and FramePattern.matches(depth)) or frames is not None or steady:
@@ -297,12 +294,12 @@ def render(
     if len(settings.focus or []) > 1:
         raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
     if resume and out.exists():
-        typer.echo(f"{out}: is there already")
+        typer.echo(_there([out]) if as_json else f"{out}: is there already")
         return
     with _progress() as progress:
         progress.add_task(f"rendering {out.name}", total=None)
-        line = render_frame(image, depth, out, settings)
-    typer.echo(line)
+        rendered = render_frame(image, depth, out, settings)
+    typer.echo(json_line(rendered.facts()) if as_json else str(rendered))
 
 
 def _render_sequence(
@@ -313,6 +310,7 @@ def _render_sequence(
     frames: str | None,
     resume: bool,
     steady: bool,
+    as_json: bool,
 ) -> None:
     """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
     source, target = FramePattern(image), FramePattern(out)
@@ -337,7 +335,8 @@ def _render_sequence(
             )
     todo = [n for n in numbers if not (resume and target.name(n).is_file())]
     if len(todo) < len(numbers):
-        typer.echo(f"{len(numbers) - len(todo)} of {len(numbers)} frames are there already")
+        there = [target.name(n) for n in numbers if n not in set(todo)]
+        typer.echo(_there(there) if as_json else f"{len(there)} of {len(numbers)} frames are there already")
     said = Said(settings.strict)
     if settings.depth_kind == "relative" and settings.value_range is None and len(numbers) > 1:
         said.say(depth or image, [_EACH_ITS_OWN])
@@ -347,8 +346,8 @@ def _render_sequence(
         for n in todo:
             depth_n = depths.name(n) if depths else depth
             read = steadied(n) if steadied else None
-            line = render_frame(source.name(n), depth_n, target.name(n), settings, n, said, read)
-            typer.echo(line)
+            rendered = render_frame(source.name(n), depth_n, target.name(n), settings, n, said, read)
+            typer.echo(json_line(rendered.facts()) if as_json else str(rendered))
             progress.advance(task)
 
 
@@ -375,6 +374,11 @@ def _steadied(
     return steadied
 
 
+def _there(files: Sequence[Path]) -> str:
+    """What ``--json`` prints of files that ``--resume`` leaves as they are, a line each."""
+    return "\n".join(json_line({"out": str(file), "is_there_already": True}) for file in files)
+
+
 @contextlib.contextmanager
 def _progress() -> Iterator[Progress]:
     """A bar on standard error, where that is a terminal."""
@@ -396,6 +400,19 @@ def parse_point(text: str) -> tuple[float, float]:
     except ValueError:
         raise ValueError(f"--focus-at expects a pixel X,Y such as 320,200, got {text!r}") from None
     return x, y
+
+
+def parse_attention(text: str) -> tuple[float, float, float]:
+    """Reads a circle ``X,Y,RADIUS``.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    try:
+        x, y, radius = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--attention expects X,Y,RADIUS in pixels such as 320,200,80, got {text!r}") from None
+    return x, y, radius
 
 
 def parse_range(text: str, option: str, example: str) -> tuple[float, float]:

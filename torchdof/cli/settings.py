@@ -22,6 +22,7 @@ from ..io.transfer import Transfer
 from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
+from ..optics.table_file import shipped
 from ..options import Method
 from ..validation import number, show
 
@@ -38,6 +39,7 @@ _OPTIONS = {
     "tilt_deg": "--tilt",
     "swing_deg": "--swing",
 }
+_IDEAL = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 
 
@@ -71,6 +73,7 @@ class RenderSettings:
         depth_edges: What is done to depth edges, as in :class:`torchdof.DepthOfField`.
         table: Blur table.
         tolerance: Accepted RMS error, as in :class:`torchdof.DepthOfField`.
+        attention: Where the viewer looks, (x, y, radius) in pixels.
         occlusion: False for the paper's single pass without occlusion.
         method: "layered" or "fold".
         device: Where to compute.
@@ -108,6 +111,7 @@ class RenderSettings:
     depth_edges: DepthEdges = "auto"
     table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
     tolerance: float = 1 / 255
+    attention: tuple[float, float, float] | None = None
     occlusion: bool = True
     method: Method = "layered"
     device: torch.device = torch.device("cpu")
@@ -241,13 +245,15 @@ def load_table(name: str, aperture: Aperture | None = None) -> BlurTable:
     With an aperture, it takes the place of the table's own.
 
     Raises:
-        ValueError: If there is no such table or it is not valid.
+        ValueError: If it is not valid.
+        FileNotFoundError: If there is no such table; the message lists those there are.
         OSError: If the file cannot be read.
     """
-    if name in ("disc", "gaussian"):
-        table = BlurTable.disc() if name == "disc" else BlurTable.gaussian()
-    else:
-        table = BlurTable.load(name)
+    try:
+        table = _IDEAL[name]() if isinstance(name, str) and name in _IDEAL else BlurTable.load(name)
+    except FileNotFoundError:
+        names = ", ".join([*_IDEAL, *shipped()])
+        raise FileNotFoundError(f"no blur table {show(name)}: neither a file nor one of {names}") from None
     return table if aperture is None else table.with_aperture(aperture)
 
 

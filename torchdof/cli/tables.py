@@ -1,7 +1,7 @@
 """``torchdof tables``: which blur tables there are, and pictures of their kernels."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as functional
@@ -11,7 +11,8 @@ from torch import Tensor
 from ..io.sheet import write_sheet
 from ..optics import table_file
 from ..optics.blur_table import BlurTable
-from .arguments import ApertureImage, Blades, Curvature, Rotation, Squeeze
+from .arguments import ApertureImage, AsJson, Blades, Curvature, Rotation, Squeeze
+from .printed import json_line
 from .settings import load_aperture, load_table
 
 __all__ = ["tables"]
@@ -36,6 +37,7 @@ def tables(
     curvature: Curvature = 0.0,
     squeeze: Squeeze = 1.0,
     aperture: ApertureImage = None,
+    as_json: AsJson = False,
 ) -> None:
     """List blur tables, and draw their kernels.
 
@@ -50,27 +52,43 @@ def tables(
     panels = {}
     for name in names or ["disc", "gaussian", *table_file.shipped()]:
         table = load_table(name, opening)
-        typer.echo(_line(name, table))
+        facts = _facts(name, table)
+        typer.echo(json_line(facts) if as_json else _line(facts))
         if out is not None:
             panels[Path(name).stem] = _column(table)
-    if out is not None:
-        write_sheet(out, panels, caption=34)
+    if out is None:
+        return
+    write_sheet(out, panels, caption=34)
+    if not as_json:
         radii = ", ".join(f"{coc:g}" for coc in _COC_PX)
         typer.echo(f"{out}: blur radii from top to bottom {radii} px in an image of {_WIDTH} px")
 
 
-def _line(name: str, table: BlurTable) -> str:
-    """What there is to say of a table in one line."""
-    parts = [f"{table.family}, {len(table.coc)} node{'s' if len(table.coc) > 1 else ''}"]
-    if table.unit != "relative":
-        unit = "mm" if table.unit == "mm" else "of the width"
-        parts.append(f"coc {float(table.coc.min()):.3g} to {float(table.coc.max()):.3g} {unit}")
-    if table.channels > 1:
-        parts.append(f"{table.channels} colours")
-    if table.aperture is not None:
-        parts.append(repr(table.aperture))
-    source = str(table.provenance.get("source", "")).partition(";")[0]
-    return f"{name:24s} {'; '.join(parts)}" + (f" ({source})" if source else "")
+def _facts(name: str, table: BlurTable) -> dict[str, Any]:
+    """What there is to say of a table."""
+    return {
+        "table": name,
+        "family": table.family,
+        "nodes": len(table.coc),
+        "coc": [float(table.coc.min()), float(table.coc.max())],
+        "unit": table.unit,
+        "colours": table.channels,
+        "aperture": None if table.aperture is None else repr(table.aperture),
+        "source": str(table.provenance.get("source", "")).partition(";")[0],
+    }
+
+
+def _line(facts: dict[str, Any]) -> str:
+    """The same in one line."""
+    parts = [f"{facts['family']}, {facts['nodes']} node{'s' if facts['nodes'] > 1 else ''}"]
+    if facts["unit"] != "relative":
+        low, high = facts["coc"]
+        parts.append(f"coc {low:.3g} to {high:.3g} {'mm' if facts['unit'] == 'mm' else 'of the width'}")
+    if facts["colours"] > 1:
+        parts.append(f"{facts['colours']} colours")
+    if facts["aperture"]:
+        parts.append(facts["aperture"])
+    return f"{facts['table']:24s} {'; '.join(parts)}" + (f" ({facts['source']})" if facts["source"] else "")
 
 
 def _column(table: BlurTable) -> Tensor:

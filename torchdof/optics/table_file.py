@@ -34,12 +34,15 @@ def find(source: str | os.PathLike[str]) -> Path:
         path = _SHIPPED / f"{path}.json"
     if not path.is_file():
         names = ", ".join(shipped())
-        raise FileNotFoundError(f"no blur table {str(source)!r}: neither a file nor one of the shipped ({names})")
+        raise FileNotFoundError(
+            f"no blur table {str(source)!r}: neither a file nor one of the shipped ({names}); "
+            "ideal lenses are BlurTable.disc() and BlurTable.gaussian()"
+        )
     return path
 
 
 def shipped() -> list[str]:
-    """Names of the tables that come with the package."""
+    """Names of the tables that come with torchdof, sorted."""
     return sorted(path.stem for path in _SHIPPED.glob("*.json"))
 
 

@@ -17,7 +17,7 @@ from . import compiled, composite, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
 from .matting import matte
-from .plan import Blur, Plan
+from .plan import Blur, Plan, tolerance_within
 from .scatter import fold
 from .surfaces import Frame, Surface, framed, surfaces_of_image
 
@@ -59,7 +59,8 @@ def blur(
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
         plan = Plan.all(max_coc_px, tolerance)
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
-        plan = Plan.still(torch.cat(maps[1::2]), options.tolerance)
+        coc = torch.cat(maps[1::2])
+        plan = Plan.still(coc, tolerance_within(coc, options.tolerance))
     elif plan is not None and not is_traced():
         plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
@@ -67,7 +68,9 @@ def blur(
     # each item has its own layers, as it would have alone
     items = []
     for item in zip(*(t.split(1) for t in maps), strict=True):
-        items.append(_render_item(Plan.of_scene(torch.cat(item[1::2]), options.tolerance), options, *item))
+        coc = torch.cat(item[1::2])
+        own_plan = Plan.of_scene(coc, tolerance_within(coc, options.tolerance))
+        items.append(_render_item(own_plan, options, *item))
     return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
 
 
@@ -110,7 +113,8 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
     moves = torch.is_grad_enabled() and coc.requires_grad
-    plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), options.tolerance)
+    tolerance = tolerance_within(coc.flatten(0, 1), options.tolerance)
+    plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), tolerance)
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
     return (_render_item(plan, options, light, coc, cover=cover) / scale).to(rgba.dtype)
@@ -150,7 +154,8 @@ def _render_item(
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
     coc = coc.clamp(low, high)
     scale = headroom.factor(light, behind_light)
-    if not headroom.has_room(scale):
+    has_room = headroom.has_room(scale)
+    if not has_room:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
     # what is a highlight; without occlusion it matters only where a light is too bright for a coarse layer
@@ -182,7 +187,7 @@ def _render_item(
         splats = highlights.splat(rays, shown, options.table, options.occlusion) if rays else None
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
-    out = out if headroom.has_room(scale) else out / scale
+    out = out if has_room else out / scale
     return out if valid is None else torch.where(valid, out, image)
 
 

@@ -17,10 +17,11 @@ from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
 from .vignetting import CatsEye
 
-__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
+__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "tolerance_within"]
 
 KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
+_SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
 _kernels = KernelCache(256 * 2**20)
 
 
@@ -119,10 +120,10 @@ class Plan:
         ends = layer_cocs.ends(coc_px.detach())
         if not self.rays or (self.nodes[0] <= ends[0] and ends[1] <= self.nodes[-1]):
             return self
-        nodes = list(self.nodes)
+        nodes, scene = list(self.nodes), Plan.of_scene(coc_px, self.tolerance)
         for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
             gap = 0.3 * layer_cocs.spacing(last, self.tolerance)
-            beyond = [sign * x for x in Plan.of_scene(coc_px, self.tolerance).nodes if sign * x > last]
+            beyond = [sign * x for x in scene.nodes if sign * x > last]
             nodes += [sign * x for x in beyond if x > last + gap or x == max(beyond)]
         return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)
 
@@ -196,6 +197,16 @@ class Plan:
         # rounded: whether a coc is in float32 or float64 does not decide
         reach = round(abs(coc_px) * math.sqrt(self.tolerance * 255.0), 4)
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
+
+
+def tolerance_within(coc_px: Tensor, tolerance: float) -> float:
+    """What to plan a frame ``[B, 1, H, W]`` for, that its error be at most a tolerance.
+
+    Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere.
+    """
+    low, high = (from_blur_axis(end) for end in layer_cocs.ends(coc_px.detach()))
+    widest = max(-low, high, 1.0)
+    return tolerance * min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * widest))
 
 
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:
