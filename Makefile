@@ -1,5 +1,7 @@
 # make demo       render a real photograph focused near, middle and far; pictures go to out/
 # make test       run the tests, two at a time
+# make docs       build the site of the documentation into build/site/, links checked
+# make pictures   render the pictures of the documentation anew into docs/pictures/
 # make sweep      run the hard tests at full length: whole frames instead of strips, up to twenty times as many examples
 # make wheel      build the wheel for this machine into dist/ and try it, and installation, without a compiler
 # make sanitize   run the compiled engine's tests under AddressSanitizer and ThreadSanitizer; needs GCC
@@ -12,18 +14,29 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+FOR_DEMO := $(VENV)/.installed-for-demo
 
 # For what is installed, and for what builds it.
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 
-.PHONY: demo test sweep install check wheel sanitize fuzz soak clean
+.PHONY: demo test docs pictures sweep install check wheel sanitize fuzz soak clean
 
-demo: $(INSTALLED)
+demo: $(FOR_DEMO)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+docs: $(INSTALLED)
+	rm -rf build/package
+	mkdir -p build/package
+	cp -r torchdof build/package/
+	cp -r fit export build/package/torchdof/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir build/site
+
+pictures: $(INSTALLED)
+	$(BIN)/python examples/gallery.py --out docs/pictures
 
 sweep: $(INSTALLED)
 	HYPOTHESIS_PROFILE=many $(BIN)/python -m pytest -n 2 --dist worksteal -m "hard or sweep"
@@ -53,10 +66,18 @@ fuzz: $(INSTALLED)
 soak: $(INSTALLED)
 	$(BIN)/python tests/hard/soak.py --renderings 1000
 
-$(INSTALLED): pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
-	@echo "installing into $(VENV); the first time this takes a minute or two"
+INSTALLS_FROM := pyproject.toml constraints.txt CMakeLists.txt $(wildcard torchdof/native/src/*) build/modules
+
+$(INSTALLED): $(INSTALLS_FROM)
+	@echo "installing into $(VENV) all that development needs; the first time this takes minutes"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --editable '.[dev]'
+	touch $(FOR_DEMO) $@
+
+$(FOR_DEMO): $(INSTALLS_FROM)
+	@echo "installing into $(VENV); the first time this takes a minute"
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --editable .
 	touch $@
 
 # An editable installation knows where each module lies: after one has moved it must be made again.

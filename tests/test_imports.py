@@ -16,6 +16,7 @@ FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "ex
 # Room -> what it may import, from the lowest floor up.
 FLOORS = {
     "validation": set(),
+    "batch": {"validation"},
     "pixels": set(),
     "native": set(),
     "io": {"validation"},
@@ -24,9 +25,11 @@ FLOORS = {
     "options": {"validation", "optics", "depth"},
     "render": {"validation", "pixels", "native", "optics", "options"},
     "reference": {"validation", "io", "optics", "render"},
-    "module": {"validation", "optics", "depth", "options", "render"},
+    "module": {"validation", "batch", "optics", "depth", "options", "render"},
     "fit": {"validation", "io", "optics"},
     "export": {"validation", "io", "optics", "options", "render", "module"},
+    "augmentation": {"validation", "io", "optics", "options", "module"},
+    "distributed": {"validation", "io", "optics", "depth", "options", "augmentation"},
     "bench": {"validation", "io", "optics", "depth", "options", "render", "reference", "module", "export"},
     "cli": {
         *("validation", "native", "io", "optics", "depth", "options", "reference", "module", "fit", "export", "bench"),

@@ -528,7 +528,7 @@ def test_modules_with_other_cameras_compile_one_after_the_other() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"image": torch.rand(3, 4, 5)}, r"image must be \[B, C, H, W\].*got \[3, 4, 5\]; did you forget the batch"),
+        ({"image": torch.rand(3, 4, 5)}, r"depth must be \[1, H, W\] beside an image \[C, H, W\], got \[1, 1, 4, 5\]"),
         (
             {"image": torch.zeros(1, 3, 4, 5, dtype=torch.uint8)},
             "image must be floating point.*torch.uint8; decode",

@@ -2,13 +2,14 @@
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Unpack
 
 import torch
 from torch import Tensor, nn
 
 from . import validation
+from .batch import flattened, leading_axes, numbers, restored
 from .depth.edges import repair
 from .depth.size import at_size_of
 from .optics.blur_table import BlurTable
@@ -16,9 +17,11 @@ from .optics.camera import CAMERA_NUMBERS, Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import pipeline
 from .render.attention import Attention
-from .render.plan import Plan
+from .render.plan import Plan, tolerance_within
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
+
+Number = float | Sequence[float] | Tensor
 
 _EDGE_PX = 1.0  # difference in coc from which on the edge between two surfaces is worth repair
 
@@ -67,8 +70,8 @@ class DepthOfField(nn.Module):
         self,
         image: Tensor,
         depth: Tensor,
-        focus_m: float | Tensor | None = None,
-        f_number: float | Tensor | None = None,
+        focus_m: Number | None = None,
+        f_number: Number | None = None,
         plan: Plan | None = None,
         background: Tensor | None = None,
         background_depth: Tensor | None = None,
@@ -76,13 +79,17 @@ class DepthOfField(nn.Module):
     ) -> Tensor:
         """Render.
 
+        One image ``[C, H, W]`` and clips ``[B, T, C, H, W]`` are taken as well; all maps then have the image's rank,
+        such as a depth of ``[1, H, W]`` or ``[B, T, 1, H, W]``.
+
         Args:
             image: ``[B, C, H, W]``, linear light, floating point.
             depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres along the optical axis, > 0, ``inf`` allowed. A map of
                 another size with the same aspect ratio is resampled, guided by the image
                 (:func:`torchdof.depth.at_size_of`); a compiled or exported graph takes the image's size only.
-            focus_m: Focus distance in metres for this call, float or ``[B]``; None takes the camera's.
-            f_number: F-number for this call, float or ``[B]``; None takes the camera's.
+            focus_m: Focus distance in metres for this call: a number, or one for each image as a list, ``[B]`` or
+                ``[B, 1]`` (of clips ``[B]`` or ``[B, T]``); None takes the camera's.
+            f_number: F-number for this call, in the same forms; None takes the camera's.
             plan: Layers to render with, from :meth:`plan`; None plans for this image. Where the image is blurred more
                 than the plan reaches, layers are added; compiled code takes a plan as it is.
             background: What is seen where the nearer surfaces of the image are taken away, ``[B, C, H, W]``, where it
@@ -93,20 +100,25 @@ class DepthOfField(nn.Module):
                 the tolerance is kept; elsewhere a draft's is enough.
 
         Returns:
-            ``[B, C, H, W]`` in the image's dtype. Differentiable with respect to image, depth, focus and f-number.
+            The image's shape and dtype. Differentiable with respect to image, depth, focus and f-number.
             While gradients with respect to the circle of confusion are recorded, the layers stand still (they do not
             follow the scene), so that the picture is a continuous, piecewise linear function of it.
 
         Raises:
-            ValueError: If shapes, types or values are not as described.
+            ValueError: If shapes, types or values are not as described, or a tensor comes from ``torch.vmap``.
         """
-        options = self.options
-        coc = self._coc_px(image, depth, focus_m, f_number, "depth")
+        options, axes = self.options, leading_axes(image)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
+        image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
+        background = flattened(axes, "background", background, "C")
+        background_depth = flattened(axes, "background_depth", background_depth)
+        coc = self._coc_px(image, depth, *lens, "depth")
         validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
-            behind = self._coc_px(background, background_depth, focus_m, f_number, "background_depth")
-        return _blur(image, coc, options, plan, background, behind, attention)
+            behind = self._coc_px(background, background_depth, *lens, "background_depth")
+        attention = flattened(axes, "attention", attention)
+        return restored(axes, _blur(image, coc, options, plan, background, behind, attention))
 
     def layers(
         self,
@@ -139,25 +151,31 @@ class DepthOfField(nn.Module):
         options = self.options
         depth = validation.stack(rgba, depth_m, options.check)
         batch, count, _, height, width = rgba.shape
-        maps = depth.expand(batch, -1, 1, height, width).transpose(1, 2).flatten(2, 3)  # [B, 1, N * H, W]
+        maps = depth.expand(batch, -1, 1, height, width)
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
-        coc = self._coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number, "depth_m")
-        return _rendered(pipeline.blur_stack, rgba, coc.unflatten(2, (count, height)).transpose(1, 2), options)
+        frame = rgba.new_empty(batch, 1, height, width)
+        cocs = [self._coc_px(frame, layer, focus_m, f_number, "depth_m") for layer in maps.unbind(1)]
+        return _rendered(pipeline.blur_stack, rgba, torch.stack(cocs, 1), options)
 
     def coc_px(
         self,
         image: Tensor,
         depth: Tensor,
-        focus_m: float | Tensor | None = None,
-        f_number: float | Tensor | None = None,
+        focus_m: Number | None = None,
+        f_number: Number | None = None,
     ) -> Tensor:
         """Signed circle of confusion of the call :meth:`forward` with the same arguments: ``[B, 1, H, W]``, pixels.
+
+        Of one image it is ``[1, H, W]``, of clips ``[B, T, 1, H, W]``.
 
         Raises:
             ValueError: As :meth:`forward`; so does a lens that blurs beyond what numbers hold.
         """
-        return _with_edges(image, self._coc_px(image, depth, focus_m, f_number, "depth"), self.options)
+        axes = leading_axes(image)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
+        image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
+        return restored(axes, _with_edges(image, self._coc_px(image, depth, *lens, "depth"), self.options))
 
     def _coc_px(
         self,
@@ -186,8 +204,8 @@ class DepthOfField(nn.Module):
         self,
         image: Tensor,
         depth: Tensor,
-        focus_m: float | Tensor | None = None,
-        f_number: float | Tensor | None = None,
+        focus_m: Number | None = None,
+        f_number: Number | None = None,
     ) -> Plan:
         """The layers this scene needs; one plan can serve a whole shot. Arguments as in :meth:`forward`.
 
@@ -204,8 +222,8 @@ class DepthOfField(nn.Module):
               coc px  radius    at  pixels
             ...
         """
-        coc = self.coc_px(image, depth, focus_m, f_number)
-        return Plan.of_scene(coc, self.options.tolerance).of_pixels(coc)
+        coc = flattened(leading_axes(image), "coc_px", self.coc_px(image, depth, focus_m, f_number))
+        return Plan.of_scene(coc, tolerance_within(coc, self.options.tolerance)).of_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""
@@ -235,8 +253,8 @@ def depth_of_field(
     camera: Camera,
     *,
     table: BlurTable | None = None,
-    focus_m: float | Tensor | None = None,
-    f_number: float | Tensor | None = None,
+    focus_m: Number | None = None,
+    f_number: Number | None = None,
     plan: Plan | None = None,
     attention: Attention | None = None,
     **options: Unpack[OptionArguments],
@@ -244,21 +262,22 @@ def depth_of_field(
     """Functional form of :class:`DepthOfField`.
 
     Args:
-        image: ``[B, C, H, W]``, linear light.
-        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres.
+        image: ``[B, C, H, W]``, linear light; also ``[C, H, W]`` or ``[B, T, C, H, W]``.
+        depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; of the image's rank.
         camera: The camera.
         table: Blur measured from a lens; None takes the ideal disc.
-        focus_m: Overrides the camera's focus distance, float or ``[B]``.
-        f_number: Overrides the camera's f-number, float or ``[B]``.
+        focus_m: Overrides the camera's focus distance: a number, or one for each image, as in
+            :meth:`DepthOfField.forward`.
+        f_number: Overrides the camera's f-number, in the same forms.
         plan: Layers to render with; None plans for this image.
         attention: Where the viewer looks, as in :meth:`DepthOfField.forward`.
         **options: As in :class:`torchdof.options.Options`.
 
     Returns:
-        ``[B, C, H, W]`` in the image's dtype.
+        The image's shape and dtype.
 
     Raises:
-        ValueError: If an argument is not as described.
+        ValueError: If an argument is not as described, or a tensor comes from ``torch.vmap``.
 
     Example:
         >>> image, depth = torch.rand(1, 3, 8, 12), torch.full((1, 1, 8, 12), 3.0)
@@ -283,7 +302,7 @@ def blur_by_coc(
     """Depth of field for pipelines that hold a map of the circle of confusion already.
 
     Args:
-        image: ``[B, C, H, W]``, linear light.
+        image: ``[B, C, H, W]``, linear light; also ``[C, H, W]`` or ``[B, T, C, H, W]``, all maps then of that rank.
         coc_px: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, signed radius in pixels: negative in front of the focus plane,
             NaN where it is unknown and ``check=False``.
         table: Blur measured from a lens; None takes the ideal disc.
@@ -294,17 +313,27 @@ def blur_by_coc(
         **options: As in :class:`torchdof.options.Options`.
 
     Returns:
-        ``[B, C, H, W]`` in the image's dtype.
+        The image's shape and dtype.
 
     Raises:
-        ValueError: If an argument is not as described.
+        ValueError: If an argument is not as described, or a tensor comes from ``torch.vmap``.
 
     Example:
         >>> image = torch.rand(1, 3, 8, 12)
         >>> blur_by_coc(image, torch.linspace(-2, 2, 12).expand(1, 1, 8, 12)).shape
         torch.Size([1, 3, 8, 12])
     """
-    return _blur(image, coc_px, Options.of(table, **options), plan, background, background_coc_px, attention)
+    axes = leading_axes(image)
+    rendered = _blur(
+        flattened(axes, "image", image, "C"),
+        flattened(axes, "coc_px", coc_px),
+        Options.of(table, **options),
+        plan,
+        flattened(axes, "background", background, "C"),
+        flattened(axes, "background_coc_px", background_coc_px),
+        flattened(axes, "attention", attention),
+    )
+    return restored(axes, rendered)
 
 
 def _blur(
@@ -326,7 +355,7 @@ def _blur(
     hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
     if hidden is not None and not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
-    _check_attention(attention, plan)
+    _check_attention(attention, plan, options)
     coc_px = _with_edges(image, coc_px, options)
     return _rendered(pipeline.blur_attended, image, coc_px, plan, options, hidden, attention)
 
@@ -372,11 +401,14 @@ def _check_plan(plan: Plan | None) -> None:
         )
 
 
-def _check_attention(attention: Attention | None, plan: Plan | None) -> None:
+def _check_attention(attention: Attention | None, plan: Plan | None, options: Options) -> None:
     """Refuse attention where it cannot be paid: beside a plan, which holds one tolerance, and where code is traced."""
     if attention is None:
         return
     if plan is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
+    aperture = options.table.aperture
+    if aperture is not None and aperture.depends_on_place:
+        raise ValueError("attention renders a part of the frame by itself; take a table without vignetting")
     if validation.is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")

@@ -10,7 +10,6 @@ from torch import Tensor
 __all__ = [
     "WHOLE_NUMBERS",
     "background",
-    "both_or_none",
     "coc_of_lens",
     "depth_edges",
     "finite_background",
@@ -203,17 +202,6 @@ def image_and_coc(image: Tensor, coc_px: Tensor, channels: int, values: bool) ->
         _finite("image", image)
 
 
-def both_or_none(background: Tensor | None, where: Tensor | None) -> None:
-    """Refuse a background without its place, or a place without its background.
-
-    Raises:
-        ValueError: Saying which is missing.
-    """
-    if (background is None) != (where is None):
-        missing = "background" if background is None else "background_depth (or background_coc_px)"
-        raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
-
-
 def background(image: Tensor, hidden: Tensor | None, name: str, where: Tensor | None, unit: str) -> None:
     """Refuse a background that does not belong to an image.
 
@@ -227,9 +215,11 @@ def background(image: Tensor, hidden: Tensor | None, name: str, where: Tensor | 
     Raises:
         ValueError: If one of both is missing, or shapes or types are wrong.
     """
-    both_or_none(hidden, where)
-    if hidden is None or where is None:
+    if hidden is None and where is None:
         return
+    if hidden is None or where is None:
+        missing = "background" if hidden is None else "background_depth (or background_coc_px)"
+        raise ValueError(f"a background needs its depth, and a depth its background: {missing} is missing")
     if not isinstance(hidden, Tensor) or (hidden.shape, hidden.dtype, hidden.device) != (
         image.shape,
         image.dtype,

@@ -1,5 +1,6 @@
 """`torchdof export` as a user runs it."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,12 @@ def run(*arguments: object) -> Any:
 def test_a_file_is_written_and_its_verification_printed(tmp_path: Path) -> None:
     path = tmp_path / "dof.onnx"
     options = ("--table", "sato_j15", "--max-coc", 1.5, "--tolerance", 0.2, "--no-occlusion", "--inputs", "coc_px")
-    result = run("-o", path, *options, "--channels", 1)
+    result = run("-o", path, *options, "--channels", 1, "--json")
     assert result.exit_code == 0, result.output
-    assert "sato_j15 (ring)" in result.output and "verified" in result.output and "bad depths" in result.output
+    printed = json.loads(result.stdout)
+    assert printed["out"] == str(path) and "sato_j15 (ring)" in printed["title"]
+    assert "bad depths" in {case["name"] for case in printed["cases"]}
+    assert max(case["max_error"] for case in printed["cases"]) < 1e-5
     facts = describe(path)
     assert facts["options"]["max_coc_px"] == 1.5 and not facts["options"]["occlusion"]
     assert list(facts["inputs"]) == ["image", "coc_px"] and "[B, 1, H, W]" in facts["inputs"]["image"]
@@ -31,6 +35,10 @@ def test_show_prints_units_camera_table_and_options(plain: Any) -> None:
     assert result.exit_code == 0, result.output
     for part in ("metres along the optical axis", "focal_length_mm: ", "family: disc", "max_coc_px: 2.5", "opset: 20"):
         assert part in result.output
+
+
+def test_json_holds_what_a_file_says_about_itself(plain: Any) -> None:
+    assert json.loads(run("--show", plain.path, "--json").stdout) == json.loads(json.dumps(describe(plain.path)))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """`torchdof fit` as a user runs it."""
 
+import json
 from pathlib import Path
 from types import ModuleType
 
@@ -17,7 +18,7 @@ def kernel(distance: float) -> tuple[str, dict[str, float]]:
 @pytest.fixture(scope="module")
 def folder(simulator: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
-    fields = 'focal_length_mm = 50.0\nf_number = 4.0\nsensor_width_mm = 36.0\nname = "my lens"'
+    fields = 'focal_length_mm = 50.0\nf_number = 1.543\nsensor_width_mm = 36.0\nname = "my lens"'
     return simulator.write_captures(
         tmp_path_factory.mktemp("lens"), camera, 0.5, [0.4, 0.8, 1.0], kernel, camera_fields=fields
     )
@@ -39,9 +40,21 @@ def test_a_folder_becomes_a_table_with_pictures(folder: Path, tmp_path: Path) ->
     ]  # fmt: skip
 
 
-def test_a_lens_becomes_a_table(tmp_path: Path) -> None:
-    result = run("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
+def test_json_holds_the_fits(folder: Path, tmp_path: Path) -> None:
+    result = run(folder, "-o", tmp_path / "mine.json", "--family", "disc", "--json")
     assert result.exit_code == 0, result.output
+    facts = json.loads(result.stdout)
+    assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
+    assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
+    assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"]) and isinstance(facts["warnings"], list)
+
+
+def test_a_lens_becomes_a_table(tmp_path: Path) -> None:
+    arguments = ("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    facts = json.loads(run(*arguments, "--json").stdout)
+    assert facts["out"] == str(tmp_path / "lens.json") and facts["f_number"] == 4.0 and facts["family"] == "radial"
     assert BlurTable.load(tmp_path / "lens.json").unit == "mm"
     told = " ".join(result.output.split())
     assert "50.3582 mm, f/4, focus 2.0 m; 5 distances from" in told and "family: radial, residual" in told

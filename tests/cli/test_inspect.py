@@ -1,5 +1,6 @@
 """``torchdof inspect`` from the outside."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,16 @@ def test_it_prints_ranges_blur_focus_holes_and_edges_and_writes_a_picture(scene:
     assert err == ""
     sheet = read_image("photo.inspect.png").pixels
     assert sheet.shape[-1] > 3 * WIDTH and sheet.shape[-2] > HEIGHT
+
+
+def test_json_says_for_programs_what_is_printed(scene: Path) -> None:
+    out, _ = run("photo.png", "depth.npy", "--focus-m", "2", "--f-number", "1.4", "--sensor-width-mm", "4", "--json")
+    facts = json.loads(out)
+    assert facts["camera"]["focus_m"] == 2.0 and facts["picture"] == "photo.inspect.png"
+    assert facts["depth_m"] == {"nearest": 2.0, "1 %": 2.0, "median": 4.0, "99 %": 6.0, "farthest": 6.0}
+    assert facts["holes_px"] == 0 and facts["in_focus"] == 0.5 and facts["coc_px"][0] == 0.0
+    assert facts["depth_edges"] == {"exact": 24, "ramp": 0, "beside": 0, "unclear": 0}
+    assert sum(part["share"] for part in facts["histogram"]) == pytest.approx(1.0)
 
 
 def test_without_a_focus_it_is_at_the_median_and_that_is_said(scene: Path) -> None:

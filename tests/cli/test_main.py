@@ -45,3 +45,18 @@ def test_command_whose_package_is_missing_says_which_extra_brings_it(
     result = CliRunner().invoke(app, ["fit"])
     assert result.exit_code == 2
     assert "this command needs scipy; install it with: pip install 'torchdof[fit]'" in result.stderr
+
+
+def test_an_option_means_the_same_in_all_commands() -> None:
+    commands = {name: main._imported(name) for name in main._MODULES if main._source(name)}
+    meanings: dict[str, dict[str, str]] = {}  # option -> parameter -> a command that has it
+    spellings: dict[str, dict[str, str]] = {}  # parameter -> options -> a command that has it
+    for command, parsed in commands.items():
+        for parameter in parsed.params:
+            if parameter.opts[0].startswith("-"):
+                spellings.setdefault(parameter.name, {})[" ".join(sorted(parameter.opts))] = command
+                for option in parameter.opts:
+                    meanings.setdefault(option, {})[parameter.name] = command
+    assert {option: means for option, means in meanings.items() if len(means) > 1} == {}
+    assert {parameter: options for parameter, options in spellings.items() if len(options) > 1} == {}
+    assert all("--json" in {option for p in parsed.params for option in p.opts} for parsed in commands.values())

@@ -250,8 +250,9 @@ def test_a_missing_channel_is_named_with_those_that_are_there(tmp_path: Path, mi
 # What is killed while it writes
 
 WRITING = """
-import sys, time
+import signal, sys, time
 from torchdof.io.atomic import whole_file
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and stays so
 with whole_file(sys.argv[1]) as part:
     part.write_bytes(b"half")
     print("writing", flush=True)

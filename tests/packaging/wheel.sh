@@ -13,7 +13,7 @@ rm -rf dist
 
 echo "building the source distribution and, from it, the wheel"
 "$python" -m venv "$work/build"
-"$work/build/bin/pip" install --quiet scikit-build-core
+"$work/build/bin/pip" install --quiet scikit-build-core setuptools-scm
 "$work/build/bin/python" -c 'from scikit_build_core.build import build_sdist; build_sdist("dist")' >"$work/log" ||
     { cat "$work/log"; exit 1; }
 "$python" -m pip wheel --quiet --no-deps --wheel-dir dist dist/*.tar.gz

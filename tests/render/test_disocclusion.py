@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
-from torchdof.render.disocclusion import behind_pixels
+from torchdof.render.disocclusion import HIDDEN_WEIGHT, behind_pixels
 from torchdof.render.highlights import threshold
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Surface, framed, surfaces_of_image
@@ -40,6 +40,15 @@ def test_what_is_hidden_is_what_is_seen_around_as_far_as_the_blur_reaches() -> N
     assert torch.allclose(other[0, :, 24, 20:31], BLUE[:, None].expand(3, 11), atol=1e-5)
     assert float(other_coc[0, 0, 24, 20:31].abs().max()) < 1e-5
     assert torch.allclose(behind[0, :, 24, 20:28], BLUE[:, None].expand(3, 8), atol=1e-5)
+
+
+@pytest.mark.parametrize(("near_px", "share"), [(-0.5, 0.0), (-0.507, 0.49), (-0.5225, 1.0), (-3.0, 1.0)])
+def test_what_is_hidden_fades_in_with_the_blur_that_reaches_it(near_px: float, share: float) -> None:
+    """From half a pixel on the finest level is looked at; a sample counts in full from a hundredth of a vote on."""
+    image, coc = edge(1.0, near_px=near_px, far_px=2.0)
+    _, (_, _, weight), _ = surfaces(image, coc, levels=5)
+    assert weight is not None
+    assert float(weight[0, 0, 24, 31]) == pytest.approx(share * HIDDEN_WEIGHT, rel=0.02, abs=1e-6)
 
 
 def test_a_highlight_beside_what_is_hidden_is_not_hidden_there_too() -> None:

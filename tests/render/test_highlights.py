@@ -119,6 +119,16 @@ def test_what_is_extracted_and_what_is_left_sum_to_the_light() -> None:
     assert float(left.light.max()) <= highlights.FACTOR * 0.05 * 1.001
 
 
+@pytest.mark.parametrize(("coc_px", "share"), [(0.9, 0.0), (1.25, 0.25), (-1.75, 0.75), (2.5, 1.0)])
+def test_rays_begin_with_a_blur_of_one_pixel_and_take_all_from_two_on(coc_px: float, share: float) -> None:
+    image = torch.full((1, 1, 40, 40), 0.1)
+    image[..., 20, 20] = 100.0
+    limit = highlights.threshold(image)
+    _, rays = highlights.extract(Surface(image, torch.full_like(image, coc_px)), limit)
+    extracted = 0.0 if rays is None else float(rays.light.sum())
+    assert extracted == pytest.approx(share * (100.0 - float(limit[..., 20, 20])), rel=1e-5)
+
+
 def test_where_a_surface_is_not_it_has_no_rays() -> None:
     image, coc, _ = street()
     surface = Surface(image, coc, torch.zeros_like(coc))

@@ -53,3 +53,20 @@ def test_places_at_the_border_are_those_of_many_pixels() -> None:
 def test_finest_distances_count_there_and_back(x: float) -> None:
     steps = float(layer_cocs._in_finest(torch.tensor(x).double()))
     assert layer_cocs._from_finest(steps) == pytest.approx(x)
+
+
+@pytest.mark.parametrize(
+    ("x", "times", "expected"),
+    [
+        (0.0, 1.0, 0.5),
+        (0.0, 4.0, 0.758),
+        (0.0, 6.0, 0.758),
+        (0.0, 64.0, 2.0),
+        (19.0, 0.0, 0.5),
+        (40.0, 0.0, 1.0),
+        (40.0, 1.0, 4.014),
+    ],
+)
+def test_layers_lie_as_far_apart_as_measured(x: float, times: float, expected: float) -> None:
+    """Near focus and far from it, at tolerances of so many times 1/255: the numbers behind speed and error."""
+    assert layer_cocs.spacing(x, times / 255) == pytest.approx(expected, abs=1e-3)

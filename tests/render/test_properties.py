@@ -11,6 +11,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable, blur_by_coc
+from torchdof.reference import metrics
 from torchdof.render.highlights import threshold
 
 TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")]
@@ -186,3 +187,16 @@ def test_a_turned_scene_is_the_turned_picture(
             # what is hardly known of a layer is multiplied by up to 1000, and with it float32's rounding
             most = 1e-4 if dtype == torch.float64 else 4e-4
             assert float(difference.abs().max()) < most * max(1.0, float(scene.image.max())), f"scene {seed}"
+
+
+@pytest.mark.parametrize("size", [16, 40, 56])
+def test_the_tolerance_holds_where_blurs_are_as_large_as_the_frame(size: int) -> None:
+    for seed in range(6):
+        generator = torch.Generator().manual_seed(seed)
+        image = 0.05 + 0.9 * torch.rand(1, 3, size, size, generator=generator)
+        coc_px = functional.interpolate(torch.rand(1, 1, 4, 4, generator=generator), size=(size, size), mode="bicubic")
+        coc_px = (2.0 * coc_px - 1.0) * 20.0
+        coc_px[..., size // 3 : 2 * size // 3, size // 3 : 2 * size // 3] = -20.0
+        exact, fast = (blur_by_coc(image, coc_px, tolerance=tolerance) for tolerance in (0, 1 / 255))
+        error = metrics.display(fast) - metrics.display(exact)
+        assert 255 * float(error.square().mean().sqrt()) < 1.0

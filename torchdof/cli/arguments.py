@@ -1,13 +1,19 @@
-"""Options that several commands take alike: what lens took the image, and what the numbers of its depth map are."""
+"""Options that several commands take alike: the lens, the numbers of a depth map, the blur, and what is printed."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 __all__ = [
+    "BLUR",
     "DEPTH",
     "LENS",
+    "ApertureImage",
     "ApertureRadiusM",
+    "AsJson",
+    "Blades",
+    "Curvature",
     "DepthChannel",
     "DepthOffset",
     "DepthScale",
@@ -16,13 +22,21 @@ __all__ = [
     "FarM",
     "FocalLengthMm",
     "FovDeg",
+    "FillDepth",
+    "MethodName",
     "NearM",
+    "NoOcclusion",
     "RelativeKind",
+    "Rotation",
     "SensorWidthMm",
+    "Squeeze",
+    "TableName",
+    "ToleranceText",
     "ValueRange",
+    "Vignetting",
 ]
 
-LENS, DEPTH = "Focus and lens", "Depth map"
+LENS, DEPTH, BLUR = "Focus and lens", "Depth map", "Blur"
 """Panels of the help that these options stand in."""
 
 FNumber = Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=LENS)]
@@ -36,6 +50,23 @@ FovDeg = Annotated[
 ]
 ApertureRadiusM = Annotated[
     float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=LENS)
+]
+
+Blades = Annotated[int, typer.Option(help="Aperture blades, from 3; 0 is a round lens.", rich_help_panel=BLUR)]
+Rotation = Annotated[
+    float,
+    typer.Option(help="Degrees by which blades or image are turned, counter-clockwise.", rich_help_panel=BLUR),
+]
+Curvature = Annotated[float, typer.Option(help="Of the blades: 0 straight, 1 a circle.", rich_help_panel=BLUR)]
+Squeeze = Annotated[
+    float, typer.Option(help="Height of the blur over its width; 2 for an anamorphic lens.", rich_help_panel=BLUR)
+]
+Vignetting = Annotated[
+    float, typer.Option(help="Cat's eyes towards the corners: 0 none, 1 closed.", rich_help_panel=BLUR)
+]
+ApertureImage = Annotated[
+    Path | None,
+    typer.Option(metavar="IMAGE", help="Picture of the opening, bright where light passes.", rich_help_panel=BLUR),
 ]
 
 DepthScale = Annotated[float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=DEPTH)]
@@ -69,3 +100,33 @@ DepthUnknown = Annotated[
 DepthChannel = Annotated[
     str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=DEPTH)
 ]
+FillDepth = Annotated[
+    str | None,
+    typer.Option(
+        metavar="nearest|far|METRES",
+        help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see "
+        "lies behind), or with a distance (inf for a sky).",
+        rich_help_panel=DEPTH,
+    ),
+]
+
+TableName = Annotated[
+    str, typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=BLUR)
+]
+ToleranceText = Annotated[
+    str,
+    typer.Option(
+        help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
+        "exact.",
+        rich_help_panel=BLUR,
+    ),
+]
+NoOcclusion = Annotated[
+    bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=BLUR)
+]
+MethodName = Annotated[
+    Literal["layered", "fold"],
+    typer.Option(help="fold is the literal scatter: exact, slow, for small radii.", rich_help_panel=BLUR),
+]
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print what is printed as JSON, for programs: one object a line.")]

@@ -18,6 +18,19 @@ from ..bench.report import existing_folder
 from ..depth.holes import resolve_holes
 from ..depth.kinds import depth_from_values
 from ..io.images import read_image, read_values
+from .arguments import (
+    DEPTH,
+    LENS,
+    AsJson,
+    DepthOffset,
+    DepthScale,
+    FillDepth,
+    FNumber,
+    FocalLengthMm,
+    SensorWidthMm,
+)
+from .printed import json_line
+from .render import parse_fill
 from .settings import RenderSettings
 
 __all__ = ["bench", "from_files"]
@@ -39,23 +52,18 @@ def bench(
     ] = None,
     repeat: Annotated[int, typer.Option(help="Timed renderings of each setting.", min=1)] = 5,
     focus_m: Annotated[
-        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=_SPEED)
+        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=LENS)
     ] = None,
-    f_number: Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=_SPEED)] = None,
-    focal_length_mm: Annotated[float | None, typer.Option(help="Focal length.", rich_help_panel=_SPEED)] = None,
-    sensor_width_mm: Annotated[float | None, typer.Option(help="36 for full frame.", rich_help_panel=_SPEED)] = None,
+    f_number: FNumber = None,
+    focal_length_mm: FocalLengthMm = None,
+    sensor_width_mm: SensorWidthMm = None,
     depth_kind: Annotated[
         Literal["z", "disparity", "inverse", "coc"],
-        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=_SPEED),
+        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=DEPTH),
     ] = "z",
-    depth_scale: Annotated[
-        float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=_SPEED)
-    ] = None,
-    depth_offset: Annotated[float, typer.Option(help="Added to each value first.", rich_help_panel=_SPEED)] = 0.0,
-    fill_depth: Annotated[
-        Literal["nearest", "far"] | None,
-        typer.Option(help="Fill pixels without depth; else they are refused.", rich_help_panel=_SPEED),
-    ] = None,
+    depth_scale: DepthScale = None,
+    depth_offset: DepthOffset = 0.0,
+    fill_depth: FillDepth = None,
     onnx: Annotated[
         bool,
         typer.Option(
@@ -101,6 +109,7 @@ def bench(
             rich_help_panel=_ACCURACY,
         ),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
@@ -126,6 +135,8 @@ def bench(
             raise ValueError(
                 "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
             )
+        if as_json:
+            raise ValueError("--truth writes its numbers as CSV to the folder --out; leave --json out")
         if out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
         if not degrade and peer:
@@ -147,7 +158,7 @@ def bench(
         depth_kind=depth_kind,
         depth_scale=depth_scale,
         depth_offset=depth_offset,
-        fill=fill_depth,
+        fill=None if fill_depth is None else parse_fill(fill_depth),
     )
     if image is None and how != RenderSettings(table=how.table):
         raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
@@ -167,11 +178,16 @@ def bench(
     if compiled:
         runtimes.append("compiled")
     rows, unit = speed.measure_all(scene, repeat, console, runtimes)
-    speed.show(rows, scene, unit)
     scan_costs = scaling.measure_scans(scene, repeat, unit, console) if scan else []
     scans = [scaling.table_of(scan_costs)] if scan_costs else []
-    for table in scans:
-        table.show()
+    if as_json:
+        facts = {"scene": scene.name, "remark": scene.remark, "unit_s": unit}
+        costs = {"settings": [dataclasses.asdict(row) for row in rows]}
+        typer.echo(json_line({**facts, **costs, "scans": [dataclasses.asdict(cost) for cost in scan_costs]}))
+    else:
+        speed.show(rows, scene, unit)
+        for table in scans:
+            table.show()
     if out is not None:
         speed.write(out, rows, scene, unit, repeat, scans)
 

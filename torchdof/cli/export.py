@@ -1,7 +1,8 @@
 """``torchdof export``: a module to a verified ONNX file, and what such a file says about itself."""
 
+import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,6 +11,17 @@ import typer
 from rich.console import Console
 
 from torchdof import Camera, DepthOfField
+from torchdof.cli.arguments import (
+    BLUR,
+    LENS,
+    AsJson,
+    FovDeg,
+    MethodName,
+    NoOcclusion,
+    TableName,
+    ToleranceText,
+)
+from torchdof.cli.printed import json_line
 from torchdof.cli.settings import load_table
 from torchdof.export.conversion import OPSET, to_onnx
 from torchdof.export.metadata import describe, shown
@@ -17,42 +29,24 @@ from torchdof.options import tolerance_of_text
 
 __all__ = ["export"]
 
-_LENS, _BLUR, _GRAPH = "Lens", "Blur", "Graph"
+_GRAPH = "Graph"
 
 
 def export(
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="The file to write.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The file to write.")] = None,
     show: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write nothing; print what this file says about itself.")
     ] = None,
-    focal_length_mm: Annotated[float, typer.Option(help="Real focal length.", rich_help_panel=_LENS)] = 50.0,
-    sensor_width_mm: Annotated[float, typer.Option(help="36 for full frame.", rich_help_panel=_LENS)] = 36.0,
-    fov_deg: Annotated[
-        float | None,
-        typer.Option(help="Horizontal field of view of a rendered image, instead of a lens.", rich_help_panel=_LENS),
-    ] = None,
-    table: Annotated[
-        str,
-        typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=_BLUR),
-    ] = "disc",
+    focal_length_mm: Annotated[float, typer.Option(help="Real focal length.", rich_help_panel=LENS)] = 50.0,
+    sensor_width_mm: Annotated[float, typer.Option(help="36 for full frame.", rich_help_panel=LENS)] = 36.0,
+    fov_deg: FovDeg = None,
+    table: TableName = "disc",
     max_coc: Annotated[
-        float, typer.Option(help="Largest radius in pixels that the file holds.", rich_help_panel=_BLUR)
+        float, typer.Option(help="Largest radius in pixels that the file holds.", rich_help_panel=BLUR)
     ] = 32.0,
-    tolerance: Annotated[
-        str,
-        typer.Option(
-            help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
-            "exact.",
-            rich_help_panel=_BLUR,
-        ),
-    ] = "final",
-    no_occlusion: Annotated[
-        bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=_BLUR)
-    ] = False,
-    method: Annotated[
-        Literal["layered", "fold"],
-        typer.Option(help="fold is the literal scatter: exact, slow, for small radii.", rich_help_panel=_BLUR),
-    ] = "layered",
+    tolerance: ToleranceText = "final",
+    no_occlusion: NoOcclusion = False,
+    method: MethodName = "layered",
     inputs: Annotated[
         Literal["depth", "coc_px"],
         typer.Option(
@@ -70,6 +64,7 @@ def export(
         ),
     ] = None,
     opset: Annotated[int, typer.Option(help="ONNX operator set.", rich_help_panel=_GRAPH)] = OPSET,
+    as_json: AsJson = False,
 ) -> None:
     """Write depth of field as one ONNX file, for pipelines without PyTorch.
 
@@ -85,16 +80,16 @@ def export(
 
         torchdof export --show dof.onnx
     """
-    if (output is None) == (show is None):
+    if (out is None) == (show is None):
         raise ValueError("give either -o FILE to write or --show FILE to read")
     if show is not None:
-        for line in _lines(show):
-            print(line)
+        facts = describe(show)
+        print(json_line(facts) if as_json else "\n".join(_lines(facts)))
         return
-    if output is None:
+    if out is None:
         return
-    if output.suffix != ".onnx":
-        raise ValueError(f"the file is ONNX: name it {output.with_suffix('.onnx')}")
+    if out.suffix != ".onnx":
+        raise ValueError(f"the file is ONNX: name it {out.with_suffix('.onnx')}")
     if fov_deg is None:
         camera = Camera(focal_length_mm=focal_length_mm, sensor_width_mm=sensor_width_mm)
     else:
@@ -109,15 +104,14 @@ def export(
         check=False,
     )
     with Console(stderr=True).status(f"tracing and verifying with {torch.get_num_threads()} threads"):
-        report = to_onnx(dof, output, inputs=inputs, channels=channels, width=width, opset=opset)
-    print(report)
-    print(f"wrote {output}")
+        report = to_onnx(dof, out, inputs=inputs, channels=channels, width=width, opset=opset)
+    print(json_line({"out": str(out), **dataclasses.asdict(report)}) if as_json else f"{report}\nwrote {out}")
 
 
-def _lines(path: Path) -> Sequence[str]:
+def _lines(facts: Mapping[str, Any]) -> Sequence[str]:
     """A file's metadata, a line each."""
     lines = []
-    for name, value in describe(path).items():
+    for name, value in facts.items():
         if isinstance(value, dict):
             lines.append(f"{shown(name)}:")
             lines += [f"  {shown(k)}: {_told(v)}" for k, v in value.items()]

@@ -4,8 +4,10 @@ import dataclasses
 import math
 import os
 import time
+from typing import Any
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from ..depth.holes import resolve_holes
@@ -16,15 +18,20 @@ from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
-from ..optics.blur_table import BlurTable
+from ..optics.camera import Camera
 from ..options import Options
 from ..validation import coc_of_lens, image_and_map, same_aspect
 from .doubts import Said
 from .settings import RenderSettings
 
-__all__ = ["Frame", "read_frame", "read_metres", "render_frame", "tint_focus"]
+__all__ = ["Frame", "Rendered", "read_frame", "read_metres", "render_frame", "tint_focus"]
 
 _NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
+_FAINT, _CLEAR = (
+    0.2,
+    0.6,
+)  # change of light from pixel to pixel, of the brighter one, that begins and that is an outline
+_DARKEST = 0.05  # of the mean light: what is darker has no outlines of its own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +47,77 @@ class Frame:
     picture: Picture
     values: Tensor
     holes: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Rendered:
+    """What was done to a frame, with what, and how long it took; ``str`` says it in one line.
+
+    Args:
+        out: The file that was written.
+        settings: What the user said.
+        camera: The camera; None where the depth map was the circle of confusion itself.
+        largest_coc_px: Largest radius of the blur in pixels.
+        size: Width and height in pixels.
+        holes: How many pixels of depth were filled.
+        seconds: From reading to writing.
+        remarks: What was not stated: the focus from the file, the lens from the file or assumed.
+    """
+
+    out: str
+    settings: RenderSettings
+    camera: Camera | None
+    largest_coc_px: float
+    size: tuple[int, int]
+    holes: int
+    seconds: float
+    remarks: tuple[str, ...]
+
+    @property
+    def table(self) -> str:
+        """Name of the blur table, or its family where it has none."""
+        return self.settings.table.name or self.settings.table.family
+
+    def __str__(self) -> str:
+        settings, parts = self.settings, []
+        if self.camera is not None:
+            ends = self.camera.focus_range_m or (self.camera.focus_m,)
+            parts.append(
+                f"focus {' to '.join(f'{end:.4g}' for end in ends)} m, f/{self.camera.f_number:.3g}, "
+                f"{self.camera.focal_length_mm:.4g} mm on {self.camera.sensor_width_mm:.4g} mm"
+            )
+            angles = {"tilt": self.camera.tilt_deg, "swing": self.camera.swing_deg}
+            parts += [f"{name} {angle:.4g} degrees" for name, angle in angles.items() if angle != 0.0]
+        parts.append(f"blur radius up to {self.largest_coc_px:.1f} px")
+        if settings.show_focus:
+            parts.append("focus shown: near orange, sharp green, far blue")
+        else:
+            parts.append(f"{self.table}, {settings.method}")
+            if settings.table.aperture is not None:
+                parts.append(repr(settings.table.aperture).removeprefix("Aperture(").removesuffix(")"))
+            parts += [] if settings.occlusion else ["no occlusion"]
+        if self.holes:
+            parts.append(f"{self.holes} px of depth filled ({settings.fill})")
+        parts += [f"{self.size[0]} x {self.size[1]}", f"{self.seconds:.2f} s on {settings.device}"]
+        return f"{self.out}: " + "; ".join(parts) + (f" [{', '.join(self.remarks)}]" if self.remarks else "")
+
+    def facts(self) -> dict[str, Any]:
+        """The same for programs, as JSON-like data."""
+        settings, names = self.settings, ("focus_m", "f_number", "focal_length_mm", "sensor_width_mm")
+        camera = None if self.camera is None else {name: float(getattr(self.camera, name)) for name in names}
+        if self.camera is not None and camera is not None:
+            ends = self.camera.focus_range_m
+            camera |= {"focus_range_m": None if ends is None else [float(end) for end in ends]}
+            camera |= {"tilt_deg": float(self.camera.tilt_deg), "swing_deg": float(self.camera.swing_deg)}
+        facts: dict[str, Any] = {"out": self.out, "camera": camera, "assumed": self.remarks}
+        facts |= {"largest_coc_px": self.largest_coc_px, "width": self.size[0], "height": self.size[1]}
+        facts |= {"filled_px": self.holes, "show_focus": settings.show_focus}
+        if not settings.show_focus:
+            aperture = settings.table.aperture
+            facts |= {"table": self.table, "aperture": None if aperture is None else aperture.to_dict()}
+            facts |= {"method": settings.method, "occlusion": settings.occlusion}
+            facts |= {"tolerance": settings.tolerance, "attention": settings.attention}
+        return facts | {"seconds": self.seconds, "device": str(settings.device)}
 
 
 def read_frame(image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, settings: RenderSettings) -> Frame:
@@ -67,7 +145,7 @@ def render_frame(
     frame: int = 0,
     said: Said | None = None,
     source: Frame | None = None,
-) -> str:
+) -> Rendered:
     """Reads an image and its depth, blurs, and writes the result whole or not at all.
 
     Args:
@@ -80,7 +158,7 @@ def render_frame(
         source: What is in ``image`` and ``depth`` where it was read already.
 
     Returns:
-        One line that says what was done, with what, and how long it took.
+        What was done, with what, and how long it took.
 
     Raises:
         ValueError: If input is wrong or missing, or looks like a mistake and the settings are strict.
@@ -94,10 +172,10 @@ def render_frame(
     picture, holes = source.picture, source.holes
     height, width = picture.pixels.shape[-2:]
     values = source.values.to(settings.device)
-    parts: list[str] = []
+    camera: Camera | None = None
     remarks: list[str] = []
     if settings.depth_kind == "coc":
-        camera, coc_px = None, values
+        coc_px = values
         said.say(depth or image, coc_doubts(coc_px))
     else:
         camera, remarks = settings.camera(picture.metadata, width, frame)
@@ -106,41 +184,33 @@ def render_frame(
         coc_px = camera.coc_px(values, width)
         coc_of_lens(coc_px, values, settings.stated(camera))
         said.say(depth or image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
-        parts.append(
-            f"focus {camera.focus_m:.4g} m, f/{camera.f_number:.3g}, {camera.focal_length_mm:.4g} mm on "
-            f"{camera.sensor_width_mm:.4g} mm"
-        )
-    parts.append(f"blur radius up to {float(coc_px.abs().max()):.1f} px")
     pixels = picture.pixels.to(settings.device)
     if settings.show_focus:
         pixels = tint_focus(pixels, coc_px, picture.has_alpha)
-        parts.append("focus shown: near orange, sharp green, far blue")
         picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
     else:
         table = settings.table
         if picture.has_alpha and table.channels > 1:  # alpha is blurred as green is
             params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
-            table = BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
+            table = table.replace(params=params)
         options = Options(
             table, settings.tolerance, settings.occlusion, method=settings.method, depth_edges=settings.depth_edges
         ).arguments()
         with torch.no_grad():
             if camera is None:
-                pixels = blur_by_coc(pixels, coc_px, **options)
+                pixels = blur_by_coc(pixels, coc_px, attention=settings.attention, **options)
             else:
-                pixels = depth_of_field(pixels, values, camera, **options)
-        parts.append(f"{settings.table.name or settings.table.family}, {settings.method}")
-        if not settings.occlusion:
-            parts.append("no occlusion")
+                pixels = depth_of_field(pixels, values, camera, attention=settings.attention, **options)
     write_image(out, dataclasses.replace(picture, pixels=pixels), settings.out_transfer, settings.sample)
-    if holes:
-        parts.append(f"{holes} px of depth filled ({settings.fill})")
-    parts += [f"{width} x {height}", f"{time.perf_counter() - start:.2f} s on {settings.device}"]
-    return f"{out}: " + "; ".join(parts) + (f" [{', '.join(remarks)}]" if remarks else "")
+    largest, seconds = float(coc_px.abs().max()), time.perf_counter() - start
+    return Rendered(str(out), settings, camera, largest, (width, height), holes, seconds, tuple(remarks))
 
 
 def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor:
-    """The image with what is in focus (blur radius of at most 1 px) green, nearer orange and farther blue.
+    """The image with outlines in colour: green in focus (radius of at most 1 px), orange nearer, blue farther.
+
+    Everything else keeps its colours. Outlines are where the image's light changes by more than a third from pixel to
+    pixel, and where one of the three zones meets another.
 
     Args:
         image: ``[B, C, H, W]`` in linear light, C of 1 or 3, one more with alpha (premultiplied).
@@ -154,20 +224,34 @@ def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor
         ValueError: If shapes or types are not as described.
 
     Example:
-        >>> tinted = tint_focus(torch.ones(1, 1, 1, 3), torch.tensor([[[[-3.0, 0.2, 5.0]]]]))
-        >>> tinted[0, :, 0].argmax(dim=0)  # red, green and blue are strongest
+        >>> coc_px = torch.tensor([-3.0, -3.0, 0.2, 5.0, 5.0])[None, None, None]
+        >>> tinted = tint_focus(torch.ones(1, 3, 1, 5), coc_px)
+        >>> tinted[0, :, 0, 1:4].argmax(dim=0)  # red, green and blue are strongest where zones meet
         tensor([0, 1, 2])
+        >>> tinted[0, :, 0, 0]
+        tensor([1., 1., 1.])
     """
     image_and_map(image, "coc_px", coc_px, "in pixels")
     if image.shape[1] - has_alpha not in (1, 3):
         raise ValueError(f"image must have 1 or 3 channels of colour, got {image.shape[1] - has_alpha}")
     colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
-    grey = colour.mean(dim=1, keepdim=True)
     tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
     zone = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
     tint = tints[zone[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
-    tinted = 0.35 * colour + 0.65 * grey * tint / tint.mean(dim=1, keepdim=True)
+    grey = colour.mean(dim=1, keepdim=True)
+    brightest, darkest = _largest_around(grey), -_largest_around(-grey)
+    zones = zone.to(image.dtype)
+    meets_another = _largest_around(zones) + _largest_around(-zones) > 0
+    contrast = (brightest - darkest) / brightest.clamp(min=_DARKEST * grey.mean().clamp(min=1e-12))
+    outline = torch.where(meets_another, 1.0, ((contrast - _FAINT) / (_CLEAR - _FAINT)).clamp(0.0, 1.0))
+    shown = tint / tint.amax(dim=1, keepdim=True) * brightest.clamp(min=grey.mean())
+    tinted = torch.lerp(colour.expand_as(shown), shown, outline.expand_as(shown))
     return torch.cat([tinted, alpha], dim=1)
+
+
+def _largest_around(values: Tensor) -> Tensor:
+    """Largest of a pixel and its eight neighbours, ``[B, 1, H, W]``."""
+    return functional.max_pool2d(values, 3, stride=1, padding=1)
 
 
 def read_metres(

@@ -11,15 +11,18 @@ from ..depth.inspect import inspect_depth, panels
 from ..depth.sanity import depth_doubts
 from ..io.images import read_image
 from ..io.sheet import write_sheet
+from ..optics.camera import CAMERA_NUMBERS
 from .arguments import (
     DEPTH,
     LENS,
     ApertureRadiusM,
+    AsJson,
     DepthChannel,
     DepthOffset,
     DepthScale,
     DepthUnknown,
     FarM,
+    FillDepth,
     FNumber,
     FocalLengthMm,
     FovDeg,
@@ -30,6 +33,7 @@ from .arguments import (
 )
 from .doubts import Said
 from .frame import read_metres
+from .printed import json_line
 from .render import parse_fill, parse_point, parse_range
 from .settings import RenderSettings
 
@@ -67,17 +71,13 @@ def inspect(
     relative_kind: RelativeKind = None,
     value_range: ValueRange = None,
     depth_unknown: DepthUnknown = None,
-    fill_depth: Annotated[
-        str | None,
-        typer.Option(
-            metavar="nearest|far|METRES", help="Look at the map with its holes filled.", rich_help_panel=DEPTH
-        ),
-    ] = None,
+    fill_depth: FillDepth = None,
     depth_channel: DepthChannel = None,
     strict: Annotated[
         bool,
         typer.Option("--strict", help="End with an error where something looks like a mistake.", rich_help_panel=DEPTH),
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Tell what a depth map holds and what a camera makes of it, before anything is rendered.
 
@@ -104,7 +104,7 @@ def inspect(
         near_m=near_m,
         far_m=far_m,
         relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range),
+        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
         fill=None if fill_depth is None else parse_fill(fill_depth),
         strict=strict,
     )
@@ -129,12 +129,18 @@ def inspect(
         camera = camera.focus_at(metres, *settings.focus_at)
     light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
     report = inspect_depth(light, metres, camera)
-    typer.echo(f"image         {width} x {picture.pixels.shape[-2]} px, {', '.join(picture.channels)}")
     notes = [*notes, *remarks]
-    typer.echo(f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""))
-    typer.echo(str(report))
-    if filled:
-        typer.echo(f"filled        {filled} holes ({100 * filled / metres.numel():.1f} %), {settings.fill}")
     write_sheet(target, panels(light, report))
-    typer.echo(f"picture       {target}")
+    if as_json:
+        numbers = {name: float(getattr(camera, name)) for name in CAMERA_NUMBERS}
+        facts = {"image": str(image), "width": width, "height": picture.pixels.shape[-2], "camera": numbers}
+        facts |= {"assumed": notes, **report.facts(), "filled_px": filled, "picture": str(target)}
+        typer.echo(json_line(facts))
+    else:
+        typer.echo(f"image         {width} x {picture.pixels.shape[-2]} px, {', '.join(picture.channels)}")
+        typer.echo(f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""))
+        typer.echo(str(report))
+        if filled:
+            typer.echo(f"filled        {filled} holes ({100 * filled / metres.numel():.1f} %), {settings.fill}")
+        typer.echo(f"picture       {target}")
     Said(strict).say(depth or image, depth_doubts(metres, camera, depth_kind, depth_scale))

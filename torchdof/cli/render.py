@@ -26,34 +26,48 @@ from ..depth.steady import SteadyFrames
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
 from .arguments import (
+    BLUR,
     DEPTH,
     LENS,
+    ApertureImage,
     ApertureRadiusM,
+    AsJson,
+    Blades,
+    Curvature,
     DepthChannel,
     DepthOffset,
     DepthScale,
     DepthUnknown,
     FarM,
+    FillDepth,
     FNumber,
     FocalLengthMm,
     FovDeg,
+    MethodName,
     NearM,
+    NoOcclusion,
     RelativeKind,
+    Rotation,
     SensorWidthMm,
+    Squeeze,
+    TableName,
+    ToleranceText,
     ValueRange,
+    Vignetting,
 )
 from .doubts import Said
 from .frame import Frame, read_frame, render_frame
-from .settings import RenderSettings, load_table, pick_device
+from .printed import json_line
+from .settings import RenderSettings, load_aperture, load_table, pick_device
 
-__all__ = ["parse_fill", "parse_point", "parse_range", "render"]
+__all__ = ["parse_attention", "parse_fill", "parse_point", "parse_range", "render"]
 
 _EACH_ITS_OWN = Doubt(
     "range",
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH",
 )
-_BLUR, _FILES = "Blur", "Files and frames"
+_FILES = "Files and frames"
 
 
 def render(
@@ -84,6 +98,25 @@ def render(
             rich_help_panel=LENS,
         ),
     ] = None,
+    focus_range: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NEAR,FAR",
+            help="In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
+            rich_help_panel=LENS,
+        ),
+    ] = None,
+    tilt: Annotated[
+        float,
+        typer.Option(
+            help="Degrees by which the lens is tilted down: focus comes nearer towards the bottom.",
+            rich_help_panel=LENS,
+        ),
+    ] = 0.0,
+    swing: Annotated[
+        float,
+        typer.Option(help="Degrees to the right: focus comes nearer towards the right.", rich_help_panel=LENS),
+    ] = 0.0,
     f_number: FNumber = None,
     focal_length_mm: FocalLengthMm = None,
     sensor_width_mm: SensorWidthMm = None,
@@ -112,15 +145,7 @@ def render(
         ),
     ] = False,
     depth_unknown: DepthUnknown = None,
-    fill_depth: Annotated[
-        str | None,
-        typer.Option(
-            metavar="nearest|far|METRES",
-            help="Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see "
-            "lies behind), or with a distance (inf for a sky). Without this they are refused.",
-            rich_help_panel=DEPTH,
-        ),
-    ] = None,
+    fill_depth: FillDepth = None,
     depth_channel: DepthChannel = None,
     depth_edges: Annotated[
         Literal["auto", "repair", "as-given"],
@@ -130,32 +155,34 @@ def render(
             rich_help_panel=DEPTH,
         ),
     ] = "auto",
-    table: Annotated[
-        str,
-        typer.Option(help="disc, gaussian, a shipped table such as sato_j15, or a JSON file.", rich_help_panel=_BLUR),
-    ] = "disc",
-    tolerance: Annotated[
-        str,
+    table: TableName = "disc",
+    blades: Blades = 0,
+    rotation: Rotation = 0.0,
+    curvature: Curvature = 0.0,
+    squeeze: Squeeze = 1.0,
+    aperture: ApertureImage = None,
+    vignetting: Vignetting = 0.0,
+    tolerance: ToleranceText = "final",
+    attention: Annotated[
+        str | None,
         typer.Option(
-            help="Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is "
-            "exact.",
-            rich_help_panel=_BLUR,
+            metavar="X,Y,RADIUS",
+            help="Where the viewer looks, in pixels from the top left: the tolerance is kept there, and elsewhere a "
+            "draft's is enough.",
+            rich_help_panel=BLUR,
         ),
-    ] = "final",
-    no_occlusion: Annotated[
-        bool, typer.Option("--no-occlusion", help="One pass that ignores what hides what.", rich_help_panel=_BLUR)
-    ] = False,
-    method: Annotated[
-        Literal["layered", "fold"],
-        typer.Option(help="fold is the literal scatter: exact, slow.", rich_help_panel=_BLUR),
-    ] = "layered",
+    ] = None,
+    no_occlusion: NoOcclusion = False,
+    method: MethodName = "layered",
     show_focus: Annotated[
         bool,
         typer.Option(
-            "--show-focus", help="Don't blur: tint near orange, in focus green, far blue.", rich_help_panel=_BLUR
+            "--show-focus",
+            help="Don't blur: draw the outlines of what is near orange, in focus green, far blue.",
+            rich_help_panel=BLUR,
         ),
     ] = False,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=_BLUR)] = "auto",
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=BLUR)] = "auto",
     transfer: Annotated[
         Literal["linear", "srgb"] | None,
         typer.Option(help="How IMAGE is encoded. Default: integers srgb, floats linear.", rich_help_panel=_FILES),
@@ -188,6 +215,7 @@ def render(
     resume: Annotated[
         bool, typer.Option("--resume", help="Render only the frames that OUT lacks.", rich_help_panel=_FILES)
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Blur IMAGE by its DEPTH as a lens would.
 
@@ -206,6 +234,10 @@ def render(
     --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
     rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
 
+    Seven blades on an anamorphic lens, all from 1.5 to 2.2 m in focus:
+
+        torchdof render shot.exr -o out.exr --focus-range 1.5,2.2 --blades 7 --rotation 15 --squeeze 2
+
     A stereo disparity map with holes (scale: baseline in metres * focal length in pixels):
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
@@ -216,11 +248,14 @@ def render(
 
     The lens is what you state, else what the file's EXIF data state, else 50 mm at f/2.8 on a sensor of 36 mm; the line
     that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
-    like a wrong unit is said on standard error; with --strict it is refused.
+    like a wrong unit is said on standard error; with --strict it is refused. --json prints one JSON object a frame.
     """
     settings = RenderSettings(
         focus=None if focus_m is None else parse_focus(focus_m),
         focus_at=None if focus_at is None else parse_point(focus_at),
+        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
+        tilt_deg=tilt,
+        swing_deg=swing,
         f_number=f_number,
         focal_length_mm=focal_length_mm,
         sensor_width_mm=sensor_width_mm,
@@ -234,11 +269,12 @@ def render(
         near_m=near_m,
         far_m=far_m,
         relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range),
+        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
         fill=None if fill_depth is None else parse_fill(fill_depth),
         depth_edges="as given" if depth_edges == "as-given" else depth_edges,
-        table=load_table(table),
+        table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)),
         tolerance=tolerance_of_text(tolerance),
+        attention=None if attention is None else parse_attention(attention),
         occlusion=not no_occlusion,
         method=method,
         device=pick_device(device),
@@ -250,7 +286,7 @@ def render(
         strict=strict,
     )
     if FramePattern.matches(image):
-        _render_sequence(image, depth, out, settings, frames, resume, steady)
+        _render_sequence(image, depth, out, settings, frames, resume, steady, as_json)
         return
     sequences = FramePattern.is_padded(out) and not FramePattern.is_padded(image) and FramePattern.matches(out)
     if sequences or (depth is not None and FramePattern.matches(depth)) or frames is not None or steady:
@@ -258,12 +294,12 @@ def render(
     if len(settings.focus or []) > 1:
         raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
     if resume and out.exists():
-        typer.echo(f"{out}: is there already")
+        typer.echo(_there([out]) if as_json else f"{out}: is there already")
         return
     with _progress() as progress:
         progress.add_task(f"rendering {out.name}", total=None)
-        line = render_frame(image, depth, out, settings)
-    typer.echo(line)
+        rendered = render_frame(image, depth, out, settings)
+    typer.echo(json_line(rendered.facts()) if as_json else str(rendered))
 
 
 def _render_sequence(
@@ -274,6 +310,7 @@ def _render_sequence(
     frames: str | None,
     resume: bool,
     steady: bool,
+    as_json: bool,
 ) -> None:
     """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
     source, target = FramePattern(image), FramePattern(out)
@@ -298,7 +335,8 @@ def _render_sequence(
             )
     todo = [n for n in numbers if not (resume and target.name(n).is_file())]
     if len(todo) < len(numbers):
-        typer.echo(f"{len(numbers) - len(todo)} of {len(numbers)} frames are there already")
+        there = [target.name(n) for n in numbers if n not in set(todo)]
+        typer.echo(_there(there) if as_json else f"{len(there)} of {len(numbers)} frames are there already")
     said = Said(settings.strict)
     if settings.depth_kind == "relative" and settings.value_range is None and len(numbers) > 1:
         said.say(depth or image, [_EACH_ITS_OWN])
@@ -308,8 +346,8 @@ def _render_sequence(
         for n in todo:
             depth_n = depths.name(n) if depths else depth
             read = steadied(n) if steadied else None
-            line = render_frame(source.name(n), depth_n, target.name(n), settings, n, said, read)
-            typer.echo(line)
+            rendered = render_frame(source.name(n), depth_n, target.name(n), settings, n, said, read)
+            typer.echo(json_line(rendered.facts()) if as_json else str(rendered))
             progress.advance(task)
 
 
@@ -336,6 +374,11 @@ def _steadied(
     return steadied
 
 
+def _there(files: Sequence[Path]) -> str:
+    """What ``--json`` prints of files that ``--resume`` leaves as they are, a line each."""
+    return "\n".join(json_line({"out": str(file), "is_there_already": True}) for file in files)
+
+
 @contextlib.contextmanager
 def _progress() -> Iterator[Progress]:
     """A bar on standard error, where that is a terminal."""
@@ -359,16 +402,29 @@ def parse_point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def parse_range(text: str) -> tuple[float, float]:
-    """Reads ``LOW,HIGH``.
+def parse_attention(text: str) -> tuple[float, float, float]:
+    """Reads a circle ``X,Y,RADIUS``.
 
     Raises:
         ValueError: If it is none.
     """
     try:
+        x, y, radius = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"--attention expects X,Y,RADIUS in pixels such as 320,200,80, got {text!r}") from None
+    return x, y, radius
+
+
+def parse_range(text: str, option: str, example: str) -> tuple[float, float]:
+    """Reads two numbers, as of an option's example.
+
+    Raises:
+        ValueError: If these are none.
+    """
+    try:
         low, high = (float(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"--value-range expects LOW,HIGH such as 0,255, got {text!r}") from None
+        raise ValueError(f"{option} expects two numbers such as {example}, got {text!r}") from None
     return low, high
 
 

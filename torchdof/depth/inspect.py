@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -73,16 +74,33 @@ class DepthReport:
         total = max(1, known.numel())
         return [(bounds[k], bounds[k + 1], counts[k] / total) for k in range(filled[0], filled[-1] + 1)]
 
+    def distances(self) -> dict[str, float]:
+        """Finite depths in metres: the nearest, those that 1, 50 and 99 % are nearer than, the farthest; or none."""
+        finite = self.depth[self.depth.isfinite()]
+        if not finite.numel():
+            return {}
+        spread = torch.quantile(finite.flatten()[:: max(1, finite.numel() // 2**20)].double(), _SHARES).tolist()
+        named = dict(zip(_SHARE_NAMES, spread, strict=True))
+        return {"nearest": float(finite.min()), **named, "farthest": float(finite.max())}
+
+    def facts(self) -> dict[str, Any]:
+        """What ``str`` tells, for programs: JSON-like data, distances in metres, radii in pixels, shares of 1."""
+        known = self.coc_px[~self.coc_px.isnan()]
+        return {
+            "depth_m": self.distances(),
+            "at_infinity_px": int(self.depth.isinf().sum()),
+            "holes_px": self.holes,
+            "coc_px": [float(known.min()), float(known.max())] if known.numel() else [],
+            "in_focus": self.sharp,
+            "histogram": [{"from_px": low, "to_px": high, "share": share} for low, high, share in self.histogram()],
+            "depth_edges": dict(zip(EDGES, self.counts, strict=True)),
+        }
+
     def __str__(self) -> str:
         total = self.depth.numel()
-        finite = self.depth[self.depth.isfinite()]
         lines = []
-        if finite.numel():
-            spread = torch.quantile(finite.flatten()[:: max(1, finite.numel() // 2**20)].double(), _SHARES).tolist()
-            named = "  ".join(f"{share} {metres:.4g}" for share, metres in zip(_SHARE_NAMES, spread, strict=True))
-            lines.append(
-                f"depth, m      nearest {float(finite.min()):.4g}  {named}  farthest {float(finite.max()):.4g}"
-            )
+        if distances := self.distances():
+            lines.append("depth, m      " + "  ".join(f"{name} {metres:.4g}" for name, metres in distances.items()))
         infinite = int(self.depth.isinf().sum())
         lines.append(f"at infinity   {_percent(infinite, total)}   holes {self.holes} ({_percent(self.holes, total)})")
         known = self.coc_px[~self.coc_px.isnan()]

@@ -24,6 +24,7 @@ _EDGE_PX = 0.5  # difference in coc of neighbours from which on they may be two 
 _UNCLEAN = 1e-2  # weight of a pixel that may be mixed itself
 _FALLOFF = math.exp(-1 / 4.5)
 _TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
+_UNBOUNDED = 1e6  # times the brightest pixel around: so bright is neither part of a pixel
 _EMITTER_REACH = 3  # pixels around a highlight that tell on which surface it lies
 _MOST_WEIGHT = 0.98  # of a highlight's pixel that a farther emitter may have
 
@@ -47,7 +48,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     With F and B the light of the two surfaces beside the pixel, the weight ``a`` of F in a pixel is the least-squares
     solution of ``I = a F + (1 - a) B``, kept on the side of 1/2 that the pixel's own depth states (its centre lies on
     that surface) and drawn towards one surface alone where the contrast of the two is small against their texture. The
-    light of the two parts sums to the pixel's, and both lie within the light around.
+    light of the two parts sums to the pixel's, and neither leaves the image's range.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -81,8 +82,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     gap = (far - near).clamp_min(1e-6)
 
     # their light: means over pixels around that lie on one of them and are hardly mixed themselves
-    falloff = light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-    weight = (1.0 - pixels.pick(edges, window)[0] + _UNCLEAN) * falloff[:, None]
+    weight = (1.0 - pixels.pick(edges, window)[0] + _UNCLEAN) * _falloff(light, 1)
     if valid is not None:
         weight = weight * pixels.pick(valid, window)[0]
     nearness = (far - window_coc) / gap
@@ -111,7 +111,8 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     unexplained = colour - own_weight * own_mean - weight * other_mean
     moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
     item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
-    least, most = (extreme[item].t() / brightest for extreme in light.flatten(2).aminmax(dim=2))
+    range_of_image = light.flatten(2).aminmax(dim=2)  # bounded: 0 of something infinite would be no number
+    least, most = ((extreme[item].t() / brightest).clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in range_of_image)
     moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
     own = (colour - moved) / own_weight
@@ -151,8 +152,7 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
     scale = peaks.detach().amax(0)
     colour, seen, peaks, own_peak = pixels.pick(light, window) / scale, seen / scale, peaks / scale, own_peak / scale
     farther_by = pixels.pick(coc_px, window)[0] - own_coc
-    reach = range(-_EMITTER_REACH, _EMITTER_REACH + 1)
-    falloff = light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in reach for dx in reach])[:, None]
+    falloff = _falloff(light, _EMITTER_REACH)
     counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
     farther, same = counted * (farther_by - 1.0).clamp(0.0, 1.0), counted * (2.0 - farther_by.abs()).clamp(0.0, 1.0)
 
@@ -175,6 +175,12 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
     own = (seen * scale - weight * other) / (1.0 - weight)
     changed = zip(surfaces, (own, other, other_coc, weight), strict=True)
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
+
+
+def _falloff(light: Tensor, reach: int) -> Tensor:
+    """Weights of the pixels of a window around its middle, ``[(2 reach + 1)^2, 1]``."""
+    steps = range(-reach, reach + 1)
+    return light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
 
 
 def _mean(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

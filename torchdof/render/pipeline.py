@@ -1,6 +1,7 @@
 """The chain: an image's surfaces and its highlights, the layers they lie in, scattered and composited."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -16,7 +17,7 @@ from .convolution import convolve
 from .exporting import exported_graph, where_needed
 from .layer_weights import blur_axis
 from .matting import matte
-from .plan import Blur, Plan
+from .plan import Blur, Plan, tolerance_within
 from .scatter import fold
 from .surfaces import Frame, Surface, framed, surfaces_of_image
 
@@ -33,6 +34,9 @@ def blur(
 
     Without a plan each item gets its own.
     """
+    aperture = options.table.aperture
+    if is_traced() and aperture is not None and aperture.depends_on_place:
+        raise ValueError("a compiled or exported graph has one kernel a layer; take a table without vignetting")
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
     maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]
@@ -41,7 +45,8 @@ def blur(
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
         plan = Plan.all(max_coc_px, tolerance)
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
-        plan = Plan.still(torch.cat(maps[1::2]), options.tolerance)
+        coc = torch.cat(maps[1::2])
+        plan = Plan.still(coc, tolerance_within(coc, options.tolerance))
     elif plan is not None and not is_traced():
         plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
@@ -49,7 +54,9 @@ def blur(
     # each item has its own layers, as it would have alone
     items = []
     for item in zip(*(t.split(1) for t in maps), strict=True):
-        items.append(_render_item(Plan.of_scene(torch.cat(item[1::2]), options.tolerance), options, *item))
+        coc = torch.cat(item[1::2])
+        own_plan = Plan.of_scene(coc, tolerance_within(coc, options.tolerance))
+        items.append(_render_item(own_plan, options, *item))
     return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
 
 
@@ -92,7 +99,8 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
     moves = torch.is_grad_enabled() and coc.requires_grad
-    plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), options.tolerance)
+    tolerance = tolerance_within(coc.flatten(0, 1), options.tolerance)
+    plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), tolerance)
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
     return (_render_item(plan, options, light, coc, cover=cover) / scale).to(rgba.dtype)
@@ -132,14 +140,18 @@ def _render_item(
         coc, light, weight = torch.where(valid, coc, 0.0), torch.where(valid, light, 0.0), valid.to(light.dtype)
     coc = coc.clamp(low, high)
     scale = headroom.factor(light, behind_light)
-    if not headroom.has_room(scale):
+    has_room = headroom.has_room(scale)
+    if not has_room:
         light, behind_light = light * scale, None if behind_light is None else behind_light * scale
 
     # what is a highlight; without occlusion it matters only where a light is too bright for a coarse layer
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
     coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
-    splatted = len(plan.nodes) > 1 and (options.occlusion or coarse)
+    # a plane's one kernel is exact, but for where blocks of the frame share it
+    aperture = options.table.aperture
+    several = len(plan.nodes) > 1 or (aperture is not None and aperture.depends_on_place)
+    splatted = several and (options.occlusion or coarse)
 
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
@@ -161,7 +173,7 @@ def _render_item(
         splats = highlights.splat(rays, shown, options.table, options.occlusion) if rays else None
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
-    out = out if headroom.has_room(scale) else out / scale
+    out = out if has_room else out / scale
     out = out if valid is None else torch.where(valid, out, image)
     return where_needed(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
@@ -204,7 +216,9 @@ def _composite(
     frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
-        scatter = convolve if layered else fold
+        aperture = options.table.aperture
+        turned = aperture is not None and not aperture.is_round
+        scatter = functools.partial(convolve, turned=turned) if layered else fold
         if options.occlusion:
             out = composite.over(frame, blurs, scatter)
             return out if splats is None else out + splats

@@ -15,21 +15,27 @@ from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
+from .vignetting import CatsEye
 
-__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
+__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "tolerance_within"]
 
 KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
 _LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
+_SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
 _kernels = KernelCache(256 * 2**20)
 
 
 @dataclasses.dataclass(frozen=True)
 class Blur:
-    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels."""
+    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
+
+    Where the lens's barrel shows, ``cats_eye`` tells what becomes of the kernel across the frame.
+    """
 
     kernel: Tensor
     scale: int
+    cats_eye: CatsEye | None = None
 
     @property
     def half(self) -> int:
@@ -115,10 +121,10 @@ class Plan:
         ends = layer_cocs.ends(coc_px.detach())
         if not self.rays or (self.nodes[0] <= ends[0] and ends[1] <= self.nodes[-1]):
             return self
-        nodes = list(self.nodes)
+        nodes, scene = list(self.nodes), Plan.of_scene(coc_px, self.tolerance)
         for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
             gap = 0.3 * layer_cocs.spacing(last, self.tolerance)
-            beyond = [sign * x for x in Plan.of_scene(coc_px, self.tolerance).nodes if sign * x > last]
+            beyond = [sign * x for x in scene.nodes if sign * x > last]
             nodes += [sign * x for x in beyond if x > last + gap or x == max(beyond)]
         return dataclasses.replace(self, nodes=tuple(sorted(nodes)), pixels=None)
 
@@ -161,11 +167,10 @@ class Plan:
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
-        scales = tuple(self._scale(coc) if coarse else 1 for coc in self.coc_px)
+        finest = 1.0 if table.aperture is None else table.aperture.finest
+        scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
         lens = table.fingerprint()
-        if (
-            torch.compiler.is_dynamo_compiling()
-        ):  # no names of this process's, such as a cache's keys, in what is compiled
+        if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
             parts = flat.split([math.prod(shape) for shape in shapes])
@@ -181,7 +186,14 @@ class Plan:
                 reach_px = _kernels.get((lens, coc, width, scale), reach)
                 window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
-        return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        if table.aperture is None or not table.aperture.depends_on_place:
+            return blurs
+        frame = (int(size[0]), int(size[1]))
+        return [
+            dataclasses.replace(blur, cats_eye=CatsEye(table.aperture, coc / blur.scale, blur.scale, frame))
+            for blur, coc in zip(blurs, self.coc_px, strict=True)
+        ]
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
@@ -190,13 +202,23 @@ class Plan:
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
+def tolerance_within(coc_px: Tensor, tolerance: float) -> float:
+    """What to plan a frame ``[B, 1, H, W]`` for, that its error be at most a tolerance.
+
+    Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere.
+    """
+    low, high = (from_blur_axis(end) for end in layer_cocs.ends(coc_px.detach()))
+    widest = max(-low, high, 1.0)
+    return tolerance * min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * widest))
+
+
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:
     """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, of signed coc ``[n]``.
 
     Each is interpolated between those of whole 1/32 px where no gradient asks for more. They are cut to what reaches
     within a frame whose longer side is ``longest`` pixels.
     """
-    if torch.is_grad_enabled() and coc_px.requires_grad:
+    if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
         kernels = table.kernels(coc_px, width)
     else:
         steps = coc_px.double() * KERNELS_PER_PX
@@ -218,6 +240,8 @@ def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, 
             coc *= shrink(table, coc, width / scale, scale)
         return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0].clone()
 
+    if torch.is_grad_enabled() and table.requires_grad:
+        return made()
     return _kernels.get((lens, coc_px, width, scale, window), made)
 
 

@@ -19,8 +19,7 @@ Border border_of(const Job &job, int farthest) {
     border.level_of_.push_back(level);
     border.part_of_.push_back((float)distance / (1 << level) - 1.0f);
   }
-  for (auto side : {Border::TOP, Border::BOTTOM, Border::LEFT, Border::RIGHT})
-    {
+  for (auto side : {Border::TOP, Border::BOTTOM, Border::LEFT, Border::RIGHT}) {
     border.means_[side].resize(border.start(side, s.count, 0, 0));
     border.shares_[side].resize((size_t)s.count * border.length(side));
   }
@@ -33,7 +32,8 @@ Border border_of(const Job &job, int farthest) {
     const float *coc, *weight;
     for (int i = 0; i < s.count; i++) {
       for (int at = 0; at < length; at++) {
-        const int y = upright ? at : side == Border::TOP ? 0 : job.height - 1, x = !upright ? at : side == Border::LEFT ? 0 : job.width - 1;
+        const int y = upright ? at : side == Border::TOP ? 0 : job.height - 1;
+        const int x = !upright ? at : side == Border::LEFT ? 0 : job.width - 1;
         const double *before = &until[(size_t)at * sums];
         double *after = &until[(size_t)(at + 1) * sums];
         const bool there = s.row(i, y, x, light.data(), coc, weight);

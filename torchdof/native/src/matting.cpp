@@ -9,6 +9,7 @@ namespace {
 constexpr float EDGE_PX = 0.5f;   // difference in coc of neighbours from which on they may be two surfaces
 constexpr float UNCLEAN = 1e-2f;  // weight of a pixel that may be mixed itself
 constexpr float TRUST = 4.0f;     // how much texture discredits the contrast of the two surfaces
+constexpr float UNBOUNDED = 1e6f;  // times the brightest pixel around: so bright is neither part of a pixel
 constexpr int EMITTER_REACH = 3;  // pixels around a highlight that tell on which surface it lies
 constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that a farther emitter may have
 constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is the surface that the image shows
@@ -183,7 +184,7 @@ void split(const Job &job, Window &w, int y, int x, const f4 *falloff, const Blo
   for (int c = 0; c < channels; c++) {
     const float own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
     const float unexplained = colour[c] - rest * own_mean - weight * other_mean;
-    const float least = job.light_least[c] / scale, most = job.light_most[c] / scale;
+    const float least = std::max(job.light_least[c] / scale, -UNBOUNDED), most = std::min(job.light_most[c] / scale, UNBOUNDED);
     float moved = weight * (other_mean + unexplained * weight / (weight * weight + rest * rest));
     moved = std::min(std::max(moved, colour[c] - rest * most), colour[c] - rest * least);
     moved = std::min(std::max(moved, weight * least), weight * most);

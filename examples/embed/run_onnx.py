@@ -1,6 +1,6 @@
 """Depth of field without PyTorch: a file of ``torchdof export``, run by onnxruntime.
 
-Usage: python examples/run_onnx.py dof.onnx photo.png depth.npz out.png --focus-m 2.3 --f-number 0.6 \
+Usage: python examples/embed/run_onnx.py dof.onnx photo.png depth.npz out.png --focus-m 2.3 --f-number 0.6 \
            --disparity-scale 192.03 --disparity-offset 31.086
 
 The image is decoded to linear light for the graph and encoded as sRGB again. Depth is an array in metres (``.npy``, or

@@ -1,0 +1,132 @@
+"""The node: an image and its depth in, the photograph of a real lens out."""
+
+import importlib.resources
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchdof import BlurTable, Camera, depth_of_field
+from torchdof.cli.frame import tint_focus
+from torchdof.depth import from_relative
+from torchdof.depth.size import at_size_of
+from torchdof.io.transfer import decode, encode
+
+__all__ = ["NODE_CLASS_MAPPINGS", "NODE_DISPLAY_NAME_MAPPINGS", "DepthOfFieldNode"]
+
+_NEAR_IS_WHITE, _FAR_IS_WHITE, _METRES = "white is near", "white is far", "metres"
+_POINT, _DISTANCE = "point", "metres"
+
+
+def _lenses() -> list[str]:
+    """Lenses by name: the ideal ones, then the tables that come with torchdof."""
+    folder = importlib.resources.files("torchdof.optics") / "tables"
+    return ["disc", "gaussian", *sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".json"))]
+
+
+def _number(default: float, low: float, high: float, step: float, tooltip: str) -> tuple[str, dict[str, Any]]:
+    return "FLOAT", {"default": default, "min": low, "max": high, "step": step, "tooltip": tooltip}
+
+
+class DepthOfFieldNode:
+    """Blurs an image by its depth as a lens would, focused on a point or at a distance."""
+
+    DESCRIPTION = "The photograph that a real lens would have taken, from an all-in-focus image and its depth."
+    CATEGORY = "image/filters"
+    FUNCTION = "render"
+    RETURN_TYPES = ("IMAGE", "IMAGE")
+    RETURN_NAMES = ("image", "focus")
+    OUTPUT_TOOLTIPS = ("The photograph.", "The sharp image, near orange, in focus green, far blue.")
+
+    @classmethod
+    def INPUT_TYPES(cls) -> dict[str, dict[str, tuple[Any, ...]]]:  # noqa: N802 (ComfyUI's name)
+        """What the node takes, as ComfyUI asks for it."""
+        return {
+            "required": {
+                "image": ("IMAGE", {"tooltip": "All in focus."}),
+                "depth": ("IMAGE", {"tooltip": "Its depth, of any size of the same aspect ratio."}),
+                "depth_kind": (
+                    [_NEAR_IS_WHITE, _FAR_IS_WHITE, _METRES],
+                    {"tooltip": "Depth Anything and MiDaS paint near white, Marigold far; or the values are metres."},
+                ),
+                "near_m": _number(
+                    1.0, 0.05, 1000.0, 0.05, "Distance of the nearest value in metres, if not in metres."
+                ),
+                "far_m": _number(10.0, 0.1, 1e5, 0.1, "Distance of the farthest value in metres, if not in metres."),
+                "focus": ([_POINT, _DISTANCE], {"tooltip": "Focus on what is seen at a point, or at a distance."}),
+                "focus_x": _number(0.5, 0.0, 1.0, 0.001, "The point: 0 is left, 1 is right."),
+                "focus_y": _number(0.5, 0.0, 1.0, 0.001, "The point: 0 is the top, 1 the bottom."),
+                "focus_m": _number(2.0, 0.1, 1e5, 0.01, "The distance in metres."),
+                "f_number": _number(1.8, 0.1, 64.0, 0.1, "Opening of the lens; smaller blurs more."),
+                "focal_length_mm": _number(50.0, 1.0, 2000.0, 1.0, "Focal length; longer blurs more."),
+                "sensor_width_mm": _number(36.0, 1.0, 200.0, 0.1, "Width of the sensor that the image fills."),
+                "lens": (_lenses(), {"tooltip": "How the lens blurs: ideal, or measured from a real one."}),
+                "quality": (["final", "preview", "draft"], {"tooltip": "Accepted error: 1, 4 or 8 of 255."}),
+            }
+        }
+
+    def render(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        depth_kind: str,
+        near_m: float,
+        far_m: float,
+        focus: str,
+        focus_x: float,
+        focus_y: float,
+        focus_m: float,
+        f_number: float,
+        focal_length_mm: float,
+        sensor_width_mm: float,
+        lens: str,
+        quality: Any,
+    ) -> tuple[Tensor, Tensor]:
+        """Render.
+
+        Args:
+            image: ``[B, H, W, 3 or 4]`` as ComfyUI passes images: encoded for display, in [0, 1].
+            depth: ``[B or 1, h, w, C]``; its channels are averaged. The extremes of all images of a batch are one
+                scale, so that clips do not pulse.
+            depth_kind: What its values are.
+            near_m: Distance of the nearest value in metres.
+            far_m: Distance of the farthest.
+            focus: "point" or "metres".
+            focus_x: The point, from 0 (left) to 1.
+            focus_y: The point, from 0 (top) to 1.
+            focus_m: The distance in metres.
+            f_number: Opening of the lens.
+            focal_length_mm: Its focal length.
+            sensor_width_mm: Width of the sensor.
+            lens: Name of a blur table.
+            quality: Tolerance by name.
+
+        Returns:
+            Two images ``[B, H, W, 3 or 4]`` and ``[B, H, W, 3]``.
+
+        Raises:
+            ValueError: If an input is not as described, or nothing lies in focus by these numbers.
+        """
+        encoded, values = image.movedim(-1, 1), depth.movedim(-1, 1).mean(1, keepdim=True)  # [B, C, H, W]
+        has_alpha = encoded.shape[1] == 4
+        light = decode(encoded, "srgb", has_alpha, straight=True)
+        if depth_kind != _METRES:
+            extremes = (float(values.min()), float(values.max()))
+            kind: Any = "disparity" if depth_kind == _NEAR_IS_WHITE else "depth"
+            values = from_relative(values, near_m, far_m, kind, value_range=extremes)
+        metres = at_size_of(light, values)
+        camera = Camera(focal_length_mm, f_number, focus_m, sensor_width_mm)
+        height, width = light.shape[-2:]
+        if focus == _POINT:
+            camera = camera.focus_at(metres, min(focus_x * width, width - 0.5), min(focus_y * height, height - 0.5))
+        ideal = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}
+        table = ideal[lens]() if lens in ideal else BlurTable.load(lens)
+        with torch.no_grad():
+            out = depth_of_field(light, metres, camera, table=table, tolerance=quality)
+        tinted = tint_focus(light, camera.coc_px(metres, width).expand(len(light), -1, -1, -1), has_alpha)[:, :3]
+        shown = encode(out.clamp_min(0.0), "srgb", has_alpha, straight=True)
+        return shown.clamp(0.0, 1.0).movedim(1, -1), encode(tinted, "srgb", False, False).clamp(0.0, 1.0).movedim(1, -1)
+
+
+NODE_CLASS_MAPPINGS = {"TorchdofDepthOfField": DepthOfFieldNode}
+NODE_DISPLAY_NAME_MAPPINGS = {"TorchdofDepthOfField": "Depth of Field (torchdof)"}

@@ -1,0 +1,68 @@
+"""A defocus data set from a folder of photographs and their depth maps.
+
+    python examples/defocus_dataset.py --images photos --depths depth --out data --workers 2 --copies 4
+
+Depth maps have their image's name, but for the suffix. Stopped, it goes on where it was when it is started again in the
+same way. Needs Ray: pip install 'torchdof[ray]'.
+"""
+
+import argparse
+from pathlib import Path
+
+from torchdof import BlurTable, Camera
+from torchdof.augmentation import RandomDepthOfField
+from torchdof.distributed import make_dataset, pairs_in
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Make the data set."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--images", type=Path, required=True, help="folder of all-in-focus images")
+    parser.add_argument("--depths", type=Path, help="folder of their depth maps; left out: the images' own Z channels")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the data set")
+    parser.add_argument("--depth-kind", default="z", help="z, distance, disparity, inverse")
+    parser.add_argument("--depth-scale", type=float, help="factor of the depth values, such as 0.001 for millimetres")
+    parser.add_argument("--depth-offset", type=float, default=0.0, help="added to the depth values first")
+    parser.add_argument("--fill-depth", help="nearest or far: where pixels without depth take theirs from")
+    parser.add_argument("--focus-m", type=float, nargs=2, default=(0.5, 5.0), metavar=("NEAR", "FAR"))
+    parser.add_argument("--f-number", type=float, nargs=2, default=(1.4, 8.0), metavar=("FROM", "TO"))
+    parser.add_argument("--focal-length-mm", type=float, default=50.0)
+    parser.add_argument("--sensor-width-mm", type=float, default=36.0)
+    parser.add_argument("--table", action="append", help="a lens, such as sato_j15; repeated, one is drawn each time")
+    parser.add_argument("--tolerance", default="final", help="draft, preview or final")
+    parser.add_argument("--format", choices=("webdataset", "parquet"), default="webdataset")
+    parser.add_argument("--per-shard", type=int, default=64, help="samples in a shard")
+    parser.add_argument("--copies", type=int, default=1, help="how often each image is blurred")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    blur = RandomDepthOfField(
+        tuple(arguments.focus_m),
+        tuple(arguments.f_number),
+        Camera(focal_length_mm=arguments.focal_length_mm, sensor_width_mm=arguments.sensor_width_mm),
+        [BlurTable.load(name) for name in arguments.table] if arguments.table else None,
+        p=1.0,
+        tolerance=arguments.tolerance,
+    )
+    make_dataset(
+        pairs_in(arguments.images, arguments.depths),
+        arguments.out,
+        blur,
+        workers=arguments.workers,
+        per_shard=arguments.per_shard,
+        copies=arguments.copies,
+        format=arguments.format,
+        seed=arguments.seed,
+        depth={
+            "kind": arguments.depth_kind,
+            "scale": arguments.depth_scale,
+            "offset": arguments.depth_offset,
+            "fill": arguments.fill_depth,
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()

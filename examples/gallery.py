@@ -1,0 +1,186 @@
+"""The pictures of the documentation, from the data in this repository.
+
+Usage: python examples/gallery.py --out docs/pictures
+
+``GALLERY`` names each file and the function that draws it; ``--only NAME`` draws one of them.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+import torchdof
+from torchdof.cli.frame import tint_focus
+from torchdof.depth import inspect_depth, read_depth
+from torchdof.depth.inspect import coc_colours, panels
+from torchdof.io.images import Picture, read_image, write_image
+from torchdof.io.sheet import write_sheet
+from torchdof.reference.scenes import read_scenes
+
+ROOT = Path(__file__).parents[1]
+MOTORCYCLE, SCENES = ROOT / "examples/data/motorcycle", ROOT / "tests/data/scenes"
+FOV_X_DEG, APERTURE_RADIUS_M = 40.85, 0.04  # wider than lenses are made, so that a picture of 741 pixels shows it
+TABLES = ("disc", "gaussian", "sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4")
+
+
+def motorcycle() -> tuple[Tensor, Tensor]:
+    """The photograph, ``[1, 3, 500, 741]`` in linear light, and its depth in metres."""
+    depth = read_depth(MOTORCYCLE / "motorcycle_disp.npz", kind="disparity", scale=192.03, offset=31.086, fill="far")
+    return read_image(MOTORCYCLE / "motorcycle_left.png").pixels, depth
+
+
+def focused(focus_m: float, aperture_radius_m: float = APERTURE_RADIUS_M) -> Tensor:
+    """The photograph as a lens takes it that is focused there."""
+    camera = torchdof.Camera.from_fov(FOV_X_DEG, aperture_radius_m, focus_m)
+    return torchdof.depth_of_field(*motorcycle(), camera, depth_edges="repair")  # stereo ends now and then a pixel off
+
+
+def photograph(path: Path, pixels: Tensor) -> None:
+    """Writes one picture."""
+    write_image(path, Picture(pixels, sample="8", transfer="srgb"))
+
+
+def half(pixels: Tensor) -> Tensor:
+    """At half the resolution."""
+    return functional.avg_pool2d(pixels, 2)
+
+
+def draw_before(path: Path) -> None:
+    """The photograph, sharp everywhere."""
+    photograph(path, motorcycle()[0])
+
+
+def draw_after(path: Path) -> None:
+    """Focused on the front wheel."""
+    photograph(path, focused(2.3))
+
+
+def draw_far(path: Path) -> None:
+    """Focused on the shelf behind."""
+    photograph(path, focused(4.6))
+
+
+def draw_blur_radius(path: Path) -> None:
+    """Photograph, signed circle of confusion, result."""
+    image, depth = motorcycle()
+    camera = torchdof.Camera.from_fov(FOV_X_DEG, APERTURE_RADIUS_M, 3.1)
+    coc_px = camera.coc_px(depth, image.shape[-1])
+    write_sheet(
+        path,
+        {
+            "sharp": half(image),
+            f"radius {float(coc_px.min()):+.1f} to {float(coc_px.max()):+.1f} px": half(coc_colours(coc_px)),
+            "focus at 3.1 m": half(focused(3.1)),
+        },
+    )
+
+
+def draw_apertures(path: Path) -> None:
+    """The same focus at three openings."""
+    part = (..., slice(120, 400), slice(340, 720))
+    write_sheet(path, {f"opening {2000 * r:g} mm": focused(2.3, r)[part] for r in (0.01, 0.02, 0.04)})
+
+
+def draw_show_focus(path: Path) -> None:
+    """What ``torchdof render --show-focus`` draws."""
+    image, depth = motorcycle()
+    photograph(path, tint_focus(image, torchdof.Camera.from_fov(FOV_X_DEG, 0.02, 2.8).coc_px(depth, image.shape[-1])))
+
+
+def draw_inspect(path: Path) -> None:
+    """What ``torchdof inspect`` draws."""
+    image, depth = motorcycle()
+    report = inspect_depth(image, depth, torchdof.Camera.from_fov(FOV_X_DEG, 0.02, 2.8))
+    write_sheet(path, {caption.partition(":")[0]: half(panel) for caption, panel in panels(image, report).items()})
+
+
+def draw_lenses(path: Path) -> None:
+    """Small lights, from 14 px in front of the focus to 14 px behind it, through five lenses."""
+    height, width, cocs = 150, 220, (-14.0, -7.0, 0.0, 7.0, 14.0)
+    image, coc_px = torch.full((1, 3, height, width), 0.01), torch.zeros(1, 1, height, width)
+    for column, coc in enumerate(cocs):
+        left = 44 * column
+        coc_px[..., left : left + 44] = coc
+        for row, colour in ((40, (1.0, 0.75, 0.4)), (110, (0.5, 0.7, 1.0))):
+            image[0, :, row, left + 22] = 0.8 * 3.1416 * max(abs(coc), 0.6) ** 2 * torch.tensor(colour)
+    tables = {name: torchdof.BlurTable.disc() for name in TABLES[:1]}
+    tables |= {"gaussian": torchdof.BlurTable.gaussian()} | {n: torchdof.BlurTable.load(n) for n in TABLES[2:]}
+    write_sheet(path, {n: torchdof.blur_by_coc(image, coc_px, table=table) for n, table in tables.items()})
+
+
+def draw_layers(path: Path) -> None:
+    """What lies behind the focus, in it and in front of it, each blurred by itself, on grey."""
+    image, depth = motorcycle()
+    camera = torchdof.Camera.from_fov(FOV_X_DEG, APERTURE_RADIUS_M, 2.5)
+    coc_px, dof = camera.coc_px(depth, image.shape[-1]), torchdof.DepthOfField(camera)
+    parts = {"behind the focus": coc_px > 2, "in focus": coc_px.abs() <= 2, "in front of it": coc_px < -2}
+    shown = {}
+    for name, part in parts.items():
+        rgba = torch.cat([image * part, part.to(image)], dim=1)
+        light, cover = dof.layers(rgba[:, None], depth[:, None]).split([3, 1], dim=1)
+        shown[name] = half(light + (1 - cover) * 0.4)
+    write_sheet(path, shown)
+
+
+def draw_truth(path: Path) -> None:
+    """A ray-traced cut-out: sharp, torchdof, and the path-traced picture through the lens."""
+    (scene,) = read_scenes(SCENES / {"truth_lamps": "highlights", "truth_bars": "planes"}[path.stem])
+    rendered = torchdof.depth_of_field(scene.image, scene.depth, scene.camera)
+    shown, m = {}, scene.margin_px
+    for name, pixels in {"sharp": scene.image, "torchdof": rendered, "path-traced": scene.truth}.items():
+        inner = pixels[..., m : pixels.shape[-2] - m, m : pixels.shape[-1] - m]
+        shown[name] = functional.interpolate(inner, scale_factor=2.0, mode="nearest")
+    write_sheet(path, shown)
+
+
+def draw_thin_lens(path: Path) -> None:
+    """Blur radius over distance at three f-numbers."""
+    from matplotlib.figure import Figure
+
+    depth = torch.linspace(0.5, 12.0, 400)
+    figure = Figure(figsize=(8, 3.4), layout="constrained")
+    axes = figure.subplots()
+    for f_number in (1.8, 2.8, 5.6):
+        camera = torchdof.Camera(focal_length_mm=50.0, f_number=f_number, focus_m=2.0)
+        axes.plot(depth, camera.coc_px(depth[None, None, None], width=1920).flatten(), label=f"f/{f_number}")
+    axes.axhline(0, color="0.7", linewidth=0.8)
+    axes.set(xlabel="distance, m", ylabel="signed radius, px", ylim=(-30, 30), title="50 mm, focus 2 m, 1920 px wide")
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+GALLERY: dict[str, Callable[[Path], None]] = {
+    "before.jpg": draw_before,
+    "after.jpg": draw_after,
+    "far.jpg": draw_far,
+    "blur_radius.jpg": draw_blur_radius,
+    "apertures.jpg": draw_apertures,
+    "show_focus.jpg": draw_show_focus,
+    "inspect.jpg": draw_inspect,
+    "lenses.jpg": draw_lenses,
+    "layers.jpg": draw_layers,
+    "truth_lamps.jpg": draw_truth,
+    "truth_bars.jpg": draw_truth,
+    "thin_lens.png": draw_thin_lens,
+}
+
+
+def main() -> None:
+    """Draw all pictures, or one."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
+    parser.add_argument("--only", choices=GALLERY, help="draw one of them")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name, draw in GALLERY.items():
+        if arguments.only in (None, name):
+            draw(arguments.out / name)
+            print(arguments.out / name)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+// Puts the page together: node build.mjs [--out FOLDER] [--model FILE.onnx]
+//
+// The page's own files and the modules of ../embed/javascript are copied as they are, beside them the two files of
+// onnxruntime-web that a browser loads. Python writes the exported file and the pair to begin with; --model takes a file
+// that is there already. PYTHON names an interpreter that has torchdof; else the repository's own is taken.
+
+import { execFileSync } from 'node:child_process'
+import { cpSync, existsSync, mkdirSync, rmSync } from 'node:fs'
+import { createRequire } from 'node:module'
+import { dirname, join } from 'node:path'
+import { fileURLToPath } from 'node:url'
+import { parseArgs } from 'node:util'
+
+const here = dirname(fileURLToPath(import.meta.url))
+const { values: options } = parseArgs({
+  options: { out: { type: 'string', default: join(here, 'dist') }, model: { type: 'string' } },
+})
+const require = createRequire(join(process.env.TORCHDOF_NODE_FOLDER ?? here, 'package.json'))
+const runtime = dirname(require.resolve('onnxruntime-web'))
+const ownPython = join(here, '..', '..', '.venv', 'bin', 'python')
+const python = process.env.PYTHON ?? (existsSync(ownPython) ? ownPython : 'python3')
+
+rmSync(options.out, { recursive: true, force: true })
+mkdirSync(options.out, { recursive: true })
+cpSync(join(here, 'src'), options.out, { recursive: true })
+for (const name of ['depth.mjs', 'depth_of_field.mjs', 'light.mjs', 'png.mjs']) {
+  cpSync(join(here, '..', 'embed', 'javascript', name), join(options.out, name))
+}
+for (const name of ['ort.wasm.min.mjs', 'ort-wasm-simd-threaded.mjs', 'ort-wasm-simd-threaded.wasm']) {
+  cpSync(join(runtime, name), join(options.out, name))
+}
+const model = options.model ? ['--model', options.model] : []
+execFileSync(python, [join(here, 'write_files.py'), '--out', options.out, ...model], { stdio: 'inherit' })
+console.log(`the page is in ${options.out}; npm start serves it`)

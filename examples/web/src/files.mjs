@@ -1,0 +1,64 @@
+// Files of people to pictures and depth maps, with errors that people can act on.
+
+import { extremes, greyDepthMap, readDepthMap } from './depth.mjs'
+import { isPng } from './png.mjs'
+
+const MOST_PIXELS = 16e6 // what phones' browsers draw at once
+
+/** What an opened file is of: 'photo' or 'depth', by its name, then by its content. */
+export async function kindOf(file) {
+  if (/depth|disp|\.npy$/i.test(file.name)) return 'depth'
+  const start = new Uint8Array(await file.slice(0, 33).arrayBuffer())
+  const isGrey = isPng(start) && (start[25] === 0 || start[25] === 4)
+  return isGrey ? 'depth' : 'photo'
+}
+
+/** @returns {Promise<{name, rgba: Uint8ClampedArray, width, height}>} in sRGB, upright. */
+export async function readPhoto(file) {
+  try {
+    return { name: file.name, ...(await pixelsOf(file)) }
+  } catch (error) {
+    throw new Error(`${file.name}: ${error.message}`)
+  }
+}
+
+/** @returns {Promise<{name, map: DepthMap}>} */
+export async function readDepth(file) {
+  try {
+    const map = await depthMapOf(file)
+    const [low, high] = extremes(map.values)
+    if (!(low < high)) throw new Error('it has one value everywhere: nothing tells near from far. Choose another file.')
+    return { name: file.name, map }
+  } catch (error) {
+    throw new Error(`${file.name}: ${error.message}`)
+  }
+}
+
+async function depthMapOf(file) {
+  const bytes = new Uint8Array(await file.arrayBuffer())
+  if (isPng(bytes) || bytes[0] === 0x93) return readDepthMap(bytes)
+  const { rgba, width, height } = await pixelsOf(file)
+  return greyDepthMap(rgba, width, height, 4, 255)
+}
+
+async function pixelsOf(file) {
+  let bitmap
+  try {
+    bitmap = await createImageBitmap(file)
+  } catch {
+    throw new Error('this browser cannot open it as a picture. Save it as JPEG or PNG and choose that.')
+  }
+  const shrink = Math.min(1, Math.sqrt(MOST_PIXELS / (bitmap.width * bitmap.height)))
+  const width = Math.max(1, Math.round(bitmap.width * shrink))
+  const height = Math.max(1, Math.round(bitmap.height * shrink))
+  const canvas = document.createElement('canvas')
+  canvas.width = width
+  canvas.height = height
+  const context = canvas.getContext('2d', { willReadFrequently: true, colorSpace: 'srgb' })
+  context.fillStyle = '#fff' // what is transparent lies on white
+  context.fillRect(0, 0, width, height)
+  context.imageSmoothingQuality = 'high'
+  context.drawImage(bitmap, 0, 0, width, height)
+  bitmap.close()
+  return { rgba: context.getImageData(0, 0, width, height).data, width, height }
+}

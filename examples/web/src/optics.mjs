@@ -1,0 +1,34 @@
+// How large the blur is: DESIGN of the file's thin lens, for what the page says and draws besides the picture.
+
+/** Signed radius in pixels of the circle of confusion: coc = (A / 2) F (1/s - 1/z), negative in front of the focus. */
+export function cocPx(camera, width, focusM, fNumber, depthM) {
+  const apertureRadiusM = camera.focal_length_mm / 1000 / fNumber / 2
+  const focalPx = (camera.focal_length_mm / camera.sensor_width_mm) * width
+  return apertureRadiusM * focalPx * (1 / focusM - 1 / depthM)
+}
+
+/** A picture of depth: near is light; what is blurred by less than a pixel of the result is tinted. */
+export function depthPicture(metres, width, height, near, far, coc) {
+  const image = new ImageData(width, height)
+  for (let i = 0; i < metres.length; i++) {
+    const share = (1 / metres[i] - 1 / far) / (1 / near - 1 / far)
+    const grey = 20 + 215 * Math.min(1, Math.max(0, share))
+    const sharpness = Math.max(0, 1 - Math.abs(coc(metres[i])))
+    image.data[4 * i] = grey + sharpness * (255 - grey)
+    image.data[4 * i + 1] = grey + sharpness * (176 - grey)
+    image.data[4 * i + 2] = grey + sharpness * (46 - grey)
+    image.data[4 * i + 3] = 255
+  }
+  return image
+}
+
+/** Distance of what is seen at a point of the picture: the median of a small patch of the depth map. */
+export function distanceAt(metres, width, height, u, v) {
+  const column = Math.min(width - 1, Math.floor(u * width))
+  const row = Math.min(height - 1, Math.floor(v * height))
+  const patch = []
+  for (let y = Math.max(0, row - 2); y <= Math.min(height - 1, row + 2); y++) {
+    for (let x = Math.max(0, column - 2); x <= Math.min(width - 1, column + 2); x++) patch.push(metres[y * width + x])
+  }
+  return patch.sort((a, b) => a - b)[patch.length >> 1]
+}

@@ -1,0 +1,88 @@
+// The page's side of the worker: one picture at a time, always the one wanted last, and how long it will take.
+
+export class Renderer {
+  /**
+   * @param handlers.onSharp ({rgba, width, height}): the photograph at the size of the result.
+   * @param handlers.onBegin (expectedMs or null, isHalf, isReady): a picture has been begun, or waits until all is loaded.
+   * @param handlers.onPicture ({rgba, width, height, half, ms}): it is there.
+   * @param handlers.onFailed (message).
+   */
+  constructor(handlers) {
+    this.handlers = handlers
+    this.msPerPixel = null
+    this.loadMs = Infinity
+    this.sceneId = 0
+    this.#start()
+  }
+
+  /** What is to be rendered from now on: {photo, depth, width, height}. */
+  setScene(scene) {
+    this.scene = { ...scene, sceneId: ++this.sceneId }
+    this.wanted = null
+    if (this.#isWorthStartingAgain()) this.#start()
+    else this.worker.postMessage({ type: 'scene', ...this.scene })
+  }
+
+  /** Ask for a picture; one that was asked for and not begun is forgotten. */
+  request(wanted) {
+    this.wanted = wanted
+    if (!this.running) this.#next()
+    else if (!this.running.half && this.#isWorthStartingAgain()) this.#start()
+  }
+
+  #start() {
+    this.worker?.terminate()
+    this.running = null
+    this.isReady = false
+    this.began = performance.now()
+    const worker = new Worker(new URL('worker.mjs', import.meta.url), { type: 'module' })
+    worker.onmessage = ({ data }) => worker === this.worker && this.#take(data)
+    worker.onerror = (event) => this.#fail(event.message ?? 'the renderer cannot be loaded')
+    this.worker = worker
+    if (this.scene) this.worker.postMessage({ type: 'scene', ...this.scene })
+    if (this.wanted) this.#next()
+  }
+
+  #next() {
+    this.running = { ...this.wanted, sceneId: this.sceneId, began: performance.now() }
+    this.wanted = null
+    this.handlers.onBegin(this.isReady ? this.#expectedMs(this.running.half) : null, this.running.half, this.isReady)
+    this.worker.postMessage({ type: 'render', ...this.running })
+  }
+
+  #take(data) {
+    if (data.type === 'ready') {
+      this.isReady = true
+      this.loadMs = performance.now() - this.began
+      if (this.running) this.running.began = performance.now()
+    } else if (data.type === 'sharp') {
+      this.handlers.onSharp(data)
+    } else if (data.type === 'picture') {
+      const ms = performance.now() - this.running.began
+      this.msPerPixel = ms / (data.width * data.height)
+      const isOfThisScene = this.running.sceneId === this.sceneId
+      this.running = null
+      if (isOfThisScene) this.handlers.onPicture({ ...data, ms })
+      if (this.wanted) this.#next()
+    } else {
+      this.#fail(data.message)
+    }
+  }
+
+  #fail(message) {
+    this.running = null
+    this.wanted = null
+    this.handlers.onFailed(message)
+  }
+
+  #expectedMs(half) {
+    if (this.msPerPixel === null) return null
+    return (this.msPerPixel * this.scene.width * this.scene.height) / (half ? 4 : 1)
+  }
+
+  /** A picture in progress cannot be stopped, but its worker can: if loading another is quicker than waiting. */
+  #isWorthStartingAgain() {
+    const expected = this.running && this.#expectedMs(this.running.half)
+    return expected !== null && expected - (performance.now() - this.running.began) > this.loadMs
+  }
+}

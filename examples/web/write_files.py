@@ -1,0 +1,73 @@
+"""What the page needs from Python: the exported file, what is to be known of it, and a pair to begin with.
+
+Usage: python examples/web/write_files.py --out examples/web/dist [--model dof.onnx]
+
+Leaves ``dof.onnx``, ``dof.json``, and in ``sample/`` the photograph and its depth in millimetres, 16 bits.
+"""
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+import torchdof
+from torchdof.depth import repair_edges
+from torchdof.depth.reading import read_depth
+from torchdof.export import describe, to_onnx
+from torchdof.io.images import read_image
+
+FOV_X_DEG = 40.0  # of a 50 mm lens on full frame
+MAX_COC_PX = 32.0
+TOLERANCE = 4 / 255  # a preview's: the page is looked at, and a browser is slow
+DATA = Path(__file__).parents[1] / "data" / "motorcycle"
+FOCAL_PX, BASELINE_M, DISPARITY_OFFSET_PX = 994.978, 0.193001, 31.086
+
+
+def main() -> None:
+    """Write the files."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the page")
+    parser.add_argument("--model", type=Path, help="an exported file to take instead of writing one")
+    arguments = parser.parse_args()
+
+    model = arguments.out / "dof.onnx"
+    if arguments.model is None:
+        camera = torchdof.Camera.from_fov(FOV_X_DEG, 0.01, 2.0)  # aperture and focus are inputs of the file
+        dof = torchdof.DepthOfField(
+            camera, tolerance=TOLERANCE, max_coc_px=MAX_COC_PX, depth_edges="as given", check=False
+        )
+        print("writing and checking the exported file; this takes a minute or two", flush=True)
+        print(to_onnx(dof, model))
+    else:
+        shutil.copyfile(arguments.model, model)
+    facts = describe(model)
+    camera_facts = {name: facts["camera"][name] for name in ("focal_length_mm", "sensor_width_mm")}
+    known = camera_facts | {"max_coc_px": facts["options"]["max_coc_px"]}
+    (arguments.out / "dof.json").write_text(json.dumps(known))
+
+    sample = arguments.out / "sample"
+    sample.mkdir(exist_ok=True)
+    shutil.copyfile(DATA / "motorcycle_left.png", sample / "motorcycle.png")
+    depth_m = read_depth(
+        DATA / "motorcycle_disp.npz",
+        kind="disparity",
+        scale=BASELINE_M * FOCAL_PX,
+        offset=DISPARITY_OFFSET_PX,
+        fill="far",
+    )
+    depth_m = repair_edges(read_image(DATA / "motorcycle_left.png").pixels, depth_m)
+    write_millimetres(sample / "motorcycle_depth.png", depth_m[0, 0].numpy())
+
+
+def write_millimetres(path: Path, depth_m: np.ndarray) -> None:
+    """Depth ``[H, W]`` in metres to a grey PNG of 16 bits, in whole millimetres."""
+    buffer = oiio.ImageBuf(np.rint(1000.0 * depth_m).astype(np.uint16)[..., None])
+    if not buffer.write(str(path)):
+        raise SystemExit(f"cannot write {path}: {buffer.geterror()}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""What the documentation tells to type works: blocks of code are run, options and links exist, pictures are true."""
+
+import importlib.metadata
+import re
+import runpy
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from torchdof.cli import main
+from torchdof.cli.main import app
+from torchdof.io.images import read_image
+from torchdof.reference.metrics import display, psnr
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+RUN = [ROOT / "README.md", ROOT / "docs" / "speed.md", *sorted((ROOT / "docs" / "guides").glob("*.md"))]
+RUN += [ROOT / "docs" / "index.md"]
+"""Pages whose blocks are run from top to bottom, but for those below a comment that says why not."""
+
+_BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
+_COMMAND = re.compile(r"(?:^|`)\s*((?:python -m )?torchdof (?:[a-z]+)(?: [^`\n\\]*(?:\\\n[^`\n\\]*)*)?)", re.M)
+_LINK = re.compile(r"""\]\((?P<link>[^)\s]+)\)|src="(?P<source>[^"]+)\"""")
+_PATH = re.compile(r"(?:`| )((?:examples|tests|docs|fit|export|torchdof|optics|render|depth)/[a-z_/]+(?:\.[a-z]+|/))")
+_ALIKE_DB = 33.0  # of a JPEG with what it was made from, and then some
+
+
+def _names(pages: list[Path]) -> list[str]:
+    return [str(page.relative_to(ROOT)) for page in pages]
+
+
+def commands_of(text: str) -> list[list[str]]:
+    """The commands of a shell block, word by word."""
+    lines = re.sub(r"(^|\s)#.*", "", text.replace("\\\n", " "), flags=re.M).splitlines()
+    return [words for words in map(shlex.split, lines) if words]
+
+
+def run_command(words: list[str]) -> None:
+    """Runs torchdof; of what would install or test things, asks whether it is there."""
+    if words[0] == "torchdof":
+        result = CliRunner().invoke(app, words[1:], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    elif words[0] == "make":
+        targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M)
+        assert set(words[1:]) <= set(targets)
+    else:
+        raise AssertionError(f"{words[0]}: a command that this test does not know")
+
+
+@pytest.mark.parametrize("name", _names(RUN))
+def test_blocks_of_a_guide_run_from_top_to_bottom(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("examples", "tests"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    names: dict[str, Any] = {"__name__": "guide"}
+    blocks = [match for match in _BLOCK.finditer((ROOT / name).read_text()) if not match["skip"]]
+    assert blocks
+    for block in blocks:
+        if block["kind"] == "python":
+            exec(compile(block["text"], name, "exec"), names)
+        else:
+            for words in commands_of(block["text"]):
+                run_command(words)
+
+
+@pytest.mark.parametrize("name", _names(PAGES))
+def test_commands_that_a_page_mentions_have_the_options_it_gives_them(name: str) -> None:
+    parsed = {command: main._imported(command) for command in main._MODULES}
+    for match in _COMMAND.finditer((ROOT / name).read_text()):
+        words = re.sub(r"\\\n", " ", match[1]).removeprefix("python -m ").split()
+        options = [re.split(r"[=,.;:)]", word)[0] for word in words[2:] if re.match(r"--?[a-z]", word)]
+        if words[1] in parsed:
+            known = {option for parameter in parsed[words[1]].params for option in parameter.opts} | {"--help"}
+            assert set(options) <= known, match[1]
+
+
+@pytest.mark.parametrize("name", _names([*PAGES, ROOT / "CHANGELOG.md"]))
+def test_links_to_files_lead_somewhere(name: str) -> None:
+    for match in _LINK.finditer((ROOT / name).read_text()):
+        link = (match["link"] or match["source"]).partition("#")[0]
+        if link and not link.startswith(("http:", "https:")):
+            assert ((ROOT / name).parent / link).exists(), link
+
+
+@pytest.mark.parametrize("name", _names(PAGES))
+def test_files_that_a_page_names_are_there(name: str) -> None:
+    for path in _PATH.findall((ROOT / name).read_text()):
+        assert (ROOT / path).exists() or (ROOT / "torchdof" / path).exists(), path
+
+
+def test_readme_is_short_and_names_folders_and_extras_that_exist() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert len(readme.splitlines()) <= 150
+    rooms = readme.partition("## Where things are")[2]
+    for path in re.findall(r"`([a-z/_]+(?:/|\.py))`", rooms):
+        assert (
+            (ROOT / path).exists() or (ROOT / "torchdof" / path).exists() or (ROOT / "torchdof/render" / path).exists()
+        )
+    extras = importlib.metadata.metadata("torchdof").get_all("Provides-Extra") or []
+    assert set(re.findall(r"`\.\[([a-z]+)\]`", readme)) <= set(extras)
+
+
+_GALLERY = runpy.run_path(str(ROOT / "examples" / "gallery.py"))["GALLERY"]
+_QUICK = ("lenses.jpg", "truth_lamps.jpg", "truth_bars.jpg")
+
+
+def test_every_picture_of_the_documentation_has_a_script() -> None:
+    assert sorted(_GALLERY) == sorted(path.name for path in (ROOT / "docs" / "pictures").iterdir())
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[] if n in _QUICK else pytest.mark.sweep) for n in _GALLERY if n.endswith(".jpg")],
+)
+def test_a_picture_of_the_documentation_is_what_its_script_draws(name: str, tmp_path: Path) -> None:
+    _GALLERY[name](tmp_path / name)
+    drawn, shown = (display(read_image(folder / name).pixels) for folder in (tmp_path, ROOT / "docs" / "pictures"))
+    assert psnr(drawn, shown) > _ALIKE_DB

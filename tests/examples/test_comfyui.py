@@ -1,0 +1,128 @@
+"""The node for ComfyUI: loaded as ComfyUI loads it, checked by its rules, and run by them."""
+
+import importlib.util
+import inspect
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof import BlurTable, Camera, depth_of_field
+from torchdof.depth import from_relative
+from torchdof.io.transfer import decode, encode
+
+FOLDER = Path(__file__).parents[2] / "examples" / "comfyui"
+TYPES = {"IMAGE", "MASK", "INT", "FLOAT", "STRING", "BOOLEAN"}
+
+
+@pytest.fixture(scope="module")
+def package() -> ModuleType:
+    """As ComfyUI's ``load_custom_node``: the folder is a package whose name is its path."""
+    name = str(FOLDER).replace(".", "_x_")
+    spec = importlib.util.spec_from_file_location(name, FOLDER / "__init__.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def node(package: ModuleType) -> Any:
+    (node,) = package.NODE_CLASS_MAPPINGS.values()
+    return node
+
+
+def defaults(node: Any) -> dict[str, Any]:
+    """What the page fills in: the first of a list, else the default."""
+    given = {}
+    for name, (kind, *extra) in node.INPUT_TYPES()["required"].items():
+        if isinstance(kind, list):
+            given[name] = kind[0]
+        elif kind != "IMAGE":
+            given[name] = extra[0]["default"]
+    return given
+
+
+def scene() -> tuple[Tensor, Tensor]:
+    return torch.rand(2, 18, 24, 3), torch.rand(2, 18, 24, 1).expand(-1, -1, -1, 3)
+
+
+def render(node: Any, image: Tensor, depth: Tensor, **changes: Any) -> tuple[Tensor, Tensor]:
+    """As ComfyUI's ``execution``: a new node, its FUNCTION by name, inputs by keyword."""
+    out = getattr(node(), node.FUNCTION)(image=image, depth=depth, **{**defaults(node), **changes})
+    assert isinstance(out, tuple) and len(out) == len(node.RETURN_TYPES) == len(node.RETURN_NAMES)
+    for pixels, kind in zip(out, node.RETURN_TYPES, strict=True):
+        assert kind == "IMAGE" and pixels.ndim == 4 and pixels.dtype == torch.float32
+        assert 0.0 <= float(pixels.min()) and float(pixels.max()) <= 1.0
+    return out
+
+
+def test_the_folder_is_a_custom_node(package: ModuleType, node: Any) -> None:
+    assert set(package.NODE_DISPLAY_NAME_MAPPINGS) == set(package.NODE_CLASS_MAPPINGS)
+    assert isinstance(node.CATEGORY, str) and callable(getattr(node, node.FUNCTION))
+    assert (FOLDER / "requirements.txt").read_text().split() == ["torchdof"]
+
+
+def test_inputs_are_as_comfyui_checks_them(node: Any) -> None:
+    inputs = node.INPUT_TYPES()
+    assert set(inputs) <= {"required", "optional", "hidden"}
+    for kind, *extra in inputs["required"].values():
+        if isinstance(kind, list):
+            assert kind and all(isinstance(value, str) for value in kind)
+        else:
+            assert kind in TYPES
+            if kind == "FLOAT":
+                assert extra[0]["min"] <= extra[0]["default"] <= extra[0]["max"] and extra[0]["step"] > 0
+    arguments = list(inspect.signature(getattr(node, node.FUNCTION)).parameters)
+    assert arguments == ["self", *inputs["required"]]
+
+
+def test_it_renders_what_torchdof_renders(node: Any) -> None:
+    image, depth = scene()
+    out, _ = render(node, image, depth, focus="metres", focus_m=1.5, sensor_width_mm=4.0)
+    light = decode(image.movedim(-1, 1), "srgb", False, False)
+    values = depth[..., :1].movedim(-1, 1)
+    metres = from_relative(values, 1.0, 10.0, value_range=(float(values.min()), float(values.max())))
+    camera = Camera(50.0, 1.8, 1.5, 4.0)
+    expected = encode(depth_of_field(light, metres, camera), "srgb", False, False).clamp(0, 1)
+    torch.testing.assert_close(out, expected.movedim(1, -1), rtol=1e-5, atol=1e-5)
+
+
+def test_focus_is_where_the_point_is(node: Any) -> None:
+    image, depth = torch.rand(1, 18, 24, 3), torch.full((1, 18, 24, 3), 2.0)
+    depth[:, :, 12:] = 5.0
+    changes = {"depth_kind": "metres", "focus": "point", "focus_y": 1.0, "sensor_width_mm": 4.0}
+    left, near = render(node, image, depth, focus_x=0.1, **changes)
+    right, far = render(node, image, depth, focus_x=1.0, **changes)
+    torch.testing.assert_close(left[:, :, :6], image[:, :, :6], rtol=0.0, atol=1e-3)
+    assert float((right[:, :, :6] - image[:, :, :6]).abs().max()) > 0.05
+    assert not torch.equal(near, far)
+
+
+def test_white_is_near_or_far(node: Any) -> None:
+    image, depth = scene()
+    changes = {"focus": "metres", "focus_m": 1.0, "sensor_width_mm": 4.0}
+    near, _ = render(node, image, depth, **changes)
+    far, _ = render(node, image, depth, depth_kind="white is far", **changes)
+    assert not torch.allclose(near, far, atol=1e-2)
+
+
+@pytest.mark.parametrize("lens", ["gaussian", "sato_j15"])
+def test_every_lens_of_the_list_can_be_had(node: Any, lens: str) -> None:
+    lenses = node.INPUT_TYPES()["required"]["lens"][0]
+    assert lens in lenses
+    for name in lenses[2:]:
+        assert BlurTable.load(name).name
+    image, depth = scene()
+    render(node, image, depth, lens=lens, sensor_width_mm=4.0)
+
+
+def test_a_small_depth_one_depth_and_alpha_are_taken(node: Any) -> None:
+    image = torch.rand(2, 18, 24, 4)
+    out, focus = render(node, image, torch.rand(1, 9, 12, 3), sensor_width_mm=4.0)
+    assert out.shape == (2, 18, 24, 4) and focus.shape == (2, 18, 24, 3)

@@ -1,0 +1,137 @@
+"""The samples of `examples/embed` give the pixels of the file that they run."""
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT / "examples" / "data" / "motorcycle"
+EMBED = ROOT / "examples" / "embed"
+NODE_FOLDER = Path(os.environ.get("TORCHDOF_NODE_FOLDER", ROOT / "build" / "node"))
+FOCUS_M, F_NUMBER = 2.3, 1.2
+SCALE, OFFSET = 192.03, 31.086  # of the disparity
+
+
+def header_folder() -> Path | None:
+    """Where onnxruntime's C++ API is: the PyPI and npm packages bring the library only."""
+    folders = [Path(os.environ["TORCHDOF_ONNXRUNTIME"], "include")] if "TORCHDOF_ONNXRUNTIME" in os.environ else []
+    folders += [Path(root, "include", "onnxruntime") for root in ("/usr", "/usr/local")]
+    return next((folder for folder in folders if (folder / "onnxruntime_cxx_api.h").is_file()), None)
+
+
+def run(call: list[str], environment: Mapping[str, str] | None = None) -> str:
+    done = subprocess.run(call, capture_output=True, text=True, env=environment, timeout=120)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
+
+
+def write(path: Path, values: np.ndarray) -> Path:
+    assert oiio.ImageBuf(np.ascontiguousarray(values)).write(str(path))
+    return path
+
+
+def crop() -> tuple[np.ndarray, np.ndarray]:
+    """A piece of the photograph, 8-bit sRGB ``[H, W, 3]``, and its depth in whole millimetres ``[H, W, 1]``."""
+    piece = np.s_[150:246, 300:428]
+    disparity = np.load(DATA / "motorcycle_disp.npz")["arr_0"][piece][..., None]
+    depth_mm = np.where(np.isfinite(disparity), 1000 * SCALE / (disparity + OFFSET), 0)
+    return np.rint(255 * pixels(DATA / "motorcycle_left.png")[piece]).astype(np.uint8), np.rint(depth_mm).astype(
+        np.uint16
+    )
+
+
+def linear(encoded: np.ndarray) -> np.ndarray:
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def rendered(exported: Any, light: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
+    """What the file makes of ``[H, W, 3]`` light and ``[H, W, 1]`` metres in Python's onnxruntime."""
+    image, depth = (torch.tensor(x.transpose(2, 0, 1)[None], dtype=torch.float32) for x in (light, depth_m))
+    out = exported.render(image, depth, torch.tensor([FOCUS_M]), torch.tensor([F_NUMBER]))
+    return out[0].numpy().transpose(1, 2, 0)
+
+
+def test_python_needs_no_torch(plain: Any, tmp_path: Path) -> None:
+    (tmp_path / "torch.py").write_text("raise ImportError('torch was imported')")
+    (tmp_path / "torchdof.py").write_text("raise ImportError('torchdof was imported')")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    check = subprocess.run([sys.executable, "-c", "import torch"], env=environment, capture_output=True, text=True)
+    assert "torch was imported" in check.stderr
+    call = [sys.executable, str(EMBED / "run_onnx.py"), str(plain.path)]
+    call += [str(DATA / "motorcycle_left.png"), str(DATA / "motorcycle_disp.npz"), str(tmp_path / "out.png")]
+    call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER)]
+    told = run([*call, "--disparity-scale", str(SCALE), "--disparity-offset", str(OFFSET)], environment)
+    assert "741 x 500" in told and "'disc'" in told
+    sharp, blurred = (pixels(path)[..., :3] for path in (DATA / "motorcycle_left.png", tmp_path / "out.png"))
+    assert sharp.shape == blurred.shape
+    assert 0.002 < np.abs(sharp - blurred).mean() < 0.2
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
+@pytest.mark.skipif(
+    not (NODE_FOLDER / "node_modules" / "onnxruntime-web").is_dir(),
+    reason="onnxruntime-web is not installed: npm install --prefix build/node onnxruntime-web",
+)
+@pytest.mark.parametrize("kind", ["png", "npy"])
+def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path, kind: str) -> None:
+    shutil.copytree(EMBED / "javascript", tmp_path / "sample")
+    (tmp_path / "sample" / "node_modules").symlink_to(NODE_FOLDER / "node_modules")
+    photo, depth_mm = crop()
+    depth_file = tmp_path / f"depth.{kind}"
+    if kind == "png":
+        write(depth_file, depth_mm)
+    else:
+        np.save(depth_file, depth_mm[..., 0] / 1000)
+    call = ["node", str(tmp_path / "sample" / "run_onnx.mjs"), str(plain.path)]
+    call += [str(write(tmp_path / "photo.png", photo)), str(depth_file), str(tmp_path / "out.png")]
+    call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER), "--scale", "0.001" if kind == "png" else "1"]
+    assert "128 x 96" in run(call)
+    value = rendered(plain, linear(photo / 255), np.where(depth_mm > 0, depth_mm / 1000, np.nan)).clip(0, 1)
+    codes = np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
+    difference = np.abs(np.rint(255 * pixels(tmp_path / "out.png")[..., :3]) - codes)
+    assert difference.max() <= 1 and (difference > 0).mean() < 1e-3
+
+
+@pytest.mark.skipif(
+    header_folder() is None,
+    reason="onnxruntime's C++ headers are not installed: Debian's libonnxruntime-dev, or an unpacked release in "
+    "TORCHDOF_ONNXRUNTIME",
+)
+@pytest.mark.skipif(shutil.which("cmake") is None or shutil.which("c++") is None, reason="no CMake or C++ compiler")
+def test_cpp_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> None:
+    spec = importlib.util.find_spec("onnxruntime")
+    assert spec is not None and spec.origin is not None
+    (library,) = Path(spec.origin).parent.glob("capi/libonnxruntime.so.*")
+    release = (
+        tmp_path / "onnxruntime"
+    )  # as a release is laid out, of the headers that are here and the library from PyPI
+    (release / "lib").mkdir(parents=True)
+    (release / "include").symlink_to(str(header_folder()))
+    for name in ("libonnxruntime.so", "libonnxruntime.so.1"):
+        (release / "lib" / name).symlink_to(library)
+    configure = ["cmake", "-S", str(EMBED / "cpp"), "-B", str(tmp_path / "build"), f"-DONNXRUNTIME={release}"]
+    run([*configure, "-DCMAKE_CXX_FLAGS=-Wall -Wextra -Werror"])
+    run(["cmake", "--build", str(tmp_path / "build")])
+    photo, depth_mm = crop()
+    light, depth_m = linear(photo / 255), np.where(depth_mm > 0, depth_mm / 1000, np.nan).astype(np.float32)
+    call = [str(tmp_path / "build" / "run_onnx"), str(plain.path), str(write(tmp_path / "image.pfm", light))]
+    call += [str(write(tmp_path / "depth.pfm", depth_m)), str(tmp_path / "out.pfm"), str(FOCUS_M), str(F_NUMBER)]
+    assert "128 x 96" in run(call)
+    out = np.frombuffer((tmp_path / "out.pfm").read_bytes()[-light.nbytes :], "<f4").reshape(light.shape)[::-1]
+    np.testing.assert_allclose(out, rendered(plain, light, depth_m), atol=1e-6)
+    refused = subprocess.run([*call[:3], str(EMBED / "README.md"), *call[4:]], capture_output=True, text=True)
+    assert refused.returncode == 1 and "README.md is not a little-endian PFM file" in refused.stderr

@@ -1,0 +1,62 @@
+"""The templates for render farms: they call options that there are, and their own validators take them."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+import typer
+
+from torchdof.cli.render import render
+
+FARM = Path(__file__).parents[2] / "examples" / "farm"
+SHOT = ["Image=/s/b.####.exr", "Depth=/s/d.####.exr", "Out=/s/o.####.exr", "Frames=1-48", "ChunkFrames=5"]
+
+
+def installed(*names: str) -> pytest.MarkDecorator:
+    missing = [name for name in names if importlib.util.find_spec(name) is None]
+    return pytest.mark.skipif(bool(missing), reason=f"not installed: {', '.join(missing)}")
+
+
+def options_of_render() -> set[str]:
+    app = typer.Typer()
+    app.command()(render)
+    return {option for parameter in typer.main.get_command(app).params for option in parameter.opts}
+
+
+def test_the_openjd_template_calls_options_that_there_are() -> None:
+    text = (FARM / "openjd.yaml").read_text()
+    called = set(re.findall(r"^ +- (--[a-z-]+)$", text, flags=re.MULTILINE))
+    assert {"--frames", "--resume", "--out", "--focus-m"} <= called <= options_of_render()
+    declared = set(re.findall(r"^  - name: (\w+)$", text, flags=re.MULTILINE)) - {"Render"}
+    assert set(re.findall(r"\{\{Param\.(\w+)\}\}", text)) == declared
+
+
+@installed("openjd")
+def test_openjd_takes_its_template() -> None:
+    tool = str(Path(sys.executable).with_name("openjd"))
+    template = str(FARM / "openjd.yaml")
+    told = subprocess.run([tool, "check", template], capture_output=True, text=True, check=True).stdout
+    assert "passes validation checks" in told
+    parameters = [word for value in SHOT for word in ("-p", value)]
+    told = subprocess.run([tool, "summary", template, *parameters], capture_output=True, text=True, check=True).stdout
+    assert "Total tasks: 48" in told
+
+
+@installed("outline", "opencue")
+def test_opencue_takes_its_job(tmp_path: Path) -> None:
+    command = [sys.executable, str(FARM / "cue_job.py"), "--image", "/s/b.####.exr", "--out", "/s/o.####.exr"]
+    command += ["--frames", "1-48", "--chunk", "5", "--print", "--", "--focus-m", "2"]
+    told = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**os.environ, "HOME": str(tmp_path)}
+    ).stdout
+    layer = ElementTree.fromstring(told[told.index("<spec>") :]).find("./job/layers/layer")
+    assert layer is not None
+    assert (layer.findtext("range"), layer.findtext("chunk")) == ("1-48", "5")
+    words = str(layer.findtext("cmd")).split()
+    assert words[-4:] == ["2", "--resume", "--frames", "#FRAME_START#-#FRAME_END#"]
+    assert {word for word in words if word.startswith("--")} <= options_of_render()

@@ -1,0 +1,136 @@
+"""The page of `examples/web`, built and used in headless Chromium; skipped where that is not installed."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from filelock import FileLock
+
+ROOT = Path(__file__).parents[2]
+NODE_FOLDER = Path(os.environ.get("TORCHDOF_NODE_FOLDER", ROOT / "build" / "node"))
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None)
+
+pytestmark = [
+    pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed"),
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: apt-get install chromium-headless-shell"),
+    pytest.mark.skipif(
+        not all((NODE_FOLDER / "node_modules" / name).is_dir() for name in ("onnxruntime-web", "playwright-core")),
+        reason="packages are missing: npm install --prefix build/node onnxruntime-web playwright-core",
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def used(plain: Any, shared_folder: Path) -> tuple[Path, Mapping[str, Any]]:
+    """The folder with the page and what was saved from it, and what was seen while it was used."""
+    folder = shared_folder / "page"
+    environment = os.environ | {"TORCHDOF_NODE_FOLDER": str(NODE_FOLDER), "PYTHON": sys.executable}
+    with FileLock(shared_folder / "page.lock"):
+        if not (folder / "results.json").exists():
+            folder.mkdir(exist_ok=True)
+            build = ["node", str(ROOT / "examples" / "web" / "build.mjs"), "--out", str(folder / "dist")]
+            run([*build, "--model", str(plain.path)], environment)
+            use = ["node", str(Path(__file__).with_name("web.mjs"))]
+            run([*use, str(folder / "dist"), str(folder), str(CHROMIUM)], environment)
+    return folder, json.loads((folder / "results.json").read_text())
+
+
+def run(call: list[str], environment: Mapping[str, str]) -> None:
+    done = subprocess.run(call, capture_output=True, text=True, env=environment, timeout=240)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT))
+
+
+def expected(exported: Any, folder: Path, u: float, v: float, f_number: float) -> tuple[np.ndarray, float]:
+    """8-bit sRGB of the file in onnxruntime, focused on a point of the sample, and the distance of that point."""
+    sample = folder / "dist" / "sample"
+    encoded = pixels(sample / "motorcycle.png")[..., :3]
+    depth = np.round(pixels(sample / "motorcycle_depth.png")[..., 0] * 65535) / 1000
+    height, width = depth.shape
+    row, column = int(v * height), int(u * width)
+    focus_m = float(np.median(depth[row - 2 : row + 3, column - 2 : column + 3]))
+    light = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    tensors = [light.transpose(2, 0, 1)[None], depth[None, None], [focus_m], [f_number]]
+    out = exported.render(*(torch.tensor(np.asarray(x), dtype=torch.float32) for x in tensors))[0]
+    value = np.clip(out.numpy().transpose(1, 2, 0), 0, 1)
+    return np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)), focus_m
+
+
+@pytest.mark.parametrize("name, u, v", [("near", 0.55, 0.6), ("far", 0.2, 0.12)])
+def test_a_click_gives_the_picture_of_the_file(plain: Any, used: Any, name: str, u: float, v: float) -> None:
+    folder, seen = used
+    picture, focus_m = expected(plain, folder, u, v, 2 ** (-3 / 6))
+    assert seen[f"{name}Focus"] == f"{focus_m:.2f} m"
+    saved = np.rint(255 * pixels(folder / f"{name}.png")[..., :3])
+    assert saved.shape == picture.shape
+    assert (np.abs(saved - picture) > 1).mean() < 1e-4
+
+
+def test_a_click_sharpens_where_it_falls_and_blurs_elsewhere(used: Any) -> None:
+    folder, _ = used
+    sharp, near, far = (
+        pixels(path)[..., :3]
+        for path in (folder / "dist/sample/motorcycle.png", folder / "near.png", folder / "far.png")
+    )
+    for u, v, focused, other in ((0.55, 0.6, near, far), (0.2, 0.12, far, near)):
+        row, column = int(v * sharp.shape[0]), int(u * sharp.shape[1])
+        window = np.s_[row - 4 : row + 5, column - 4 : column + 5]
+        assert np.abs(focused - sharp)[window].mean() < 0.002
+        assert np.abs(other - sharp)[window].mean() > 0.008
+
+
+def test_nothing_is_fetched_from_elsewhere_and_nothing_is_complained_of(used: Any) -> None:
+    _, seen = used
+    assert seen["elsewhere"] == [] and seen["console"] == []
+
+
+def test_a_file_is_saved_under_a_telling_name(used: Any) -> None:
+    folder, seen = used
+    assert seen["nearName"] == f"motorcycle_f0.7_{seen['nearFocus'].removesuffix(' m')}m.png"
+
+
+def test_half_the_size_is_shown_while_a_control_moves_and_the_full_size_then(used: Any) -> None:
+    _, seen = used
+    halves = [message["half"] for message in seen["dragAsked"] if message["type"] == "render"]
+    assert halves[0] is True and halves[-1] is False
+    assert [m["half"] for m in seen["nearAsked"] if m["type"] == "render"][-1] is False
+
+
+def test_everything_works_with_the_keyboard_and_has_a_name(used: Any) -> None:
+    _, seen = used
+    assert seen["aperture"] == ["f/0.7", "f/1.4"]
+    assert seen["keyboardFocus"][0] != seen["keyboardFocus"][1]
+    assert seen["divider"] == "80" and seen["depthIsShown"]
+    assert seen["unnamed"] == []
+
+
+def test_bad_files_are_answered_with_what_to_do(used: Any) -> None:
+    problems = used[1]["problems"]
+    assert "notes.jpg: this browser cannot open it" in problems["photo"] and "JPEG or PNG" in problems["photo"]
+    assert "in colour" in problems["depth"] and "shades of grey" in problems["depth"]
+    assert "one value everywhere" in problems["flat"]
+    assert "cut_depth.png" in problems["damaged"] and "damaged" in problems["damaged"]
+    assert "90 × 60" in problems["frame"] and "40 × 60" in problems["frame"]
+
+
+def test_relative_depth_lies_between_the_distances_given_and_can_be_turned(used: Any) -> None:
+    _, seen = used
+    assert seen["ownKind"] == "disparity"
+    assert float(seen["ownNear"].removesuffix(" m")) < 1.1 and float(seen["ownTurned"].removesuffix(" m")) > 7.5
+
+
+def test_the_page_fits_a_phone(used: Any) -> None:
+    _, seen = used
+    assert all(seen[f"{name}_overflow"] == 0 for name in ("desktop_light", "phone_light", "phone_dark"))

@@ -1,0 +1,163 @@
+// Uses the page in headless Chromium as people do: node web.mjs DIST OUT CHROMIUM
+// Leaves OUT/results.json, the saved PNG files and screenshots. DIST is the page, as examples/web/build.mjs writes it.
+import { spawn } from 'node:child_process'
+import { writeFileSync } from 'node:fs'
+import { createRequire } from 'node:module'
+import { dirname, join } from 'node:path'
+import { fileURLToPath } from 'node:url'
+
+const [dist, out, executablePath] = process.argv.slice(2)
+const require = createRequire(join(process.env.TORCHDOF_NODE_FOLDER, 'package.json'))
+const { chromium } = require('playwright-core')
+const root = join(dirname(fileURLToPath(import.meta.url)), '..', '..')
+const server = spawn('node', [join(root, 'examples', 'web', 'serve.mjs'), dist, '0'])
+const address = await new Promise((resolve) => server.stdout.once('data', (text) => resolve(String(text).trim())))
+const browser = await chromium.launch({ executablePath, args: ['--no-sandbox'] })
+const results = { console: [], elsewhere: [], problems: {} }
+
+const context = await browser.newContext({ viewport: { width: 1280, height: 860 }, acceptDownloads: true })
+await context.addInitScript(() => {
+  window.asked = []
+  const post = Worker.prototype.postMessage
+  Worker.prototype.postMessage = function (message, ...rest) {
+    window.asked.push({ type: message.type, half: message.half })
+    return post.call(this, message, ...rest)
+  }
+})
+const page = await context.newPage()
+page.on('console', (message) => ['error', 'warning'].includes(message.type()) && results.console.push(message.text()))
+page.on('pageerror', (error) => results.console.push(String(error)))
+page.on('request', (request) => {
+  if (!request.url().startsWith(address) && !/^(blob|data):/.test(request.url())) results.elsewhere.push(request.url())
+})
+
+const isDone = () => document.querySelector('#status').textContent.includes('Click what should be sharp')
+const done = () => page.waitForFunction(isDone, null, { timeout: 120_000 })
+const text = (selector) => page.locator(selector).innerText()
+const asked = () => page.evaluate(() => window.asked.splice(0))
+async function clickAt(u, v) {
+  const box = await page.locator('#frame').boundingBox()
+  const begin = Date.now()
+  await page.mouse.click(box.x + u * box.width, box.y + v * box.height)
+  await done()
+  return (Date.now() - begin) / 1000
+}
+async function save(name) {
+  const [download] = await Promise.all([page.waitForEvent('download'), page.click('#save')])
+  await download.saveAs(join(out, name))
+  return download.suggestedFilename()
+}
+async function problemOf(input, name, mimeType, buffer) {
+  await page.setInputFiles(input, { name, mimeType, buffer })
+  await page.waitForSelector('#problem:not([hidden])')
+  return text('#problem')
+}
+
+try {
+  await page.goto(address)
+  await done()
+  results.isolated = await page.evaluate(() => window.crossOriginIsolated)
+  await page.screenshot({ path: join(out, 'opened.png') })
+
+  // By mouse: something near, then something far.
+  await asked()
+  results.nearSeconds = await clickAt(0.55, 0.6)
+  results.nearFocus = await text('#focus-value')
+  results.nearAsked = await asked()
+  results.nearName = await save('near.png')
+  await clickAt(0.2, 0.12)
+  results.farFocus = await text('#focus-value')
+  await save('far.png')
+
+  // By keyboard: the lens, the point of focus, the divider, what is shown.
+  await asked()
+  await page.focus('#aperture')
+  const before = await text('#aperture-value')
+  for (let i = 0; i < 6; i++) await page.keyboard.press('ArrowLeft')
+  await page.waitForFunction(() => window.asked.some((message) => message.half === false))
+  await done()
+  results.aperture = [before, await text('#aperture-value')]
+  results.dragAsked = await asked()
+  await page.focus('#reticle')
+  const focusBefore = await text('#focus-value')
+  for (let i = 0; i < 12; i++) await page.keyboard.press('Shift+ArrowDown')
+  results.keyboardFocus = [focusBefore, await text('#focus-value')]
+  await page.focus('#divider')
+  await page.keyboard.press('End')
+  await page.keyboard.press('Shift+ArrowLeft')
+  results.divider = await page.getAttribute('#divider', 'aria-valuenow')
+  await page.screenshot({ path: join(out, 'compared.png') })
+  await page.keyboard.press('Home')
+  await page.check('[name=view][value=depth]', { force: true })
+  results.depthIsShown = await page.isVisible('#depth-view')
+  await page.screenshot({ path: join(out, 'depth.png') })
+  await page.check('[name=view][value=picture]', { force: true })
+  await done()
+
+  // Names for whoever cannot see the controls.
+  results.unnamed = await page.evaluate(() =>
+    [...document.querySelectorAll('button, input, select, [role=slider], canvas[role=img]')]
+      .filter((e) => !(e.getAttribute('aria-label') || e.innerText?.trim() || [...(e.labels ?? [])].some((l) => l.innerText.trim())))
+      .map((e) => e.outerHTML),
+  )
+
+  // Files that are none, or do not fit. The pair that was there is kept until it is replaced.
+  const png = (name) => page.evaluate(async (colours) => {
+    const canvas = document.createElement('canvas')
+    canvas.width = colours.width
+    canvas.height = colours.height
+    const context = canvas.getContext('2d')
+    const gradient = context.createLinearGradient(0, 0, colours.width, 0)
+    colours.stops.forEach((colour, i) => gradient.addColorStop(i / (colours.stops.length - 1), colour))
+    context.fillStyle = gradient
+    context.fillRect(0, 0, colours.width, colours.height)
+    const blob = await new Promise((resolve) => canvas.toBlob(resolve, colours.type))
+    return [...new Uint8Array(await blob.arrayBuffer())]
+  }, name)
+  const picture = async (width, height, stops, type = 'image/png') =>
+    Buffer.from(await png({ width, height, stops, type }))
+  const words = Buffer.from('this is no picture')
+  results.problems.photo = await problemOf('#photo-file', 'notes.jpg', 'image/jpeg', words)
+  results.problems.depth = await problemOf('#depth-file', 'notes.npy', 'image/png', Buffer.from(await picture(60, 40, ['red', 'blue'])))
+  results.problems.flat = await problemOf('#depth-file', 'flat_depth.png', 'image/png', await picture(60, 40, ['#777', '#777']))
+  results.problems.damaged = await problemOf('#depth-file', 'cut_depth.png', 'image/png', (await picture(60, 40, ['#000', '#fff'])).subarray(0, 60))
+
+  // One's own pair, dropped together: lighter is nearer.
+  const photo = await picture(90, 60, ['#fff', '#000', '#fff', '#000', '#fff', '#000', '#fff'])
+  const depth = await picture(90, 60, ['#fff', '#000'], 'image/jpeg')
+  const transfer = await page.evaluateHandle(([photo, depth]) => {
+    const transfer = new DataTransfer()
+    transfer.items.add(new File([new Uint8Array(photo)], 'a.png', { type: 'image/png' }))
+    transfer.items.add(new File([new Uint8Array(depth)], 'a_depth.jpg', { type: 'image/jpeg' }))
+    return transfer
+  }, [[...photo], [...depth]])
+  await page.dispatchEvent('#frame', 'drop', { dataTransfer: transfer })
+  await done()
+  await clickAt(0.02, 0.2)
+  results.ownNear = await text('#focus-value')
+  results.ownKind = await page.inputValue('#kind')
+  await page.selectOption('#kind', 'depth')
+  await done()
+  await clickAt(0.02, 0.2)
+  results.ownTurned = await text('#focus-value')
+  results.problems.frame = await problemOf('#depth-file', 'tall_depth.png', 'image/png', await picture(40, 60, ['#000', '#fff']))
+
+  await page.click('#sample')
+  await done()
+  for (const [name, width, height, colorScheme] of [
+    ['desktop_light', 1280, 860, 'light'],
+    ['desktop_dark', 1280, 860, 'dark'],
+    ['phone_light', 390, 844, 'light'],
+    ['phone_dark', 390, 844, 'dark'],
+  ]) {
+    await page.emulateMedia({ colorScheme })
+    await page.setViewportSize({ width, height })
+    await page.screenshot({ path: join(out, `${name}.png`), fullPage: width < 800 })
+    const wide = await page.evaluate(() => document.documentElement.scrollWidth)
+    results[`${name}_overflow`] = wide - width
+  }
+} finally {
+  writeFileSync(join(out, 'results.json'), JSON.stringify(results, null, 2))
+  await browser.close()
+  server.kill()
+}

@@ -1,0 +1,304 @@
+"""Depth of field among Kornia's augmentations, and torchvision's."""
+
+import io
+from typing import Any
+
+import kornia.augmentation as K
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+import torchdof.augmentation
+import torchdof.io.transfer
+from torchdof import BlurTable, Camera, depth_of_field
+from torchdof.augmentation import DepthAugmentationSequential, RandomDepthOfField
+
+CAMERA = Camera(sensor_width_mm=4.0)
+
+
+def sample(count: int = 4) -> tuple[Tensor, Tensor]:
+    return torch.rand(count, 3, 18, 24), 0.6 + 3 * torch.rand(count, 1, 18, 24)
+
+
+def random_dof(**changes: Any) -> RandomDepthOfField:
+    return RandomDepthOfField(**{"camera": CAMERA, "p": 1.0, **changes})
+
+
+def test_it_is_the_rendering_of_what_was_drawn() -> None:
+    image, depth = sample()
+    aug = random_dof(transfer="linear", tolerance="preview", p=0.5)
+    torch.manual_seed(2)
+    out = aug(image, depth)
+    drawn = aug._params
+    chosen = drawn["batch_prob"] > 0.5
+    assert 0 < int(chosen.sum()) < 4
+    expected = depth_of_field(
+        image[chosen],
+        depth[chosen],
+        CAMERA,
+        focus_m=drawn["focus_m"][chosen],
+        f_number=drawn["f_number"][chosen],
+        tolerance="preview",
+    )
+    assert torch.equal(out[chosen], expected)
+    assert torch.equal(out[~chosen], image[~chosen])
+
+
+def test_images_that_are_left_out_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered = []
+
+    def noted(image: Tensor, *arguments: Any, **options: Any) -> Tensor:
+        rendered.append(len(image))
+        return depth_of_field(image, *arguments, **options)
+
+    monkeypatch.setattr(torchdof.augmentation, "depth_of_field", noted)
+    image, depth = sample()
+    drawn = {**random_dof().forward_parameters(tuple(image.shape)), "batch_prob": torch.tensor([0.0, 1.0, 0.0, 0.0])}
+    random_dof(p=0.5)(image, depth, params=drawn)
+    random_dof(p=0.0)(image, depth)
+    assert rendered == [1]
+
+
+def test_encoded_images_are_blurred_in_linear_light() -> None:
+    image, depth = sample()
+    aug = random_dof()
+    out = aug(image, depth)
+    decode, encode = (getattr(torchdof.io.transfer, name) for name in ("decode", "encode"))
+    linear = random_dof(transfer="linear")(decode(image, "srgb", False, False), depth, params=aug._params)
+    assert torch.equal(out, encode(linear, "srgb", False, False))
+
+
+def test_it_is_repeated_by_its_parameters() -> None:
+    image, depth = sample()
+    aug = random_dof(p=0.7, table=[BlurTable.disc(), BlurTable.gaussian()])
+    first = aug(image, depth)
+    drawn = aug._params
+    assert not torch.equal(first, aug(image, depth))
+    assert torch.equal(first, aug(image, depth, params=drawn))
+    assert "depth" not in drawn
+
+
+def test_draws_lie_in_their_ranges_and_differ() -> None:
+    aug = random_dof(focus_m=(0.5, float("inf")), f_number=(1.4, 8.0), table=[BlurTable.disc()] * 3)
+    drawn = aug.forward_parameters((500, 3, 4, 5))
+    assert 0.5 <= float(drawn["focus_m"].min()) < 0.51 and float(drawn["focus_m"].max()) > 20
+    assert 1.4 <= float(drawn["f_number"].min()) < 1.45 and 7.8 < float(drawn["f_number"].max()) <= 8.0
+    assert float((drawn["f_number"] < (1.4 * 8) ** 0.5).float().mean()) == pytest.approx(0.5, abs=0.1)  # stops
+    assert drawn["table"].bincount().tolist() == pytest.approx([167] * 3, abs=50)
+
+
+def test_a_batch_can_share_its_draw() -> None:
+    image, depth = sample()
+    aug = random_dof(same_on_batch=True, p=0.5)
+    aug(image, depth)
+    for name in ("focus_m", "f_number", "table", "batch_prob"):
+        assert len(set(aug._params[name].tolist())) == 1
+
+
+def test_several_lenses_blur_each_their_own_images() -> None:
+    image, depth = sample()
+    tables = [BlurTable.disc(), BlurTable.gaussian()]
+    aug = random_dof(table=tables)
+    drawn = {**aug.forward_parameters(tuple(image.shape)), "table": torch.tensor([0, 1, 1, 0])}
+    out = aug(image, depth, params=drawn)
+    for k, table in enumerate(tables):
+        alone = random_dof(table=table)(image, depth, params={**drawn, "table": torch.zeros(4, dtype=torch.long)})
+        assert torch.equal(out[drawn["table"] == k], alone[drawn["table"] == k])
+
+
+@pytest.mark.parametrize("shape", [(4, 18, 24), (1, 1, 18, 24)])
+def test_depth_may_lack_its_channel_or_be_shared(shape: tuple[int, ...]) -> None:
+    image, depth = sample()
+    depth = depth[: shape[0]]
+    aug = random_dof()
+    expected = aug(image, depth.expand(4, -1, -1, -1))
+    assert torch.equal(aug(image, depth.reshape(shape), params=aug._params), expected)
+
+
+def test_one_image_is_kept_or_becomes_a_batch() -> None:
+    image, depth = sample(1)
+    aug = random_dof(keepdim=True)
+    out = aug(image[0], depth[0])
+    assert out.shape == (3, 18, 24)
+    assert torch.equal(random_dof()(image[0], depth[0, 0], params=aug._params)[0], out)
+
+
+def test_the_last_channel_is_the_depth_and_is_returned() -> None:
+    image, depth = sample()
+    aug = random_dof()
+    out = aug(torch.cat([image, depth], dim=1))
+    assert torch.equal(out[:, 3:], depth)
+    assert torch.equal(out[:, :3], aug(image, depth, params=aug._params))
+
+
+def test_gradients_reach_image_and_depth() -> None:
+    image, depth = sample()
+    image.requires_grad_()
+    depth.requires_grad_()
+    random_dof(p=0.5)(image, depth).square().sum().backward()
+    assert image.grad is not None and depth.grad is not None and bool(depth.grad.any())
+
+
+# In Kornia's containers
+
+
+def test_image_depth_and_masks_stay_aligned() -> None:
+    image, depth = sample()
+    labels = (depth > 2).float()
+    dof = random_dof()
+    pipeline = DepthAugmentationSequential(
+        K.RandomHorizontalFlip(p=0.5),
+        K.RandomAffine(20.0, p=1.0),
+        K.RandomResizedCrop((12, 16)),
+        dof,
+        data_keys=["input", "mask", "mask"],
+    )
+    out, moved, moved_labels = pipeline(image, depth, labels)
+    assert out.shape == (4, 3, 12, 16) and moved.shape == moved_labels.shape == (4, 1, 12, 16)
+    assert torch.equal(moved_labels, (moved > 2).float())
+    assert set(moved.unique().tolist()) <= {0.0, *depth.unique().tolist()}  # no depth is made up
+    drawn, steps = pipeline._params or [], list[Any](pipeline.children())
+    sharp, same = K.AugmentationSequential(*steps[:3], data_keys=["input", "mask"])(image, depth, params=drawn[:3])
+    assert torch.equal(same, moved)
+    assert torch.equal(out, dof(sharp, moved, params=drawn[3].data))
+    again = pipeline(image, depth, labels, params=drawn)
+    assert all(torch.equal(a, b) for a, b in zip(again, (out, moved, moved_labels), strict=True))
+
+
+def test_a_dict_goes_through_the_sequence() -> None:
+    image, depth = sample()
+    pipeline = DepthAugmentationSequential(K.RandomHorizontalFlip(p=1.0), random_dof(), data_keys=None)
+    out = pipeline({"image": image, "mask_depth": depth, "mask_labels": depth.clone(), "name": "a"})
+    assert torch.equal(out["mask_depth"], depth.flip(-1)) and torch.equal(out["mask_labels"], depth.flip(-1))
+    drawn: Any = pipeline._params
+    assert torch.equal(out["image"], random_dof()(image.flip(-1), depth.flip(-1), params=drawn[1].data))
+    assert out["name"] == "a"
+
+
+@pytest.mark.parametrize("container", ["image", "augmentation", "video"])
+def test_the_fourth_channel_goes_through_kornias_own_containers(container: str) -> None:
+    image, depth = sample()
+    steps, dof = K.RandomHorizontalFlip(p=1.0), random_dof(same_on_batch=True)
+    both = torch.cat([image, depth], dim=1)
+    out: Any
+    if container == "image":
+        out = K.ImageSequential(steps, dof)(both)
+    elif container == "video":
+        out = K.VideoSequential(steps, dof, data_format="BTCHW")(both[None])[0]
+    else:
+        out, mask = K.AugmentationSequential(steps, dof, data_keys=["input", "mask"])(both, depth)
+        assert torch.equal(mask, depth.flip(-1))
+    assert torch.equal(out[:, 3:], depth.flip(-1))
+    drawn = {name: dof._params[name][:1].expand(4) for name in ("focus_m", "f_number", "table", "batch_prob")}
+    assert torch.equal(out[:, :3], dof(image.flip(-1), depth.flip(-1), params=drawn))
+
+
+def test_pixels_that_a_rotation_leaves_without_depth_stay_sharp() -> None:
+    image, depth = torch.rand(1, 3, 24, 24), torch.full((1, 1, 24, 24), 3.0)
+    pipeline = DepthAugmentationSequential(
+        K.RandomRotation((45.0, 45.0), p=1.0), random_dof(focus_m=(0.6, 0.7)), data_keys=["input", "mask"]
+    )
+    out, moved = pipeline(image, depth)
+    assert bool(torch.isfinite(out).all()) and not bool(moved[..., 0, 0].any())
+    assert float(out[..., 0, 0].abs().max()) == 0.0
+
+
+# In torchvision's, and in a DataLoader
+
+
+def test_torchvision_composes_dicts_of_its_tensors() -> None:
+    v2 = pytest.importorskip("torchvision.transforms.v2", reason="torchvision is not installed")
+    tv = pytest.importorskip("torchvision.tv_tensors", reason="torchvision is not installed")
+    image, depth = sample(1)
+    dof = random_dof()
+    pipeline = v2.Compose([v2.RandomHorizontalFlip(p=1.0), dof, v2.Normalize([0.5] * 3, [0.5] * 3)])
+    data = {"image": tv.Image(image[0]), "depth": tv.Mask(depth[0, 0]), "labels": tv.Mask(depth[0]), "index": 3}
+    out = pipeline(data)
+    assert isinstance(out["image"], tv.Image) and isinstance(out["depth"], tv.Mask) and out["index"] == 3
+    assert torch.equal(out["depth"], depth[0, 0].flip(-1)) and torch.equal(out["labels"], depth[0].flip(-1))
+    expected = dof(image.flip(-1), depth.flip(-1), params=dof._params)[0]
+    assert torch.equal(out["image"].as_subclass(Tensor), (expected - 0.5) / 0.5)
+
+
+def test_a_dict_of_plain_tensors_is_taken_too() -> None:
+    image, depth = sample(1)
+    dof = random_dof()
+    out = dof({"image": image[0], "depth": depth[0]})
+    assert torch.equal(out["image"], dof(image, depth, params=dof._params)[0]) and out["depth"] is not None
+
+
+class Blurred(Dataset[Tensor]):
+    """Sixteen times the same image, blurred at random."""
+
+    def __init__(self) -> None:
+        self.image, self.depth = sample(1)
+        self.blur = random_dof(keepdim=True)
+
+    def __len__(self) -> int:
+        return 16
+
+    def __getitem__(self, index: int) -> Tensor:
+        return self.blur(self.image[0], self.depth[0])
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 4 worker processes:UserWarning")  # with fewer cores
+def test_four_workers_of_a_data_loader_blur_each_image_by_a_draw_of_its_own() -> None:
+    torch.manual_seed(5)
+    loader = DataLoader(Blurred(), batch_size=4, num_workers=4)
+    images = torch.cat(list(loader))
+    assert len(images) == 16 and len(images.flatten(1).unique(dim=0)) == 16
+    torch.manual_seed(5)
+    assert torch.equal(torch.cat(list(DataLoader(Blurred(), batch_size=4, num_workers=4))), images)
+
+
+def test_it_is_pickled_with_its_lenses() -> None:
+    image, depth = sample()
+    aug = random_dof(table=[BlurTable.gaussian(), BlurTable.load("sato_j15")])
+    file = io.BytesIO()
+    torch.save(aug, file)
+    file.seek(0)
+    copy = torch.load(file, weights_only=False)
+    expected = aug(image, depth)
+    assert torch.equal(copy(image, depth, params=aug._params), expected)
+
+
+# Refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"focus_m": 2.0}, "focus_m must be two numbers"),
+        ({"focus_m": (5.0, 0.5)}, "focus_m must be two numbers, the smallest first"),
+        ({"focus_m": (0.0, 5.0)}, "focus_m must be a number > 0"),
+        ({"focus_m": (0.04, 5.0)}, "focus_m must be longer than the focal length"),
+        ({"f_number": (1.4, float("inf"))}, "f_number must be a number"),
+        ({"table": []}, "table must be"),
+        ({"table": ["disc"]}, "table must be a torchdof.BlurTable, got str"),
+        ({"transfer": "gamma"}, "transfer must be 'linear' or 'srgb'"),
+        ({"camera": 50}, "camera must be a torchdof.Camera"),
+        ({"tolerance": 2.0}, "tolerance must be a number"),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RandomDepthOfField(**arguments)
+
+
+def test_an_image_without_depth_is_refused_saying_how_to_give_it() -> None:
+    image, depth = sample()
+    with pytest.raises(ValueError, match=r"needs a depth: .*DepthAugmentationSequential.*3 channels alone"):
+        K.AugmentationSequential(random_dof(), data_keys=["input", "mask"])(image, depth)
+    with pytest.raises(ValueError, match="a dict must have 'image' and 'depth', got the keys image"):
+        random_dof()({"image": image})
+    with pytest.raises(ValueError, match=r"depth must be \[4, 1, 18, 24\].* got \[1, 3, 18, 24\]"):
+        random_dof()(image, depth[:3, 0])
+
+
+def test_values_that_are_not_encoded_are_refused() -> None:
+    image, depth = sample()
+    with pytest.raises(ValueError, match=r"must lie in \[0, 1\].*put normalization behind"):
+        random_dof()((image - 0.5) / 0.2, depth)
+    with pytest.raises(ValueError, match=r"floating-point tensor.*image.float\(\) / 255"):
+        random_dof()((image * 255).byte(), depth)

@@ -1,0 +1,292 @@
+"""Random depth of field among Kornia's augmentations: its parameters, containers and rules of repetition.
+
+``RandomDepthOfField`` sits in Kornia's ``ImageSequential`` and ``AugmentationSequential`` with the depth as the last
+channel of the image, in ``DepthAugmentationSequential`` with the depth as a mask, resampled as masks are, and in
+``torchvision.transforms.v2.Compose`` with samples that are dicts.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Unpack
+
+import torch
+from kornia.augmentation import AugmentationSequential, IntensityAugmentationBase2D
+from kornia.augmentation import random_generator as rg
+from kornia.augmentation.container.ops import AugmentationSequentialOps
+from kornia.augmentation.container.params import ParamItem
+from kornia.constants import DataKey
+from torch import Tensor, nn
+
+from .io.transfer import Transfer, decode, encode
+from .module import depth_of_field
+from .optics.blur_table import BlurTable
+from .optics.camera import Camera
+from .options import OptionArguments, Options, spells_options
+from .validation import floating, image_and_map, number, show
+
+__all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
+
+_DISPLAYED = (-0.5, 1.5)  # what resampling may make of values from 0 to 1
+_IMAGE_NAMES = ("image", "input", "img")
+
+
+@spells_options
+class RandomDepthOfField(IntensityAugmentationBase2D):
+    """Blurs images by their depth with a random focus, f-number and lens.
+
+    Focus is drawn evenly in dioptres (1 / metres) and the f-number evenly in stops, because blur and light go with
+    these; both, and the lens, are kept in ``_params`` and repeated by ``aug(image, depth, params=aug._params)``. Images
+    that ``p`` leaves out are returned as they are, and cost nothing.
+
+    The depth comes in one of three ways: as the second argument, as the last channel of an image of two or four
+    channels (which is returned with it, unchanged), or under the key ``"depth"`` of a dict.
+
+    Where the depth is not > 0, as in the corners that a rotation leaves, pixels stay sharp: ``check`` is False unless
+    you say otherwise. A crop narrows the field of view, and so does a camera with a smaller ``sensor_width_mm``: the
+    camera given is that of the image as it arrives here.
+
+    Args:
+        focus_m: Nearest and farthest focus distance in metres, > 0, ``inf`` allowed.
+        f_number: Smallest and largest f-number, > 0.
+        camera: Focal length, sensor width and focus breathing; its own focus and f-number are not used.
+        table: Blur measured from a lens, or several, of which one is drawn for each image; None takes the ideal disc.
+        transfer: How images are encoded: ``"srgb"``, as files and data sets hold them (in [0, 1]; put normalization
+            behind), or ``"linear"`` light.
+        same_on_batch: Draw once for the whole batch.
+        p: Probability of each image to be blurred.
+        keepdim: Return one image ``[C, H, W]`` as such, not as a batch of one.
+        **options: As in :class:`torchdof.options.Options`.
+
+    Raises:
+        ValueError: If an argument is not as described.
+
+    Example:
+        >>> aug = RandomDepthOfField(focus_m=(0.5, 5.0), f_number=(1.4, 8.0), p=1.0)
+        >>> image, depth = torch.rand(2, 3, 8, 12), 1 + torch.rand(2, 1, 8, 12)
+        >>> blurred = aug(image, depth)
+        >>> torch.equal(blurred, aug(image, depth, params=aug._params))
+        True
+    """
+
+    def __init__(
+        self,
+        focus_m: tuple[float, float] = (0.5, 5.0),
+        f_number: tuple[float, float] = (1.4, 8.0),
+        camera: Camera | None = None,
+        table: BlurTable | Sequence[BlurTable] | None = None,
+        transfer: Transfer = "srgb",
+        same_on_batch: bool = False,
+        p: float = 0.5,
+        keepdim: bool = False,
+        **options: Unpack[OptionArguments],
+    ) -> None:
+        super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
+        near_m, far_m = _range("focus_m", focus_m, math.inf)
+        widest, narrowest = _range("f_number", f_number, 1e300)
+        self.camera = Camera() if camera is None else camera
+        if not isinstance(self.camera, Camera):
+            raise ValueError(f"camera must be a torchdof.Camera, got {show(camera)}")
+        self.camera.replace(focus_m=near_m, f_number=widest)
+        tables = [table] if table is None or isinstance(table, BlurTable) else [*table]
+        if not tables:
+            raise ValueError("table must be a torchdof.BlurTable, several, or None, got an empty list")
+        if transfer not in ("linear", "srgb"):
+            raise ValueError(f"transfer must be 'linear' or 'srgb', got {show(transfer)}")
+        options.setdefault("check", False)
+        self.focus_m, self.f_number = (near_m, far_m), (widest, narrowest)
+        self.renderings = [Options.of(table, **options) for table in tables]
+        self.flags = {"transfer": transfer}
+        self._param_generator = rg.PlainUniformGenerator(
+            ((1.0 / far_m, 1.0 / near_m), "focus", None, None),  # dioptres
+            ((2 * math.log2(widest), 2 * math.log2(narrowest)), "f_number", None, None),  # stops
+            ((0.0, float(len(tables))), "table", None, None),
+        )
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """Draws ``focus_m`` [m], ``f_number`` and ``table`` (which of several), each ``[B]``."""
+        drawn = super().generate_parameters(batch_shape)
+        return {
+            "focus_m": (1.0 / drawn["focus"]).clamp(*self.focus_m),
+            "f_number": torch.exp2(drawn["f_number"] / 2).clamp(*self.f_number),
+            "table": drawn["table"].long().clamp_max(len(self.renderings) - 1),
+        }
+
+    def forward(  # type: ignore[override]  # the depth comes second, where Kornia has the parameters
+        self,
+        input: Any,
+        depth: Tensor | None = None,
+        params: dict[str, Tensor] | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        """Augment.
+
+        Args:
+            input: ``[B, C, H, W]`` or ``[C, H, W]``; without a depth beside it, its last channel is the depth. Or a
+                dict with ``"image"`` (or ``"input"``, ``"img"``) and ``"depth"``, which is returned with that image
+                replaced.
+            depth: Metres, ``[B, 1, H, W]``, ``[B, H, W]`` or ``[1, 1, H, W]``; of one image ``[1, H, W]`` or
+                ``[H, W]``.
+            params: Parameters of an earlier call, to repeat it; None draws new ones.
+            **kwargs: What Kornia's containers pass on.
+
+        Returns:
+            Images of the shape of ``input`` (a batch unless ``keepdim``), in its dtype, or the dict.
+
+        Raises:
+            ValueError: If there is no depth, or shapes or values are not as described.
+        """
+        if isinstance(input, Mapping):
+            return self._forward_dict(input, params, **kwargs)
+        if depth is not None:
+            shape = _batch_shape(input)
+            params = dict(self.forward_parameters(shape) if params is None else params)
+            params["depth"] = depth
+        try:
+            return super().forward(input, params, **kwargs)
+        finally:
+            self._params.pop("depth", None)  # it is an input, not a parameter: nothing keeps it, nothing repeats it
+
+    def _forward_dict(
+        self, sample: Mapping[str, Any], params: dict[str, Tensor] | None, **kwargs: Any
+    ) -> dict[str, Any]:
+        """A sample as torchvision's transforms pass it on."""
+        name = next((name for name in _IMAGE_NAMES if name in sample), None)
+        if name is None or "depth" not in sample:
+            raise ValueError(f"a dict must have 'image' and 'depth', got the keys {', '.join(map(str, sample))}")
+        image, depth = (_plain(sample[key]) for key in (name, "depth"))
+        blurred = self.forward(image, depth, params, **kwargs).reshape(image.shape)
+        return {**sample, name: _as(sample[name], blurred)}
+
+    def apply_transform(
+        self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
+    ) -> Tensor:
+        """Blurs the images that ``params`` select, ``[B, C, H, W]``."""
+        depth = params.get("depth")
+        image, kept = input, input[:, :0]
+        if depth is None:
+            if input.shape[1] not in (2, 4):
+                raise ValueError(
+                    "RandomDepthOfField needs a depth: give it as the second argument or as the last channel of an "
+                    "image of 2 or 4 channels, or use torchdof.augmentation.DepthAugmentationSequential, whose first "
+                    f"mask is the depth; got an image of {input.shape[1]} channels alone"
+                )
+            image, depth, kept = input[:, :-1], input[:, -1:], input[:, -1:]
+        if depth.ndim in (2, 3):
+            depth = depth.unsqueeze(-3) if depth.ndim == 2 or len(depth) == len(input) else depth
+            depth = depth if depth.ndim == 4 else depth[None]
+        image_and_map(image, "depth", depth, "in metres")
+        depth = depth.expand(len(input), -1, -1, -1)
+        chosen = self._chosen(params, len(input))
+        out = image
+        for index in params["table"][chosen].unique().tolist():
+            items = chosen[params["table"][chosen] == index]
+            items = items.to(input.device)
+            rendered = self._blurred(image[items], depth[items], params, items, int(index), flags["transfer"])
+            out = out.index_copy(0, items, rendered)
+        return torch.cat([out, kept], dim=1)
+
+    def _chosen(self, params: Mapping[str, Tensor], count: int) -> Tensor:
+        """Numbers of the items to blur; where all are always blurred, Kornia does not look at the gate."""
+        if self.p == 1.0 and self.p_batch == 1.0:
+            return torch.arange(count)
+        return torch.atleast_1d(params["batch_prob"] > 0.5).expand(count).nonzero()[:, 0].cpu()
+
+    def _blurred(
+        self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor], items: Tensor, index: int, transfer: Transfer
+    ) -> Tensor:
+        """Items of one lens, ``[N, C, H, W]``."""
+        if transfer == "srgb":
+            low, high = (float(value) for value in image.detach().aminmax())
+            if not _DISPLAYED[0] <= low <= high <= _DISPLAYED[1]:
+                raise ValueError(
+                    f"images with transfer='srgb' must lie in [0, 1], got {low:.4g} to {high:.4g}; put normalization "
+                    "behind RandomDepthOfField, or say transfer='linear'"
+                )
+            image = decode(image, "srgb", has_alpha=False, straight=False)
+        options: Any = self.renderings[index].arguments()
+        focus_m, f_number = (params[name].to(items.device)[items] for name in ("focus_m", "f_number"))
+        out = depth_of_field(image, depth, self.camera, focus_m=focus_m, f_number=f_number, **options)
+        return encode(out, "srgb", has_alpha=False, straight=False) if transfer == "srgb" else out
+
+
+class DepthAugmentationSequential(AugmentationSequential):
+    """Kornia's ``AugmentationSequential``, in which the first mask is the depth of the image, in metres.
+
+    Geometric steps move image, depth and masks alike, depth and masks by nearest neighbour, so that no depth between
+    two surfaces is made up; :class:`RandomDepthOfField` gets the depth as it is at its place in the sequence.
+
+    Args:
+        *args: Augmentations; those of depth of field are direct members, not within another container.
+        **kwargs: As Kornia's; ``data_keys`` are ``"input"``, ``"mask"`` for the depth, and whatever else there is. With
+            ``data_keys=None`` a dict is taken, in which the first key that begins with ``"mask"`` is the depth.
+
+    Raises:
+        ValueError: When called, if there is no mask and a member needs the depth.
+
+    Example:
+        >>> from kornia.augmentation import RandomHorizontalFlip
+        >>> seq = DepthAugmentationSequential(
+        ...     RandomHorizontalFlip(p=1.0), RandomDepthOfField(p=1.0), data_keys=["input", "mask", "mask"]
+        ... )
+        >>> image, depth, labels = torch.rand(2, 3, 8, 12), 1 + torch.rand(2, 1, 8, 12), torch.ones(2, 1, 8, 12)
+        >>> image, depth, labels = seq(image, depth, labels)
+        >>> image.shape, depth.shape, labels.shape
+        (torch.Size([2, 3, 8, 12]), torch.Size([2, 1, 8, 12]), torch.Size([2, 1, 8, 12]))
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.transform_op = _DepthOps(self.data_keys)
+
+
+class _DepthOps(AugmentationSequentialOps):
+    """Hands the depth to the steps that need it, where Kornia's hands every tensor on by itself."""
+
+    def transform(
+        self,
+        *arg: Any,
+        module: nn.Module,
+        param: ParamItem,
+        extra_args: dict[DataKey, dict[str, Any]],
+        data_keys: list[Any] | None = None,
+    ) -> Any:
+        """Apply one step to all inputs."""
+        keys = self.preproc_datakeys(data_keys)
+        if isinstance(module, RandomDepthOfField) and DataKey.MASK in keys and isinstance(param.data, dict):
+            depth = arg[keys.index(DataKey.MASK)]
+            param = ParamItem(param.name, {**param.data, "depth": depth})
+        return super().transform(*arg, module=module, param=param, extra_args=extra_args, data_keys=data_keys)
+
+
+def _range(name: str, value: Any, most: float) -> tuple[float, float]:
+    """Two numbers > 0, the smaller first."""
+    if not isinstance(value, Sequence) or len(value) != 2:
+        raise ValueError(f"{name} must be two numbers, the smallest and the largest, got {show(value)}")
+    low, high = (number(name, item, low=0.0, infinite=most == math.inf) for item in value)
+    if low > high:
+        raise ValueError(f"{name} must be two numbers, the smallest first, got {show(value)}")
+    return low, high
+
+
+def _batch_shape(image: Any) -> tuple[int, ...]:
+    """``[B, C, H, W]`` of images as Kornia takes them."""
+    if not floating(image) or image.ndim not in (3, 4):
+        raise ValueError(
+            f"image must be a floating-point tensor [B, C, H, W] or [C, H, W], got {show(image)}; convert bytes with "
+            "image.float() / 255, or torchvision's ToDtype(torch.float32, scale=True)"
+        )
+    return tuple(image.shape) if image.ndim == 4 else (1, *image.shape)
+
+
+def _plain(value: Any) -> Any:
+    """A tensor without a subclass of its own, such as torchvision's."""
+    return value.as_subclass(Tensor) if isinstance(value, Tensor) else value
+
+
+def _as(like: Any, value: Tensor) -> Tensor:
+    """A tensor of the same subclass, with what torchvision keeps beside the numbers."""
+    if type(like) is Tensor:
+        return value
+    from torchvision.tv_tensors import TVTensor, wrap
+
+    return wrap(value, like=like) if isinstance(like, TVTensor) else value.as_subclass(type(like))

@@ -1,0 +1,112 @@
+"""Single images and clips as the batches that are rendered, and back: ``[C, H, W]`` and ``[B, T, C, H, W]``."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .validation import is_traced, show
+
+__all__ = ["flattened", "leading_axes", "numbers", "restored"]
+
+
+def leading_axes(image: Any) -> tuple[int, ...]:
+    """The axes of an image before its channels: ``()`` of one image, ``(B,)`` of a batch, ``(B, T)`` of clips.
+
+    What is no image counts as a batch: the checks of a batch say what is wrong with it.
+
+    Example:
+        >>> leading_axes(torch.rand(2, 5, 3, 8, 12))
+        (2, 5)
+    """
+    if isinstance(image, Tensor) and image.ndim in (3, 5):
+        return tuple(image.shape[:-3])
+    return (1,)
+
+
+def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> Any:
+    """A tensor of images or maps as a batch, its leading axes made one; one that is shared by all stays one item.
+
+    Args:
+        axes: :func:`leading_axes` of the image.
+        name: Of the argument.
+        value: A tensor of the image's rank; what is none is returned as it is.
+        what: Its channels, for the message.
+
+    Raises:
+        ValueError: If its leading axes do not fit, or it comes from ``torch.vmap``.
+
+    Example:
+        >>> flattened((2, 5), "depth", torch.ones(2, 1, 1, 8, 12)).shape
+        torch.Size([10, 1, 8, 12])
+    """
+    if not isinstance(value, Tensor):
+        return value
+    _not_mapped(name, value)
+    if len(axes) == 1:
+        return value
+    fits = value.ndim == len(axes) + 3 and all(n in (1, m) for n, m in zip(value.shape, axes, strict=False))
+    if not fits:
+        lead = ", ".join(map(str, axes)) + ", " * bool(axes)
+        raise ValueError(
+            f"{name} must be [{lead}{what}, H, W] beside an image [{lead}C, H, W], got {list(value.shape)}"
+        )
+    if not axes:
+        return value[None]
+    shared = all(n == 1 for n in value.shape[: len(axes)])
+    return value.flatten(0, 1) if shared else value.expand(*axes, -1, -1, -1).flatten(0, 1)
+
+
+def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
+    """A number of the camera as it takes them: a float, or a tensor with one value for each image.
+
+    Args:
+        axes: :func:`leading_axes` of the image.
+        name: Of the argument.
+        value: A number, a list, or a tensor ``[B]``, ``[B, 1]``, or ``[B, T]`` of clips; None stays None.
+
+    Raises:
+        ValueError: If a list holds something else than numbers, a tensor has another shape, or one comes from
+            ``torch.vmap``.
+
+    Example:
+        >>> numbers((2,), "focus_m", [1.0, 2.5]).tolist(), numbers((2, 3), "focus_m", torch.ones(2)).shape
+        ([1.0, 2.5], torch.Size([6]))
+    """
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        try:
+            value = torch.tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            raise ValueError(f"{name} must be a number, a list of numbers or a tensor [B], got {show(value)}") from None
+    if not isinstance(value, Tensor) or value.ndim == 0:
+        return value
+    _not_mapped(name, value)
+    if len(axes) < 2:
+        return value[:, 0] if value.ndim == 2 and value.shape[1] == 1 else value
+    batch, frames = axes
+    per_clip = value.reshape(-1, 1) if value.ndim == 1 else value
+    if per_clip.ndim != 2 or per_clip.shape[0] not in (1, batch) or per_clip.shape[1] not in (1, frames):
+        raise ValueError(f"{name} must be a number, [{batch}] or [{batch}, {frames}] for clips, got {show(value)}")
+    return per_clip.expand(batch, frames).flatten()
+
+
+def restored(axes: tuple[int, ...], batch: Tensor) -> Tensor:
+    """What was made of a batch with the leading axes that the image came with.
+
+    Example:
+        >>> restored((2, 5), torch.ones(10, 3, 8, 12)).shape, restored((), torch.ones(1, 3, 8, 12)).shape
+        (torch.Size([2, 5, 3, 8, 12]), torch.Size([3, 8, 12]))
+    """
+    if not axes:
+        return batch[0]
+    return batch if len(axes) == 1 else batch.unflatten(0, axes)
+
+
+def _not_mapped(name: str, value: Tensor) -> None:
+    """Refuse a tensor that stands for one item of ``torch.vmap``: its numbers decide what is computed."""
+    if not is_traced() and torch._C._functorch.is_batchedtensor(value):
+        raise ValueError(
+            f"{name} comes from torch.vmap, which cannot follow this rendering: layers are planned from the numbers of "
+            "the depth; call it with the whole batch instead, [B, C, H, W] and [B, 1, H, W]"
+        )
