@@ -108,15 +108,15 @@ class DepthOfField(nn.Module):
             ValueError: If shapes, types or values are not as described, or a tensor comes from ``torch.vmap``.
         """
         options, axes = self.options, leading_axes(image)
-        focus_m, f_number = numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
         background = flattened(axes, "background", background, "C")
         background_depth = flattened(axes, "background_depth", background_depth)
-        coc = self._coc_px(image, depth, focus_m, f_number, "depth")
+        coc = self._coc_px(image, depth, *lens, "depth")
         validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
-            behind = self._coc_px(background, background_depth, focus_m, f_number, "background_depth")
+            behind = self._coc_px(background, background_depth, *lens, "background_depth")
         attention = flattened(axes, "attention", attention)
         return restored(axes, _blur(image, coc, options, plan, background, behind, attention))
 
@@ -173,9 +173,9 @@ class DepthOfField(nn.Module):
             ValueError: As :meth:`forward`; so does a lens that blurs beyond what numbers hold.
         """
         axes = leading_axes(image)
-        focus_m, f_number = numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
-        return restored(axes, _with_edges(image, self._coc_px(image, depth, focus_m, f_number, "depth"), self.options))
+        return restored(axes, _with_edges(image, self._coc_px(image, depth, *lens, "depth"), self.options))
 
     def _coc_px(
         self,
