@@ -247,6 +247,8 @@ class RenderShards:
             "focus_breathing": camera.focus_breathing,
             "table": options.table.name or options.table.family,
             "table_fingerprint": options.table.fingerprint(),
+            "aperture": None if options.table.aperture is None else repr(options.table.aperture),
+            "camera": repr(camera),
             "tolerance": options.tolerance,
             "occlusion": options.occlusion,
             "method": options.method,
