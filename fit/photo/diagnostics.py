@@ -182,7 +182,9 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None, stacklevel
     beyond = (distance > pair.data_dot.reach + 4) & pair.used
     if not beyond.any():
         return
-    remaining = gaussian_filter(np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0), 2.0)
+    remaining = gaussian_filter(
+        np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0), 2.0, mode="constant"
+    )
     remaining = np.where(beyond, remaining, -np.inf)
     y, x = np.unravel_index(int(np.argmax(remaining)), remaining.shape)
     height, peak = float(remaining[y, x]), pair.data_dot.peak

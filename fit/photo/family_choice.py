@@ -122,7 +122,10 @@ def choose(
         if f not in (family, likeliest)
     )
     if family == likeliest:
-        why = f"the lowest BIC, {second} second by {bic[second] - bic[likeliest]:.0f}"
+        why = (
+            f"the lowest BIC ({second} second by {bic[second] - bic[likeliest]:.0f}), and no cheaper family has "
+            f"{accuracy_db:g} dB on a natural image and {wanted_look:g} dB on a highlight"
+        )
     else:
         why = (
             f"the cheapest with {accuracy_db:g} dB on a natural image and {wanted_look:g} dB on a highlight "

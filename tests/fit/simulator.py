@@ -187,6 +187,47 @@ def write_captures(
     return folder
 
 
+def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.01, kernel="disc", jpeg=90, exif=True):
+    """A phone's JPEGs of the printed target on a grey desk, focused at `focus_m`; returns radius in px by distance.
+
+    26 mm equivalent at f/1.8; `tone` is the strength of an S-curve that nobody undoes.
+    """
+    import OpenImageIO as oiio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    focal_mm, f_number = 5.4, 1.8
+    image_px = focal_mm / (36 * focal_mm / 26) * width / (1 - focal_mm / 1000 / focus_m)
+    height, fine = width * 3 // 4, 3
+    radius = {}
+    for i, distance in enumerate([focus_m, *distances]):
+        scale = image_px / distance / 1000  # px a mm
+        turn, (x0, y0) = np.deg2rad(1.5), (0.02 * width, -0.015 * width)
+        axis_x, axis_y = ((np.arange(n * fine) + 0.5) / fine - n / 2 for n in (width, height))
+        x, y = np.meshgrid(axis_x - x0, axis_y - y0)
+        x, y = (x * np.cos(turn) + y * np.sin(turn)) / scale, (y * np.cos(turn) - x * np.sin(turn)) / scale
+        light = np.where((np.abs(x) < 105) & (np.abs(y + 17) < 148), 0.8, 0.3 + 0.05 * np.sin(x / 30))
+        light[(np.abs(x) < 50) & (np.abs(y) < 50)] = 0.035
+        light[np.hypot(x, y) < 2.5] = 0.8
+        light = light.reshape(height, fine, width, fine).mean((1, 3)) * (1 + 0.1 * np.linspace(-1, 1, width))
+        radius[distance] = focal_mm / 2000 / f_number * image_px * abs(1 / focus_m - 1 / distance)
+        if radius[distance]:
+            wide = np.pad(light, 40, mode="edge")
+            light = blur(wide, kernel, {"radius": radius[distance]})[40:-40, 40:-40]
+        camera = Simulator(snr_db=-20 * np.log10(noise), bayer=True, tone=tone)
+        pixels = np.round(255 * encode_srgb(camera.record(light, np.random.default_rng(i)))).astype(np.uint8)
+        spec = oiio.ImageSpec(width, height, 3, "uint8")
+        spec.attribute("Compression", f"jpeg:{jpeg}")
+        if exif:
+            spec.attribute("Exif:FocalLength", focal_mm)
+            spec.attribute("FNumber", f_number)
+            spec.attribute("Exif:FocalLengthIn35mmFilm", 26)
+        out = oiio.ImageOutput.create(str(folder / f"img_{i:04d}.jpg"))
+        out.open(str(folder / f"img_{i:04d}.jpg"), spec)
+        out.write_image(np.ascontiguousarray(np.repeat(pixels[..., None], 3, 2)))
+        out.close()
+    return radius
+
+
 def _centre(square: np.ndarray, height: int, width: int) -> np.ndarray:
     top, left = (square.shape[0] - height) // 2, (square.shape[1] - width) // 2
     return square[top : top + height, left : left + width]

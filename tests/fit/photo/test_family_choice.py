@@ -51,5 +51,5 @@ def test_choice_is_the_cheapest_that_looks_like_the_likeliest():
     assert "gaussian" in why and "BIC +900" in why and psnr["radial"] == 200
     assert choose(arrays, {"gaussian": 900.0, "disc": 5.0, "radial": 0.0}, 20)[0] == "gaussian"
     family, why, _ = choose(arrays, {"gaussian": 5.0, "disc": -5.0, "radial": 0.0}, 199)
-    assert family == "disc" and "the lowest BIC, radial second by 5" in why
+    assert family == "disc" and "the lowest BIC (radial second by 5)" in why
     assert choose(arrays, {"gaussian": 5.0, "disc": 5.0, "radial": 0.0}, 199)[0] == "radial"

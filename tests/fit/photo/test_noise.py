@@ -48,7 +48,7 @@ def test_correlate_is_the_covariance_of_filtered_noise():
 def test_standard_errors_hold_in_demosaiced_captures_and_nothing_is_said(simulator):
     # 2.0 to 2.3 times too small where pixels count as independent; and a warning would be an error here
     camera = simulator.Simulator(size=61, dot_radius=8.0, bayer=True)
-    fits = [fit_pair(*camera.pair("disc", {"radius": 5.0}, s), "disc", fit_magnification=False) for s in range(24)]
+    fits = [fit_pair(*camera.pair("disc", {"radius": 5.0}, s), "disc", fit_magnification=False) for s in range(16)]
     pulls = np.array([(f.radius - 5.0) / f.radius_stderr for f in fits])
     assert 0.7 < pulls.std() < 1.4
     assert 0.8 < np.mean([f.residual_over_noise for f in fits]) < 1.2
