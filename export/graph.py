@@ -76,8 +76,11 @@ class _Pinned(BlurTable):
     """A table whose kernels are those of one image width, whatever the width of the image at hand."""
 
     def __init__(self, table: BlurTable, width: int) -> None:
-        fields = {k: v for k, v in table.to_dict().items() if k not in ("schema", "version", "family", "coc", "params")}
-        super().__init__(table.family, table.coc, table.node_params, **fields)
+        fields = table.to_dict()
+        fields = {
+            k: v for k, v in fields.items() if k not in ("schema", "version", "family", "coc", "params", "aperture")
+        }
+        super().__init__(table.family, table.coc, table.node_params, **fields, aperture=table.aperture)
         self._scale = super()._px_per_unit(width)
         self.unit = "relative"  # to the plan: not tied to the width
 

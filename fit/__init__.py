@@ -1,7 +1,8 @@
 """Capture to radial profile to fitted kernel to blur table: lengths in, lengths out, in the caller's unit."""
 
 from .lens.trace import trace_table
-from .photo.family_choice import natural_psnr
+from .photo.family_choice import highlight_psnr, natural_psnr
+from .photo.kernel_image import KernelImage, fit_kernel_image
 from .photo.manifest import Capture, Captures, read_captures, read_pair
 from .photo.pair import fit_pair
 from .photo.profile_fit import fit_profile
@@ -17,13 +18,16 @@ __all__ = [
     "Captures",
     "FitError",
     "FitWarning",
+    "KernelImage",
     "TableFit",
     "blur_strength",
     "check_reach",
     "fit_captures",
+    "fit_kernel_image",
     "fit_pair",
     "fit_profile",
     "fit_table",
+    "highlight_psnr",
     "natural_psnr",
     "polar_samples",
     "read_captures",

@@ -17,9 +17,9 @@ from .result import Array, BlurFit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["picture_of_fit", "picture_of_quad", "picture_of_table", "picture_of_texture"]
+__all__ = ["DATA", "MODEL", "new_figure", "picture_of_fit", "picture_of_quad", "picture_of_table", "picture_of_texture"]
 
-_DATA, _MODEL = "#7a7a7a", "#c2410c"
+DATA, MODEL = "#7a7a7a", "#c2410c"
 
 
 def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
@@ -38,12 +38,12 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
     """
     if not fit.samples.shape[1]:
         raise FitError("this fit carries no samples to draw")
-    figure, axes = _figure(5.4, 3.6)
+    figure, axes = new_figure(5.4, 3.6)
     forward = fit.model == "forward"
     axes.plot(
         *fit.samples,
         ".",
-        color=_DATA,
+        color=DATA,
         markersize=2.5 if forward else 4,
         label="samples" if not forward else "pixels",
         zorder=1,
@@ -52,12 +52,12 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         bins = np.floor(fit.curve[0] * 2 + 0.5).astype(int)  # half a unit wide
         count = np.bincount(bins)
         r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
-        axes.plot(r, level, color=_MODEL, label="forward model", zorder=3)
+        axes.plot(r, level, color=MODEL, label="forward model", zorder=3)
         line = np.linspace(0, fit.samples[0].max(), 400)
         shape = evaluate(fit.family, line, fit.kernel_params())
         axes.plot(line, shape / shape.max() * level.max(), "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
     else:
-        axes.plot(*fit.curve, color=_MODEL, label=f"fitted {fit.family}", zorder=3)
+        axes.plot(*fit.curve, color=MODEL, label=f"fitted {fit.family}", zorder=3)
     axes.set(xlabel=f"r [{unit}]", ylabel="level above background" if forward else "blur strength", ylim=(0, None))
     values = ", ".join(f"{k} = {v:.4g} ± {fit.stderr[k]:.1g}" for k, v in fit.params.items() if not np.ndim(v))
     axes.set_title(title or f"{fit.family}: {values}", fontsize=9)
@@ -75,7 +75,7 @@ def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str =
         title: above the picture.
     """
     texture = table.blur_texture(coc_px, width).detach().numpy()
-    figure, axes = _figure(4.2, 3.6)
+    figure, axes = new_figure(4.2, 3.6)
     half = texture.shape[-1] / 2
     colours = np.moveaxis(texture, 0, -1) / texture.max() if texture.shape[0] == 3 else texture[0]
     shown = axes.imshow(colours, cmap="gray", vmin=0, extent=(-half, half, half, -half))
@@ -94,15 +94,15 @@ def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
         blurred: `[H, W]` linear light.
         title: above the picture.
     """
-    figure, (left, right, below) = _figure(9.6, 3.4, 3)
+    figure, (left, right, below) = new_figure(9.6, 3.4, 3)
     top = max(float(sharp.max()), 1e-12)
     for axes, picture, name in ((left, sharp, "in focus"), (right, blurred, "out of focus")):
         axes.imshow((np.clip(picture / top, 0, 1)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
         axes.set_title(name, fontsize=9)
         axes.set_axis_off()
     row = sharp.shape[0] // 2
-    below.plot(sharp[row], color=_DATA, label="in focus")
-    below.plot(blurred[row], color=_MODEL, label="out of focus")
+    below.plot(sharp[row], color=DATA, label="in focus")
+    below.plot(blurred[row], color=MODEL, label="out of focus")
     below.set(xlabel="px", ylabel="linear light, middle row")
     below.legend(frameon=False, fontsize=8)
     figure.suptitle(title, fontsize=10)
@@ -117,7 +117,7 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
         title: above the picture.
     """
     names = list(table.node_params)
-    figure, axes = _figure(3.2 * len(names), 3.2, len(names))
+    figure, axes = new_figure(3.2 * len(names), 3.2, len(names))
     reach = float(table.coc.abs().max())
     width = 1 if table.sensor_width_mm is None else int(table.sensor_width_mm) or 1
     scale = 1.0 if table.unit != "mm" else width / float(table.sensor_width_mm or 1.0)
@@ -136,7 +136,7 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
         else:
             per = scale if name in LENGTHS else 1.0
             for channel in range(nodes.shape[0]):
-                colour = _MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
+                colour = MODEL if nodes.shape[0] == 1 else ("#dc2626", "#16a34a", "#2563eb")[channel % 3]
                 ax.plot(line, between[name][channel] / per, color=colour, linewidth=1)
                 ax.plot(table.coc, nodes[channel], "o", color=colour, markersize=3)
             ax.set(ylabel=name + (f" [{unit}]" if name in LENGTHS else ""))
@@ -145,12 +145,12 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
     return figure
 
 
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
-    """A figure of a size in inches, and its axes side by side."""
+def new_figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, Any]:
+    """A figure of a size in inches, and its axes side by side, in rows where there are several."""
     # no pyplot: it would choose a screen and keep every figure alive
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(1, columns)
+    return figure, figure.subplots(rows, columns)

@@ -10,6 +10,8 @@ import warnings
 __all__ = [
     "AsymmetryWarning",
     "BoundaryWarning",
+    "CameraError",
+    "CameraWarning",
     "DistanceError",
     "DotNotFoundError",
     "ExposureWarning",
@@ -130,6 +132,14 @@ class AsymmetryWarning(FitWarning):
 
 class MagnificationWarning(FitWarning):
     """The blurred dot has not the expected size; `number` is fitted over expected."""
+
+
+class CameraError(FitError):
+    """The fitted blur is far from what camera and distances promise; `number` is fitted over promised."""
+
+
+class CameraWarning(FitWarning):
+    """The fitted blur, or EXIF, contradicts the camera's numbers; `number` is fitted over promised."""
 
 
 class ExposureWarning(FitWarning):

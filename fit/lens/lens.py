@@ -22,11 +22,12 @@ from . import prescription
 __all__ = ["RGB_UM", "Lens", "Paraxial"]
 
 
-D_UM, F_UM, C_UM = 0.58756, 0.48613, 0.65627
+D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
 RGB_UM = (C_UM, 0.54607, F_UM)
 """Wavelengths that stand for red, green and blue, in micrometres: the lines C, e and F."""
 
 _SHIPPED = Path(__file__).parent / "lenses"
+_NORMAL = 0.6438, -0.001682  # P_gF of normal glasses at V = 0, and its slope
 _MARKED = 1.03  # a lens is sold by a rounded f-number: f/2.03 is marked f/2
 
 
@@ -72,6 +73,8 @@ class Lens:
         stop: Number of the surface that is the aperture stop.
         name: Short name.
         source: Where the numbers are from.
+        partial: Partial dispersion P_gF of the medium behind each surface ``[S]``, as in glass catalogues; NaN, and None
+            for all, takes that of a normal glass with its Abbe number.
 
     Raises:
         ValueError: If a number is outside its range.
@@ -93,6 +96,7 @@ class Lens:
     stop: int
     name: str = ""
     source: str = ""
+    partial: Array | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers, so that whatever is computed later is about a lens."""
@@ -108,6 +112,10 @@ class Lens:
             if array.ndim != 1 or array.shape != np.shape(self.radius):
                 raise ValueError(f"{name} must hold one number a surface, got shape {list(array.shape)}")
             object.__setattr__(self, name, array)
+        partial = np.full(self.radius.shape, np.nan) if self.partial is None else np.asarray(self.partial, np.float64)
+        if partial.shape != self.radius.shape or not np.all(np.isnan(partial) | ((partial > 0) & (partial < 1))):
+            raise ValueError(f"partial must hold one number a surface, 0 to 1 or NaN, got {show(self.partial)}")
+        object.__setattr__(self, "partial", partial)
         if isinstance(self.stop, bool) or not isinstance(self.stop, int) or not 0 <= self.stop < len(self.radius):
             raise ValueError(
                 f"stop must be the number of a surface (0 to {len(self.radius) - 1}), got {show(self.stop)}"
@@ -157,15 +165,25 @@ class Lens:
     def indices(self, wavelength_um: float | None = None) -> Array:
         """Refractive indices along the light's way ``[S + 1]``: before the first surface (air), then behind each.
 
-        Cauchy's two terms, ``n = a + b / wavelength^2``, through the index at d and with the dispersion
-        ``n_F - n_C = (n_d - 1) / V``. None is the d line.
+        Cauchy's three terms, ``n = a + b / wavelength^2 + c / wavelength^4``, through the index at d, of the dispersion
+        ``n_F - n_C = (n_d - 1) / V`` and the partial dispersion ``n_g - n_F = P_gF (n_F - n_C)``. For a glass whose
+        P_gF is not stated that of a normal one is taken, ``0.6438 - 0.001682 V``. None is the d line.
+
+        Reference:
+            SCHOTT, "TIE-29: Refractive index and dispersion", 2016 (the line of normal glasses).
         """
         index = self.index
         if wavelength_um is not None:
             if not 0.3 <= wavelength_um <= 1.2:
                 raise ValueError(f"wavelength_um must be in micrometres, 0.3 to 1.2, got {wavelength_um}")
-            dispersion = (wavelength_um**-2 - D_UM**-2) / (F_UM**-2 - C_UM**-2)
-            index = index + (index - 1.0) / self.abbe * dispersion
+            normal = _NORMAL[0] + _NORMAL[1] * np.where(np.isfinite(self.abbe), self.abbe, 0.0)
+            partial = np.where(np.isnan(self.partial), normal, self.partial)  # type: ignore[arg-type]
+            # powers of 1 / wavelength^2: between C and F, between F and g, and from d to here
+            across, beyond, here = (
+                np.array([a**-2 - b**-2, a**-4 - b**-4]) for a, b in ((F_UM, C_UM), (G_UM, F_UM), (wavelength_um, D_UM))
+            )
+            share = np.linalg.solve(np.stack([across, beyond]), np.stack([np.ones_like(partial), partial]))
+            index = index + (index - 1.0) / self.abbe * (here @ share)
         return np.concatenate([[1.0], index])
 
     def matrix(self, first: int, last: int, wavelength_um: float | None = None) -> Array:
@@ -242,7 +260,8 @@ class Lens:
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
-        return prescription.lines(self.radius, self.thickness, self.index, self.abbe, self.diameter, self.stop)
+        columns = (self.radius, self.thickness, self.index, self.abbe, self.partial, self.diameter)
+        return prescription.lines(*columns, self.stop)  # type: ignore[arg-type]
 
 
 def _check_positive(name: str, value: float) -> None:

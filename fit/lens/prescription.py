@@ -9,8 +9,9 @@
 
 Millimetres. ``thickness`` is the distance to the next surface, ``index`` the refractive index behind the surface and
 ``diameter`` the clear diameter. Radius 0 is the aperture stop (its index 0: unchanged), ``inf`` a flat surface.
-``1.67/47.1`` is an index at 587.56 nm (the d line) with its Abbe number V; without one the glass has the same index at
-any wavelength. ``#`` starts a comment; ``# source:`` is kept.
+``1.67/47.1`` is an index at 587.56 nm (the d line) with its Abbe number V, and ``1.67/47.1/0.557`` has its partial
+dispersion P_gF too, as glass catalogues list them; without any the glass has the same index at any wavelength. ``#`` starts
+a comment; ``# source:`` is kept.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ def parse(text: str) -> tuple[dict[str, Array], int, str]:
     r"""Read the text of a prescription.
 
     Returns:
-        The columns by name (``radius``, ``thickness``, ``index``, ``abbe``, ``diameter``), the number of the stop's
-        surface, and the source.
+        The columns by name (``radius``, ``thickness``, ``index``, ``abbe``, ``partial``, ``diameter``), the number of
+        the stop's surface, and the source.
 
     Raises:
         ValueError: If it is not a prescription; the message names line and column.
@@ -57,49 +58,56 @@ def parse(text: str) -> tuple[dict[str, Array], int, str]:
         if len(fields) != len(COLUMNS):
             raise ValueError(f"line {number}: expected the columns {' '.join(COLUMNS)}, got {len(fields)}: {line!r}")
         row = [_number(text, column, number) for text, column in zip(fields, COLUMNS, strict=True)]
-        radius, thickness, (index, abbe), diameter = row[0][0], row[1][0], row[2], row[3][0]
-        before = rows[-1][2:4] if rows else [1.0, math.inf]
+        radius, thickness, (index, abbe, partial), diameter = row[0][0], row[1][0], row[2], row[3][0]
+        before = rows[-1][2:5] if rows else [1.0, math.inf, math.nan]
         if radius == 0.0:
             if stop is not None:
                 raise ValueError(f"line {number}, column radius: a second stop (radius 0); write inf for flat")
             if index not in (0.0, before[0]):
                 raise ValueError(f"line {number}, column index: the stop does not change the index, write 0")
-            stop, radius, (index, abbe) = len(rows), math.inf, before
+            stop, radius, (index, abbe, partial) = len(rows), math.inf, before
         for column, value in zip(COLUMNS, (radius, thickness, index, diameter), strict=True):
             if problem := fault(column, value):
                 raise ValueError(f"line {number}, column {column}: {problem}")
         if len(rows) == _MOST_SURFACES:
             raise ValueError(f"line {number}: a lens has at most {_MOST_SURFACES} surfaces")
-        rows.append([radius, thickness, index, abbe, diameter])
+        rows.append([radius, thickness, index, abbe, partial, diameter])
     if stop is None:
         raise ValueError(f"no aperture stop among {len(rows)} surfaces; one line must have radius 0")
-    names = ("radius", "thickness", "index", "abbe", "diameter")
+    names = ("radius", "thickness", "index", "abbe", "partial", "diameter")
     return {name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}, stop, source
 
 
-def lines(radius: Array, thickness: Array, index: Array, abbe: Array, diameter: Array, stop: int) -> list[str]:
+def lines(
+    radius: Array, thickness: Array, index: Array, abbe: Array, partial: Array, diameter: Array, stop: int
+) -> list[str]:
     """Surfaces as lines of a prescription, the inverse of :func:`parse`."""
     written = []
-    for i, row in enumerate(zip(radius, thickness, index, abbe, diameter, strict=True)):
+    for i, row in enumerate(zip(radius, thickness, index, abbe, partial, diameter, strict=True)):
         glass = f"{row[2]:.9g}/{row[3]:.9g}" if math.isfinite(row[3]) else f"{row[2]:.9g}"
+        glass += f"/{row[4]:.9g}" if math.isfinite(row[3]) and math.isfinite(row[4]) else ""
         curve, glass = ("0", "0") if i == stop else (f"{row[0]:.9g}", glass)
-        written.append(f"{curve} {row[1]:.9g} {glass} {row[4]:.9g}")
+        written.append(f"{curve} {row[1]:.9g} {glass} {row[5]:.9g}")
     return written
 
 
-def _number(text: str, column: str, line: int) -> tuple[float, float]:
-    """A field's number, and for an index its Abbe number (inf without one)."""
-    value, slash, abbe = text.partition("/")
+def _number(text: str, column: str, line: int) -> tuple[float, float, float]:
+    """A field's number, and for an index its Abbe number (inf without one) and partial dispersion (NaN without one)."""
+    value, *dispersion = text.split("/")
     try:
-        if slash and column != "index":
+        if len(dispersion) > (2 if column == "index" else 0):
             raise ValueError
-        pair = float(value), float(abbe) if slash else math.inf
+        number = float(value)
+        abbe = float(dispersion[0]) if dispersion else math.inf
+        partial = float(dispersion[1]) if len(dispersion) == 2 else math.nan
     except ValueError:
-        kind = "a number or index/V" if column == "index" else "a number"
+        kind = "a number, index/V or index/V/P_gF" if column == "index" else "a number"
         raise ValueError(f"line {line}, column {column}: expected {kind}, got {text!r}") from None
-    if problem := fault("abbe", pair[1]):
+    if problem := fault("abbe", abbe):
         raise ValueError(f"line {line}, column {column}: {problem}")
-    return pair
+    if len(dispersion) == 2 and not 0 < partial < 1:
+        raise ValueError(f"line {line}, column {column}: P_gF must be between 0 and 1, got {partial:g}")
+    return number, abbe, partial
 
 
 def fault(column: str, value: float) -> str:

@@ -50,9 +50,9 @@ def cut_pairs(
     files: tuple[str, str],
     white: float | None,
     exposure: float | None,
+    middle: tuple[float, float],
 ) -> list[Capture]:
-    """Find the dot, or the dots of a grid, in two frames and cut the windows around each."""
-    middle = ((still.shape[1] - 1) / 2, (still.shape[0] - 1) / 2)
+    """Find the dot, or the dots of a grid, in two frames and cut the windows around each; `middle` is the frame's."""
     if dots == "one":
         chosen = [(find_dot(still, file=files[0]), find_dot(moved, file=files[1]))]
     else:

@@ -6,11 +6,11 @@ import numpy as np
 
 from torchdof.optics.psf import FAMILIES
 
-from ..result import Array, BlurFit, Mask
+from ..result import Array, BlurFit
 from ..solve import information_criterion
-from .diagnostics import asymmetry_of, signal_pixels
-from .dot import noise_of
+from .diagnostics import asymmetry_of, noise_near, signal_pixels, size_of_blur
 from .forward import Forward, Solution
+from .noise import fine_share, independent_share
 
 __all__ = ["bic_of", "describe", "kernel_lists"]
 
@@ -26,7 +26,10 @@ def bic_of(pair: Forward, solution: Solution) -> float:
     free = len(FAMILIES[solution.family])
     if solution.family == "radial":
         free = int(np.sum(np.asarray(solution.params["values"]) > 0))
-    return information_criterion(solution.squares + floor, pair.values.size, free + len(pair.fit_moves) + 2)
+    # neighbours whose noise goes together are no independent witnesses
+    count = pair.values.size * independent_share(pair.noise_correlation)
+    squares = (solution.squares + floor) * count / pair.values.size
+    return information_criterion(squares, max(round(count), 1), free + len(pair.fit_moves) + 2)
 
 
 def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
@@ -36,7 +39,9 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
     size = float(np.sqrt(np.sum(light**2)))
     error = pair.data[near] - solution.model[near]
     kernel = pair.kernels(solution.family, kernel_lists(solution))[0]
-    through = (solution.gain * pair.source.noise) ** 2 * float(np.sum(kernel**2))
+    through = (solution.gain * pair.source.noise) ** 2 / fine_share(pair.noise_correlation)
+    own = noise_near(pair, solution, near) ** 2 + through * float(np.sum(kernel**2))
+    rms, rms_error = size_of_blur(pair, solution)
     spread = np.sqrt(np.diag(solution.covariance))
     if solution.family == "radial":
         stderr: dict[str, float | Array] = {"values": spread, "radius": 0.0}
@@ -47,7 +52,7 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
         params=dict(solution.params),
         stderr=stderr,
         residual=float(np.sqrt(np.sum(error**2))) / size,
-        noise=float(np.sqrt(error.size * (_own_noise(pair, solution, near) ** 2 + through))) / size,
+        noise=float(np.sqrt(error.size * own)) / size,
         covariance=solution.covariance,
         names=solution.names,
         bic=bic_of(pair, solution),
@@ -60,21 +65,13 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
             pair.data_dot.y + solution.moves["dy"] - pair.source.dot.y,
         ),
         magnification=solution.moves["magnification"],
-        asymmetry=asymmetry_of(pair, solution),
+        asymmetry=asymmetry_of(pair, solution)[0],
+        radius=float(np.sqrt(2) * rms),
+        radius_stderr=float(np.sqrt(2) * rms_error),
         why=why,
         samples=_samples(pair, solution),
         curve=_samples(pair, solution, modelled=True),
     )
-
-
-def _own_noise(pair: Forward, solution: Solution, near: Mask) -> float:
-    """Noise of the blurred picture's pixels where the light is: what varies from pixel to pixel in the residual."""
-    residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
-    mixed_differences = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
-    inside = near[1:-1, 1:-1]
-    noise = float(np.sqrt(np.mean(mixed_differences[inside] ** 2))) if inside.any() else 0.0
-    return max(noise, noise_of(pair.data))
 
 
 def _samples(pair: Forward, solution: Solution, modelled: bool = False) -> Array:

@@ -11,27 +11,22 @@ from ..problems import (
     FlatProfileError,
     FlatProfileWarning,
     MagnificationWarning,
-    NotLinearWarning,
     ResidualWarning,
     WindowError,
     WindowWarning,
     warn,
 )
-from ..result import Array, BlurFit, Mask
-from .dot import Dot, noise_inside, noise_of
-from .dot_model import Edge, soft_edge
-from .forward import Forward, Solution
-from .ratio import polar_samples
+from ..result import BlurFit, Mask
+from .dot import noise_of
+from .forward import Forward, Solution, without_level
+from .noise import fine_share, independent_share
 
-__all__ = ["EXPLAINED", "asymmetry_of", "check_fit", "check_linearity", "signal_pixels"]
+__all__ = ["asymmetry_of", "check_fit", "noise_near", "signal_pixels", "size_of_blur"]
 
-EXPLAINED = 1.15
-"""Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
-
-_ENCODED = 0.7
 _FAR_ABOVE = 1.6  # residual over noise
-_MATTERS = 0.005
-_UNEVEN = 0.3
+_MATTERS, _SEEN = 0.005, 1e-3
+_UNEVEN, _CHANCE = 0.02, 1e-6  # least share of the light, and how seldom noise may do it
+_HARMONICS, _RINGS = 8, 4
 _SPOT, _SPOT_MATTERS = 8.0, 0.003
 _MAGNIFIED = 0.08
 _OUTSIDE_REFUSED, _OUTSIDE_WARNED = 0.05, 0.005
@@ -44,17 +39,54 @@ def signal_pixels(pair: Forward) -> Mask:
     return np.asarray(near & pair.used)
 
 
-def asymmetry_of(pair: Forward, solution: Solution) -> float:
-    """Norm of what depends on the angle in the residual (its first four harmonics) over the norm of the light."""
+def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
+    """How much of the blur depends on the angle, and how likely noise alone would show as much.
+
+    The residual is expanded in the first eight harmonics of the angle, on four rings each. Under noise of known
+    covariance the squared coefficients, whitened, follow a chi squared distribution.
+
+    Returns:
+        Norm of what depends on the angle, without noise's own share, over the norm of the light; and the chance.
+    """
+    from scipy.stats import chi2
+
+    x, y = pair.data_dot.x + solution.moves["dx"], pair.data_dot.y + solution.moves["dy"]
+    rows, columns = np.indices(pair.data.shape)
+    reach = max(pair.data_dot.reach, 2.0)
+    angle, place = np.arctan2(rows - y, columns - x), np.hypot(columns - x, rows - y) / reach * _RINGS
+    near = (place <= _RINGS) & pair.used
+    templates = []
+    for ring in range(1, _RINGS + 1):
+        hat = np.clip(1 - np.abs(place - ring + 0.5), 0, None) * near
+        for order in range(1, _HARMONICS + 1):
+            templates += [hat * np.cos(order * angle), hat * np.sin(order * angle)]
+    basis = np.stack([t.ravel()[pair.flat] for t in templates], axis=1)
+    slopes = solution.slopes if solution.slopes is not None else np.zeros((basis.shape[0], 0))
+    # what the fit could have taken up is not seen in its residual
+    known, _ = np.linalg.qr(slopes[:, np.abs(slopes).max(axis=0) > 0]) if slopes.shape[1] else (slopes, None)
+    basis = without_level(basis - known @ (known.T @ basis), solution.model.ravel()[pair.flat])
+    left, values, _ = np.linalg.svd(basis, full_matrices=False)
+    left = left[:, values > 1e-6 * values.max()]
+    residual = pair.values - solution.model.ravel()[pair.flat]
+    deviation, correlation = pair.residual_noise(residual)
+    # a smooth deviation would take the shape itself for noise: its level beside the dot and within it is enough
+    deviation = np.full_like(deviation, noise_near(pair, solution, near))
+    spread = left.T @ pair.noise_times(left, deviation, pair.noise_correlation)
+    found = left.T @ residual
+    chance = float(chi2.sf(found @ np.linalg.solve(spread, found), found.size)) if np.trace(spread) > 0 else 0.0
+    light = float(np.sum((pair.data[near] - solution.background) ** 2))
+    share = np.sqrt(max(float(found @ found) - float(np.trace(spread)), 0.0) / light) if light > 0 else np.inf
+    return float(share), chance
+
+
+def noise_near(pair: Forward, solution: Solution, near: Mask) -> float:
+    """Deviation of a pixel's noise where the light is, from what varies from pixel to pixel in the residual."""
     residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    centre = (pair.data_dot.x + solution.moves["dx"], pair.data_dot.y + solution.moves["dy"])
-    r, _, uneven = polar_samples(residual, centre, max(pair.data_dot.reach, 2.0), step_deg=10.0)
-    light = polar_samples(pair.data - solution.background, centre, float(r[-1]), step_deg=10.0)[2]
-    waves = np.fft.rfft(uneven, axis=0)[1:5] / uneven.shape[0]
-    # r weighs a sample by the area it stands for
-    varying = float(np.sum(r * 2 * np.sum(np.abs(waves) ** 2, axis=0)))
-    whole = float(np.sum(r * np.mean(light**2, axis=0)))
-    return float(np.sqrt(varying / whole)) if whole > 0 else np.inf
+    rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
+    mixed_differences = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
+    inside = near[1:-1, 1:-1]
+    noise = float(np.sqrt(np.mean(mixed_differences[inside] ** 2))) if inside.any() else 0.0
+    return max(noise, noise_of(pair.data)) / np.sqrt(fine_share(pair.noise_correlation))
 
 
 def check_fit(
@@ -94,8 +126,19 @@ def check_fit(
     if outside > _OUTSIDE_WARNED:
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {_size(pair)}; cut a larger one"
         warn(WindowWarning(text, file=file, number=outside), stacklevel)
+    if (
+        fit is not freest
+        and fit.residual > _SEEN
+        and fit.residual_over_noise > max(2.0, 1.3 * freest.residual_over_noise)
+    ):
+        text = (
+            f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise ({100 * fit.residual:.1f} % "
+            f"of the light), the free profile {freest.residual_over_noise:.1f} times; it was chosen because what is "
+            "missing would not be seen at accuracy_db: ask for more, or for a richer family"
+        )
+        warn(ResidualWarning(text, file=file, number=fit.residual_over_noise), stacklevel)
     ratio = freest.residual_over_noise
-    if freest.residual > _MATTERS and ratio > _FAR_ABOVE:
+    if (freest.residual > _MATTERS and ratio > _FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0):
         text = (
             f"the residual is {100 * freest.residual:.1f} %, {ratio:.1f} times the noise; is the image linear, not "
             "sRGB encoded, a single white dot, and not a strong JPEG?"
@@ -110,37 +153,14 @@ def check_fit(
         )
         warn(MagnificationWarning(text, file=file, number=change), stacklevel)
     _check_spots(pair, solution, file, stacklevel + 1)
-    if fit.asymmetry > _UNEVEN:
+    if fit.asymmetry > _UNEVEN and asymmetry_of(pair, solution)[1] < _CHANCE:
         text = (
             f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle, which no family here "
-            "has; is the lens decentred, or the dot off the axis?"
+            "has; is the lens decentred, the dot off the axis, or the stop a polygon?"
         )
         warn(AsymmetryWarning(text, file=file, number=fit.asymmetry), stacklevel)
     if solution.family != "radial":
         _check_parameters(pair, solution, file, stacklevel + 1)
-
-
-def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
-    """Warn where a sharp picture shows that it is not in linear light: by its noise, or by its dot's edge."""
-    inside = noise_inside(still, dot)
-    # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
-    if inside and dot.noise > (1 + 4 / np.sqrt(inside[1])) * inside[0] and dot.noise > 1e-4 * dot.peak:
-        ratio = dot.noise / max(inside[0], 1e-9 * dot.peak)
-        text = (
-            f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
-            "encoded; is the image linear? Decode it first"
-        )
-        warn(NotLinearWarning(text, file=file, number=ratio), stacklevel)
-        return
-    if edge.misfit < EXPLAINED:
-        return
-    bent = soft_edge(still, dot, fit_exponent=True)
-    if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
-        text = (
-            f"the dot's edge is that of light to the power {bent.exponent:.2f}, as in a picture that is left sRGB "
-            "encoded (about 0.45); is the image linear? Decode it first"
-        )
-        warn(NotLinearWarning(text, file=file, number=bent.exponent), stacklevel)
 
 
 def _outside(pair: Forward, solution: Solution) -> float:
@@ -162,12 +182,15 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None, stacklevel
     beyond = (distance > pair.data_dot.reach + 4) & pair.used
     if not beyond.any():
         return
-    remaining = gaussian_filter(np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0), 2.0)
+    remaining = gaussian_filter(
+        np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0), 2.0, mode="constant"
+    )
     remaining = np.where(beyond, remaining, -np.inf)
     y, x = np.unravel_index(int(np.argmax(remaining)), remaining.shape)
     height, peak = float(remaining[y, x]), pair.data_dot.peak
-    # smoothing by sigma = 2 px leaves 0.14 of white noise
-    if height > max(_SPOT * 0.14 * noise_of(pair.data), _SPOT_MATTERS * peak):
+    # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of noise that goes together in neighbours
+    smooth = fine_share(pair.noise_correlation) * independent_share(pair.noise_correlation)
+    if height > max(_SPOT * 0.14 * noise_of(pair.data) / np.sqrt(smooth), _SPOT_MATTERS * peak):
         text = (
             f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), "
             f"{distance[y, x]:.0f} px from the dot and beyond its blur: is there another dot, dust or a reflection? "
@@ -194,14 +217,16 @@ def _check_parameters(pair: Forward, solution: Solution, file: str | None, stack
                 continue  # the exponent of a tilt that is not there
             text = f"{name} ended on its bound {float(value):.4g}; it is only a limit"
             warn(BoundaryWarning(text, file=file, number=float(value)), stacklevel)
-    size, error = _size_of_blur(pair, solution)
+    size, error = size_of_blur(pair, solution)
     if not error < 0.5 * size:
         text = f"the blur's rms radius of {size:.3g} +- {error:.2g} px is not determined: too little blur, or too noisy"
         warn(FlatProfileWarning(text, file=file, number=error / size if size else np.inf), stacklevel)
 
 
-def _size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
+def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     """The kernel's rms radius and its standard error, px; single parameters may trade with each other."""
+    if solution.family == "radial":
+        return _size_of_profile(solution)
     shape = list(solution.params)
     steps = {n: 1e-3 * max(abs(float(solution.params[n])), 0.1) for n in shape}
     varied = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
@@ -226,6 +251,19 @@ def _size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
         return float(rms[0]), np.inf
     noise = np.sqrt(solution.squares / pair.values.size)
     return float(rms[0]), float(noise * np.linalg.norm(along[seen] / values[seen]))
+
+
+def _size_of_profile(solution: Solution) -> tuple[float, float]:
+    """The same of a free profile, whose second moment is linear in its values."""
+    values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
+    r = np.linspace(0, radius, 64 * values.size + 1)
+    place = r / radius * (values.size - 1)
+    hats = np.clip(1 - np.abs(place[None, :] - np.arange(values.size)[:, None]), 0, None)
+    light, moment = hats @ r, hats @ r**3
+    rms = float(np.sqrt(moment @ values / (light @ values)))
+    # of a quotient: the total light is part of both
+    slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
+    return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))
 
 
 def _size(pair: Forward) -> str:

@@ -56,7 +56,8 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     if len(dots) > 1:
         where = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
         raise SeveralDotsError(
-            f"{len(dots)} dots where one was expected, at {where}; crop the picture, or read a grid with dots='centre'",
+            f"{len(dots)} dots where one was expected, at {where}; cover the others, say crop = [left, top, width, "
+            "height] in capture.toml (cropping in an editor loses the scale), or read a grid with dots='centre'",
             file=file,
             number=float(len(dots)),
         )

@@ -9,6 +9,7 @@ import numpy as np
 from ..result import Array
 from ..solve import best_of
 from .dot import Dot, noise_inside
+from .noise import correlate, correlation_of, fine_share
 from .profile_fit import inverse
 
 __all__ = ["STEPS", "Edge", "draw_edge", "soft_edge"]
@@ -115,7 +116,17 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         moved[i] += h
         slope[:, i] = (model(levels, *moved) - model(levels, *solution)) / h
     variance = float(residual @ residual) / max(levels.size - len(solution), 1)
-    expected = float(np.sqrt(np.mean(_variance(picture, dot)[near]))) / dot.peak
+    smooth = fine_share(correlation_of(picture - dot.background, ~near))
+    expected = float(np.sqrt(np.mean(_variance(picture, dot)[near]) / smooth)) / dot.peak
+    # noise that goes together in neighbours does not average out along the edge
+    shown = np.zeros(picture.shape)
+    shown[near] = residual
+    pictures = np.zeros((slope.shape[1], *picture.shape))
+    pictures[:, near] = slope.T
+    together = correlate(pictures, correlation_of(shown, near))[:, near]
+    bread = inverse(slope.T @ slope)
+    bread = np.where(np.isfinite(bread), bread, 0.0)
+    covariance = bread @ (slope.T @ together.T) @ bread * variance
     return Edge(
         x=dot.x + float(solution[0]),
         y=dot.y + float(solution[1]),
@@ -123,7 +134,7 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         softness=float(solution[3]),
         level=float(solution[4]) * dot.peak,
         exponent=float(solution[5]) if fit_exponent else 1.0,
-        covariance=inverse(slope.T @ slope)[2:4, 2:4] * variance,
+        covariance=covariance[2:4, 2:4],
         rms=float(np.sqrt(variance)),
         misfit=float(np.sqrt(variance)) / expected if expected > 0 else np.inf,
     )

@@ -17,6 +17,7 @@ from torchdof.optics.psf import FAMILIES, pixel_kernels, support
 from ..result import Array, Mask
 from ..solve import best_of
 from .dot import Dot, noise_of
+from .noise import correlate, correlation_of, fine_share
 from .profile_fit import inverse
 from .source import Source
 
@@ -28,7 +29,10 @@ _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
 
 @dataclass(frozen=True)
 class Solution:
-    """Kernel parameters and moves that explain the defocused picture best, with everything needed to judge them."""
+    """Kernel parameters and moves that explain the defocused picture best, with everything needed to judge them.
+
+    `slopes` are the model's derivatives by the named parameters `[pixels used, parameters]`.
+    """
 
     family: str
     params: dict[str, float | Array]
@@ -39,6 +43,7 @@ class Solution:
     names: tuple[str, ...]
     covariance: Array
     squares: float
+    slopes: Array | None = None
 
 
 @dataclass
@@ -53,6 +58,8 @@ class Forward:
         magnification: size of the blurred picture's dot over the sharp one's, as expected.
         fit_moves: which of displacement and magnification are fitted.
         held_magnification: the one to use where it is not fitted, and to start from; None takes the expected one.
+        distance: of each pixel from the blurred dot's centre `[H, W]`, px.
+        noise_correlation: how the noise of neighbouring pixels goes together, from the dark paper.
         start: kernel parameters to start from beside the moments, by family.
         prior: expected value and standard deviation of kernel parameters, as if measured elsewhere.
     """
@@ -82,6 +89,10 @@ class Forward:
         )
         self.flat = self.used.ravel()
         self.values = self.data.ravel()[self.flat]
+        rows_, columns_ = np.indices(self.data.shape)
+        self.distance = np.hypot(columns_ - self.data_dot.x, rows_ - self.data_dot.y)
+        dark = self.used & (self.distance > self.data_dot.reach + 2)
+        self.noise_correlation = correlation_of(self.data - self.data_dot.background, dark)
         # every level near 1, so that one tolerance serves all pictures
         self.unit = max(float(np.abs(self.values - self.data_dot.background).max()), np.finfo(float).tiny)
 
@@ -113,6 +124,15 @@ class Forward:
         blurred = irfft2(source * rfft2(wrapped), self.grid)[..., : self.data.shape[0], : self.data.shape[1]]
         flat = blurred.reshape(*blurred.shape[:-2], -1)
         return np.asarray(flat if whole else flat[..., self.flat])
+
+    def correlate(self, source: Array, picture: Array, size: int) -> Array:
+        """The adjoint of `convolve` for one kernel `[size, size]`: what the used pixels say of each of its pixels."""
+        from scipy.fft import irfft2
+
+        full = np.zeros(self.flat.size)
+        full[self.flat] = picture
+        spread = irfft2(np.conj(source) * self._transform(full.reshape(self.data.shape)), self.grid)
+        return np.asarray(np.roll(spread, (size // 2, size // 2), (0, 1))[:size, :size])
 
     def kernels(self, family: str, params: dict[str, Array]) -> Array:
         """Kernels `[n, k, k]` for parameters `[n]`, as wide as they need and at most as wide as the window."""
@@ -171,6 +191,7 @@ class Forward:
             names=names,
             covariance=self.covariance(slopes, residual, kernel, gain, self.moves(params), pull * scale),
             squares=float(residual @ residual),
+            slopes=slopes,
         )
 
     def moves(self, params: dict[str, float]) -> dict[str, float]:
@@ -198,20 +219,21 @@ class Forward:
     ) -> Array:
         """Covariance of the parameters under both pictures' noise (a sandwich).
 
-        The defocused picture's noise is white and as large as the residual says, pixel by pixel. The sharp picture's
-        passes through the kernel and is then alike in neighbouring pixels, which is what makes naive errors too small.
-        An ideal dot brings the errors of its radius and softness instead.
+        The defocused picture's noise is as large as the residual says around each pixel, and goes together in
+        neighbours as the residual does. The sharp picture's passes through the kernel and is then alike in neighbouring
+        pixels too. Both make naive errors too small. An ideal dot brings the errors of its radius and softness instead.
         """
         known_before = 0.0 if prior is None else prior.T @ prior
         bread = inverse(jacobian.T @ jacobian + known_before)
         known = np.isfinite(np.diag(bread))
         bread = np.where(np.outer(known, known), bread, 0.0)
         n, p = jacobian.shape
-        own = residual**2 * n / max(n - p - 2, 1)
-        through = (gain * self.source.noise) ** 2
+        through = (gain * self.source.noise) ** 2 / fine_share(self.noise_correlation)
+        deviation, correlation = self.residual_noise(residual, n / max(n - p - 2, 1))
         if through > 0:
-            own = np.maximum(own - through * float(np.sum(kernel**2)), 0.1 * own)
-        meat = jacobian.T @ (own[:, None] * jacobian) + known_before
+            least = np.sqrt(0.1) * deviation
+            deviation = np.sqrt(np.maximum(deviation**2 - through * float(np.sum(kernel**2)), least**2))
+        meat = jacobian.T @ self.noise_times(jacobian, deviation, correlation) + known_before
         if through > 0:
             meat = meat + through * self._source_scores(jacobian, kernel)
         covariance = bread @ meat @ bread
@@ -231,8 +253,29 @@ class Forward:
         spread = self.convolve(self._transform(pictures.reshape(-1, *self.data.shape)), kernel[None], whole=True)
         rows, columns = np.indices(self.data.shape)
         near = np.hypot(columns - self.data_dot.x, rows - self.data_dot.y) <= self.source.reach * self.magnification
-        spread = spread[:, near.ravel()]
-        return np.asarray(spread @ spread.T)
+        spread = np.where(near.ravel(), spread, 0.0)
+        shaped = spread.reshape(-1, *self.data.shape)
+        return np.asarray(spread @ correlate(shaped, self.noise_correlation).reshape(spread.shape).T)
+
+    def residual_noise(self, residual: Array, factor: float = 1.0) -> tuple[Array, Array]:
+        """Deviation of each used pixel's noise `[pixels used]`, and how neighbours' go together, from a residual."""
+        from scipy.ndimage import gaussian_filter
+
+        full = np.zeros(self.flat.size)
+        full[self.flat] = residual
+        full = full.reshape(self.data.shape)
+        share = np.maximum(gaussian_filter(self.used.astype(np.float64), 2.0), 1e-6)
+        deviation = np.sqrt(factor * np.maximum(gaussian_filter(full**2, 2.0) / share, 0.0))
+        near = self.used & (self.distance <= self.data_dot.reach + 2)
+        scaled = full / np.maximum(deviation, 1e-12 * self.unit)
+        return deviation.ravel()[self.flat], correlation_of(scaled, near)
+
+    def noise_times(self, columns: Array, deviation: Array, correlation: Array) -> Array:
+        """Covariance of the pixels' noise times columns `[pixels used, p]`."""
+        pictures = np.zeros((columns.shape[1], self.flat.size))
+        pictures[:, self.flat] = (deviation[:, None] * columns).T
+        together = correlate(pictures.reshape(-1, *self.data.shape), correlation).reshape(pictures.shape)
+        return np.asarray(deviation[:, None] * together[:, self.flat].T)
 
     def _shaped(self, family: str, names: tuple[str, ...], p: Array) -> Array:
         """Kernel convolved with the moved source, before gain and background: `[pixels used]`."""

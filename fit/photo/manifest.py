@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from torchdof.io.images import read_image
+from torchdof.io.metadata import camera_facts, original_width
 from torchdof.io.transfer import Transfer
 from torchdof.validation import show
 
-from ..problems import DistanceError, FitError, ManifestError, NonFiniteError
+from ..problems import CameraWarning, DistanceError, FitError, ManifestError, NonFiniteError, warn
 from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
 
@@ -31,6 +32,8 @@ _RANGES = {  # beyond any camera's
     "sensor_width_mm": (1e-3, 1e5),
     "exposure_s": (1e-9, 1e7),
     "width_px": (1, 2**31),
+    "full_width_px": (1, 2**31),
+    "original_width_px": (1, 2**31),
 }
 
 
@@ -41,12 +44,14 @@ class Captures:
     Attributes:
         pairs: by increasing distance.
         focus_m: distance of the sharp picture: what the lens stays focused on.
-        width_px: width of the whole frame.
+        width_px: width of the whole frame, which `sensor_width_mm` belongs to: the pictures may be crops of it.
         focal_length_mm: of the lens, or None.
         f_number: of the lens, or None.
         sensor_width_mm: of the camera, or None.
         name: of the table to be.
         notes: more about the capture, for the table's provenance.
+        original_width_px: width at which EXIF says the pictures were taken, where it is another than theirs and nobody
+            said whether they are crops. None otherwise.
     """
 
     pairs: tuple[Capture, ...]
@@ -57,6 +62,7 @@ class Captures:
     sensor_width_mm: float | None = None
     name: str = ""
     notes: Mapping[str, Any] = field(default_factory=dict)
+    original_width_px: int | None = None
 
     def __post_init__(self) -> None:
         """Check what all later steps rely on.
@@ -70,7 +76,7 @@ class Captures:
         if not self.pairs:
             raise FitError("captures hold no pair of pictures; photograph the dot at one more distance at least")
         _check_distances([p.distance_m for p in self.pairs], self.focus_m, None)
-        for what in ("width_px", "focal_length_mm", "f_number", "sensor_width_mm"):
+        for what in ("width_px", "focal_length_mm", "f_number", "sensor_width_mm", "original_width_px"):
             value = getattr(self, what)
             plain, (low, high) = isinstance(value, int | float) and not isinstance(value, bool), _RANGES[what]
             if not (plain and low <= value <= high) and (value is not None or what == "width_px"):
@@ -93,9 +99,11 @@ def read_captures(
     ```toml
     focus_m = 0.20              # the lens stays focused here
     sharp = "0200mm.png"        # the dot at that distance
-    focal_length_mm = 50.0      # camera: optional, all of them together make the table know its unit
+    focal_length_mm = 50.0      # camera: what is left out is read from EXIF; all three make the table know its unit
     f_number = 2.8
     sensor_width_mm = 36.0
+    full_width_px = 6000        # optional: width of the whole frame, if the pictures were cropped before
+    crop = [1200, 800, 900, 900]  # optional: left, top, width, height in px; what lies outside is not looked at
     transfer = "srgb"           # optional: "srgb" or "linear"; by default integers are sRGB, floats are linear
     dark = "dark.png"           # optional: lens cap on, same exposure
     exposure_s = 0.02           # optional: of the sharp picture
@@ -152,30 +160,49 @@ def read_captures(
     if root is not None:
         for file in [sharp, *files, *([] if dark is None else [base / dark])]:
             _inside(file, root, where)
-    darkness = None if dark is None else _read(base / dark, transfer)[0]
-    still, white = _read(sharp, transfer, darkness)
-    first = _optional(fields, "exposure_s", where)
+    crop = _crop(fields, where)
+    darkness = None if dark is None else _read(base / dark, transfer, crop=crop).light
+    first = _read(sharp, transfer, darkness, crop)
+    still, exposed = first.light, _optional(fields, "exposure_s", where)
     columns: list[list[Capture]] = []
     for shot, distance, file in zip(shots, distances, files, strict=True):
-        moved, _ = _read(file, transfer, darkness)
-        if moved.shape != still.shape:
-            raise ManifestError(f"{file.name} is {size_of(moved)}, {sharp.name} is {size_of(still)}", file=where)
+        moved = _read(file, transfer, darkness, crop)
+        if moved.light.shape != still.shape:
+            raise ManifestError(f"{file.name} is {size_of(moved.light)}, {sharp.name} is {size_of(still)}", file=where)
+        _check_same_camera(first.facts, moved.facts, sharp.name, str(file))
         second = _optional(shot, "exposure_s", where)
-        exposure = None if first is None or second is None else second / first
         columns.append(
-            cut_pairs(still, moved, distance, focus / distance, chosen, (str(sharp), str(file)), white, exposure)
+            cut_pairs(
+                still,
+                moved.light,
+                distance,
+                focus / distance,
+                chosen,
+                (str(sharp), str(file)),
+                first.white,
+                None if exposed is None or second is None else second / exposed,
+                first.middle,
+            )
         )
+    camera = {name: _optional(fields, name, where) for name in ("focal_length_mm", "f_number", "sensor_width_mm")}
+    from_exif = [name for name, value in camera.items() if value is None and name in first.facts]
+    _check_exif(camera, first.facts, where)
+    full_width = _optional(fields, "full_width_px", where)
+    if full_width is not None and full_width < first.width_px:
+        got = f"got {full_width:g} for pictures of {first.width_px}"
+        raise ManifestError(f"full_width_px must be at least the pictures' own width, {got}", file=where)
     notes = {"manifest": path.name, "transfer": transfer or "by file type", "pictures": [s["file"] for s in shots]}
+    if from_exif:
+        notes["from_exif"] = from_exif
     return [
         Captures(
             pairs=tuple(column[i] for column in columns),
             focus_m=focus,
-            width_px=still.shape[1],
-            focal_length_mm=_optional(fields, "focal_length_mm", where),
-            f_number=_optional(fields, "f_number", where),
-            sensor_width_mm=_optional(fields, "sensor_width_mm", where),
+            width_px=first.width_px if full_width is None else round(full_width),
+            **{name: first.facts.get(name) if value is None else value for name, value in camera.items()},
             name=_text(fields, "name", where) or base.resolve().name,
             notes=notes | {"position_px": list(columns[0][i].position_px)},
+            original_width_px=first.original_width_px if full_width is None else None,
         )
         for i in range(min(len(c) for c in columns))
     ]
@@ -205,16 +232,16 @@ def read_pair(
     for name, file in (("sharp", sharp), ("blurred", blurred)):
         if not isinstance(file, str | os.PathLike):
             raise FitError(f"{name} must be the path of a picture, got {show(file)}")
-    still, white = _read(Path(sharp), transfer)
-    moved, _ = _read(Path(blurred), transfer)
+    first, second = _read(Path(sharp), transfer), _read(Path(blurred), transfer)
+    still, moved, files = first.light, second.light, (str(sharp), str(blurred))
     if still.shape != moved.shape:
         raise FitError(f"the pictures must have one size, got {size_of(still)} and {size_of(moved)}", file=str(blurred))
-    return cut_pairs(still, moved, distance_m, magnification, "one", (str(sharp), str(blurred)), white, None)[0]
+    return cut_pairs(still, moved, distance_m, magnification, "one", files, first.white, None, first.middle)[0]
 
 
 _FIELDS = (
     "focus_m", "sharp", "shot", "focal_length_mm", "f_number", "sensor_width_mm", "transfer", "dark", "exposure_s",
-    "dots", "name",
+    "dots", "name", "full_width_px", "crop",
 )  # fmt: skip
 
 
@@ -280,11 +307,41 @@ def _check_distances(distances: Sequence[float], focus: float, where: str | None
         raise DistanceError(f"focus_m must be positive, got {focus}", file=where, number=float(focus))
 
 
-def _read(path: Path, transfer: Any, dark: Array | None = None) -> tuple[Array, float | None]:
-    """A picture `[H, W]` in linear light, mean of its colours, and the level at which it is clipped."""
+@dataclass(frozen=True)
+class _Photograph:
+    """A picture `[H, W]` in linear light, mean of its colours, and what its file says.
+
+    Attributes:
+        light: `[H, W]`.
+        white: the level at which it is clipped, or None.
+        width_px: of the whole picture.
+        middle: (x, y) of the whole picture's centre in px of `light`.
+        facts: what EXIF says about the camera.
+        original_width_px: width at which EXIF says it was taken, where that is another one.
+    """
+
+    light: Array
+    white: float | None
+    width_px: int
+    middle: tuple[float, float]
+    facts: Mapping[str, float]
+    original_width_px: int | None
+
+
+def _read(
+    path: Path, transfer: Any, dark: Array | None = None, crop: tuple[int, int, int, int] | None = None
+) -> _Photograph:
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
     pixels = pixels[[i for i, name in enumerate(picture.channels) if name != "A"]]
+    height, width = pixels.shape[1:]
+    middle = ((width - 1) / 2, (height - 1) / 2)
+    if crop is not None:
+        left, top, columns, rows = crop
+        if left + columns > width or top + rows > height:
+            raise ManifestError(f"crop {list(crop)} leaves the picture of {width}x{height}", file=str(path))
+        pixels = pixels[:, top : top + rows, left : left + columns]
+        middle = (middle[0] - left, middle[1] - top)
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise NonFiniteError(f"{bad} values are NaN or infinite", file=str(path), number=float(bad))
@@ -298,4 +355,40 @@ def _read(path: Path, transfer: Any, dark: Array | None = None) -> tuple[Array, 
         light = light - dark
     if clipped is not None:
         light[clipped] = white
-    return light, white
+    facts = camera_facts(picture.metadata, width)
+    if height > width and "sensor_width_mm" in facts:  # turned upright: EXIF speaks of the longer side
+        facts["sensor_width_mm"] *= width / height
+    original = original_width(picture.metadata)
+    taken = original if original is not None and original > width else None
+    return _Photograph(light, white, width, middle, facts, taken)
+
+
+def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | None:
+    value = fields.get("crop")
+    if value is None:
+        return None
+    whole = isinstance(value, list) and len(value) == 4 and all(type(v) is int and 0 <= v < 2**31 for v in value)
+    if not whole or value[2] < 1 or value[3] < 1:
+        raise ManifestError(f"crop must be [left, top, width, height] in pixels, got {show(value)}", file=where)
+    return value[0], value[1], value[2], value[3]
+
+
+def _check_same_camera(first: Mapping[str, float], second: Mapping[str, float], name: str, file: str) -> None:
+    """Refuse pictures of one capture between which the lens was changed."""
+    for what, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
+        if what in first and what in second and abs(math.log(first[what] / second[what])) > 0.02:
+            raise ManifestError(
+                f"EXIF says this was taken at {word} {second[what]:g}, and {name} at {first[what]:g}; aperture and "
+                "zoom must stay as they are",
+                file=file,
+                number=second[what],
+            )
+
+
+def _check_exif(camera: Mapping[str, float | None], facts: Mapping[str, float], where: str) -> None:
+    """Warn where the manifest contradicts what EXIF says; the manifest's is taken."""
+    for name, most in (("focal_length_mm", 0.1), ("f_number", 0.1), ("sensor_width_mm", 0.15)):
+        stated = camera[name]
+        if stated is not None and name in facts and abs(math.log(stated / facts[name])) > most:
+            text = f"{name} is stated as {stated:g}, and EXIF says {facts[name]:.4g}; the stated one is taken"
+            warn(CameraWarning(text, file=where, number=stated / facts[name]), stacklevel=4)

@@ -12,29 +12,29 @@ from numpy.typing import ArrayLike
 from torchdof.optics.psf import FAMILIES
 from torchdof.validation import show
 
-from ..problems import FitError, NotInFocusWarning, SaturatedWarning, warn
+from ..problems import FitError, SaturatedWarning, warn
 from ..result import Array, BlurFit
 from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
-from .diagnostics import EXPLAINED, check_fit, check_linearity
+from .diagnostics import check_fit
 from .dot import find_dot
-from .dot_model import soft_edge
+from .dot_model import Edge, soft_edge
 from .family_choice import COST, choose
 from .forward import ALL_MOVES, Forward, Solution
+from .linearity import EXPLAINED, check_focus, check_linearity, focused
 from .profile_fit import fit_profile
-from .radial import solve_radial
+from .radial import solve_radial, solve_round
 from .ratio import blur_strength
 from .saturation import used_pixels
 from .source import IdealDot, PictureOfDot, point_source
 
-__all__ = ["fit_pair"]
+__all__ = ["fit_pair", "prepared_pair"]
 
 Model = Literal["forward", "ratio"]
 SourceKind = Literal["auto", "image", "dot"]
 
 _SMALLEST_WINDOW = 15
 _AS_GOOD = 2e-3
-_SOFT = 1.5  # px: an edge softer than this is not in focus
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
 
@@ -123,7 +123,7 @@ def fit_pair(
         r, strength, spokes = blur_strength(still, data)
         fit = fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes)
         return replace(fit, model="ratio")
-    pair = _prepare(still, data, source, magnification, white, files)
+    pair, edge = prepared_pair(still, data, source, magnification, white, files)
     if start is not None and start.family in FAMILIES:
         pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
     pair.prior = dict(prior or {})
@@ -142,6 +142,8 @@ def fit_pair(
     fit = describe(pair, solutions[family], why)
     # a family that was chosen for being cheap is not to blame for what the free profile explains
     check_fit(pair, solutions[family], fit, files, describe(pair, solutions["radial"], "") if why else fit)
+    if edge is not None:
+        check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)
 
 
@@ -184,33 +186,23 @@ def _check_options(
         a_number(f"the deviation of {name}", deviation, 0)
 
 
-def _prepare(
+def prepared_pair(
     still: Array | None,
     data: Array,
     source: SourceKind,
     magnification: float,
     white: float | None,
     files: tuple[str | None, str | None],
-) -> Forward:
-    """Find the dots, leave out what is clipped, doubt the focus, and decide what stands for the sharp dot."""
+) -> tuple[Forward, Edge | None]:
+    """Find the dots, leave out what is clipped, and decide what stands for the sharp dot, whose edge comes with it."""
     data_dot = find_dot(data, file=files[1])
     used = used_pixels(data, data_dot, white, files[1], "blurred")
     if still is None:
-        return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification)
+        return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None
     dot = find_dot(still, file=files[0])
     whole = used_pixels(still, dot, white, files[0], "sharp", refuse=False)
     clipped = int(np.sum(~whole))
     edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)
-    if edge.softness > _SOFT and edge.radius > 2 * _SOFT:
-        warn(
-            NotInFocusWarning(
-                f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px (at most {_SOFT}); "
-                "focus on the dot, or expect a kernel that is too small",
-                file=files[0],
-                number=edge.softness,
-            ),
-            stacklevel=4,
-        )
     if not clipped:
         check_linearity(still, dot, edge, files[0])
     if clipped:
@@ -227,8 +219,8 @@ def _prepare(
     close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
     explained = close and edge.radius > 2 * edge.softness
     if clipped or source == "dot" or (source == "auto" and explained):
-        return Forward(IdealDot.of(dot, edge), data, used, data_dot, magnification)
-    return Forward(PictureOfDot.of(still, dot), data, used, data_dot, magnification)
+        return Forward(IdealDot.of(dot, focused(edge)), data, used, data_dot, magnification), edge
+    return Forward(PictureOfDot.of(still, dot), data, used, data_dot, magnification), edge
 
 
 def _with_magnification(pair: Forward) -> Forward:
@@ -244,13 +236,9 @@ def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
 
 def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: float | None) -> Solution:
     """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`."""
-    soft = pair.solve("softm")
-    if reach is None:  # a little beyond what the soft disc says
-        reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
-    reach = min(reach, pair.half - 1.0)
-    solution = solve_radial(pair, soft, reach, knots)
+    solution = solve_round(pair, knots, reach)
     if held is None:
-        free = solve_radial(_with_magnification(pair), solution, reach, knots)
+        free = solve_radial(_with_magnification(pair), solution, float(solution.params["radius"]), knots)
         if _improves(pair, solution, free):
             pair.fit_moves, solution = ALL_MOVES, free
     pair.held_magnification = solution.moves["magnification"]

@@ -13,7 +13,7 @@ from ..result import Array, Mask
 from .forward import Forward, Solution, without_level
 from .profile_fit import inverse
 
-__all__ = ["solve_radial"]
+__all__ = ["solve_radial", "solve_round"]
 
 # plain cross-validation (1) follows the noise now and then; 3 costs nothing without noise and up to 12 dB less with it
 _CAUTION = 3.0
@@ -75,7 +75,16 @@ def solve_radial(pair: Forward, seed: Solution, radius: float, knots: int | None
         names=tuple(f"values[{i}]" for i in range(count)),
         covariance=covariance / gain**2,
         squares=float(residual @ residual),
+        slopes=np.stack(pair.move_columns(moves, ("dx", "dy"), kernel[None]), axis=1),
     )
+
+
+def solve_round(pair: Forward, knots: int | None = None, reach: float | None = None) -> Solution:
+    """A free profile that ends a little beyond where a soft disc says, or at `reach` px."""
+    soft = pair.solve("softm")
+    if reach is None:
+        reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
+    return solve_radial(pair, soft, min(reach, pair.half - 1.0), knots)
 
 
 def hat_mass(count: int, radius: float) -> Array:

@@ -5,23 +5,21 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchdof.optics.blur_table import BlurTable
-from torchdof.optics.camera import Camera
-from torchdof.optics.psf import FAMILIES, LENGTHS, profile, support
+from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
 
 from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
 from ..result import Array, BlurFit
+from .agreement import check_agreement, frame_width, promised_px
 from .distances import fit_distances, fit_one
 from .family_choice import COST
 from .manifest import Capture, Captures
-from .scale import signed_coc
 
 __all__ = ["TableFit", "fit_captures", "fit_table"]
 
@@ -38,6 +36,7 @@ class TableFit:
         coc_px: signed circle of confusion of each, px of the frame.
         why: how the family was chosen.
         scale: where the circles of confusion come from: "camera" or "measured".
+        coc_per_dioptre_px: the circle of confusion over 1/focus - 1/distance [1/m], px of the frame.
     """
 
     table: BlurTable
@@ -45,6 +44,7 @@ class TableFit:
     coc_px: tuple[float, ...]
     why: str
     scale: str
+    coc_per_dioptre_px: float
 
 
 def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **options: Any) -> BlurTable:
@@ -88,6 +88,7 @@ def fit_captures(
     smooth: bool = True,
     progress: Callable[[int, int, str], None] | None = None,
     command: str = "torchdof.fit.fit_table",
+    scale_of: TableFit | None = None,
 ) -> TableFit:
     """Fit every distance, and make one table of the fits.
 
@@ -106,15 +107,19 @@ def fit_captures(
         smooth: whether neighbouring distances inform each other.
         progress: called with (done, all, what) after each fit.
         command: recorded in the table's provenance.
+        scale_of: the fit of another dot of the same photographs, whose scale is taken where the camera is not known.
+            Measured dot by dot, the scale would make the centre and the corner of a frame the same table.
 
     Returns:
         The table and its fits.
 
     Raises:
         FitError: a pair cannot be fitted; the message names its file.
+        CameraError: the fitted blur is far from what the camera's numbers promise.
 
     Warns:
         SingleDistanceWarning: one distance only; the thin lens scales it.
+        CameraWarning: the fitted blur differs from what the camera's numbers promise.
         ExposureWarning: a fitted gain contradicts the stated exposures.
         FitWarning: what `fit_pair` warns about.
     """
@@ -137,7 +142,10 @@ def fit_captures(
             progress(done, total, f"{pair.distance_m:g} m")
 
     ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
-    coc_px, scale = _keys(captures, ordered)
+    radius_px = [f.radius for f in ordered]
+    captures = replace(captures, width_px=frame_width(captures, radius_px))
+    check_agreement(captures, radius_px)
+    coc_px, scale = _keys(captures, radius_px, scale_of)
     if family == "radial":
         # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
         radius = np.array([float(f.params["radius"]) for f in ordered])
@@ -157,6 +165,7 @@ def fit_captures(
         coc_px=tuple(coc_px),
         why=why,
         scale=scale,
+        coc_per_dioptre_px=coc_px[0] / (1 / captures.focus_m - 1 / pairs[0].distance_m),
     )
 
 
@@ -193,28 +202,16 @@ def _check_exposure(pair: Capture, fit: BlurFit) -> None:
         warn(ExposureWarning(text, file=pair.files[1], number=off), stacklevel=4)
 
 
-def _keys(captures: Captures, fits: list[BlurFit]) -> tuple[list[float], str]:
-    """Signed circle of confusion of each pair in px of the frame."""
-    if captures.focal_length_mm is not None and captures.f_number is not None and captures.sensor_width_mm is not None:
-        camera = Camera(
-            focal_length_mm=captures.focal_length_mm,
-            f_number=captures.f_number,
-            focus_m=captures.focus_m,
-            sensor_width_mm=captures.sensor_width_mm,
-        )
-        return [signed_coc(camera, p.distance_m, captures.width_px) for p in captures], "camera"
-    vergence = np.array([1 / captures.focus_m - 1 / p.distance_m for p in captures])
-    size = np.array([math.sqrt(2) * rms_radius(f) for f in fits])
-    factor = float(np.abs(vergence) @ size / (vergence @ vergence))
-    return [float(factor * v) for v in vergence], "measured"
-
-
-def rms_radius(fit: BlurFit) -> float:
-    """Root of a kernel's mean squared radius, in the fit's unit; over a uniform disc it is its radius / sqrt(2)."""
-    params = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in fit.kernel_params().items()}
-    r = np.linspace(0, support(fit.family, params) + 1e-9, 4001)
-    f = profile(fit.family, torch.from_numpy(r), params).numpy()
-    return float(np.sqrt((f * r**3).sum() / (f * r).sum()))
+def _keys(captures: Captures, radius_px: list[float], scale_of: TableFit | None) -> tuple[list[float], str]:
+    """Signed circle of confusion of each pair in px of the frame, and where its scale is from."""
+    promised = promised_px(captures)
+    if promised is not None:
+        return promised, "camera"
+    defocus = np.array([1 / captures.focus_m - 1 / p.distance_m for p in captures])
+    if scale_of is not None:
+        return [float(scale_of.coc_per_dioptre_px * d) for d in defocus], scale_of.scale
+    factor = float(np.abs(defocus) @ np.array(radius_px) / (defocus @ defocus))
+    return [float(factor * d) for d in defocus], "measured"
 
 
 def _table(

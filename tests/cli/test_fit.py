@@ -18,7 +18,7 @@ def kernel(distance: float) -> tuple[str, dict[str, float]]:
 @pytest.fixture(scope="module")
 def folder(simulator: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
-    fields = 'focal_length_mm = 50.0\nf_number = 4.0\nsensor_width_mm = 36.0\nname = "my lens"'
+    fields = 'focal_length_mm = 50.0\nf_number = 1.543\nsensor_width_mm = 36.0\nname = "my lens"'
     return simulator.write_captures(
         tmp_path_factory.mktemp("lens"), camera, 0.5, [0.4, 0.8, 1.0], kernel, camera_fields=fields
     )

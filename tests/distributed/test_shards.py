@@ -17,7 +17,7 @@ from torchdof.augmentation import RandomDepthOfField
 from torchdof.distributed import Pair, RenderShards, pairs_in, shard_rows, summary_of
 from torchdof.io.images import Picture, read_image, write_image
 
-BLUR = {"camera": Camera(sensor_width_mm=4.0), "tolerance": "preview", "p": 0.0}
+BLUR: dict[str, Any] = {"camera": Camera(sensor_width_mm=4.0), "tolerance": "preview", "p": 0.0}
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_a_shard_holds_each_sample_with_its_parameters(pairs: list[Pair], tmp_pa
         key = f"{k:08d}"
         facts = json.loads(files[f"{key}.json"])
         depth = torch.from_numpy(np.load(io.BytesIO(files[f"{key}.depth.npy"])))
-        assert facts["image"] == pair.image and torch.equal(depth, torch.from_numpy(np.load(pair.depth)).float())
+        assert facts["image"] == pair.image and torch.equal(depth, torch.from_numpy(np.load(str(pair.depth))).float())
         camera = Camera(facts["focal_length_mm"], facts["f_number"], facts["focus_m"], facts["sensor_width_mm"])
         sharp = read_image(pair.image).pixels
         right = depth_of_field(sharp, depth[None, None], camera, tolerance=facts["tolerance"], check=False)

@@ -22,4 +22,9 @@ def test_the_paper_s_experiment_reaches_its_figure_4(tmp_path: Path) -> None:
     # 0.318 mm on a sensor of 9 mm and 480 pixels is the thin lens's; the traced lens is a little more
     assert 16.9 < float(re.findall(r"radius = ([\d.]+)", run.stdout)[0]) < 17.3
     assert "sigma = 0.0023476 m" in run.stdout
+    assert "samples of its own curve" in run.stdout
+    off = {
+        n: float(re.findall(rf"{n} +rms radius [\d.]+ px, ([+-][\d.]+) %", run.stdout)[0]) for n in ("ratio", "forward")
+    }
+    assert abs(off["forward"]) < 2 < abs(off["ratio"])
     assert float(re.findall(r"spot itself: ([\d.]+) dB", run.stdout)[0]) > 45

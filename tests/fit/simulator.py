@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
 from torchdof.optics.psf import pixel_kernels
@@ -49,6 +50,11 @@ class Simulator:
         srgb: leave both pictures sRGB encoded.
         jpeg: JPEG quality the sRGB-encoded pictures are stored at and decoded from; None for none.
         edge_sigma: softness of the sharp picture in px, in both pictures.
+        misfocus: blur (a Gaussian's sigma in px) of the sharp picture alone.
+        texture: contrast of the paper's and the dot's grain, a few px large, the same in both pictures.
+        uneven: how much brighter the light is at the window's right edge than at its left.
+        tone: strength of an S-curve over the encoded levels that nobody undoes, 0 to 1.
+        bayer: record one colour a pixel and demosaic it bilinearly, as the mean of the colours that comes back.
     """
 
     size: int = 101
@@ -66,6 +72,11 @@ class Simulator:
     srgb: bool = False
     jpeg: int | None = None
     edge_sigma: float = 0.0
+    misfocus: float = 0.0
+    texture: float = 0.0
+    uneven: float = 0.0
+    tone: float = 0.0
+    bayer: bool = False
 
     def pair(self, family: str, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
@@ -74,6 +85,13 @@ class Simulator:
         moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, self.shift), self.size)
         if self.edge_sigma:
             sharp, moved = (blur(p, "gaussian", {"sigma": self.edge_sigma}) for p in (sharp, moved))
+        if self.texture:
+            grain = gaussian_filter(np.random.default_rng(7).normal(size=moved.shape), 2.0)
+            grain = 1 + self.texture * grain / grain.std()
+            moved = moved * grain
+            sharp = sharp * grain[self.size : 2 * self.size, self.size : 2 * self.size]
+        if self.misfocus:
+            sharp = blur(sharp, "gaussian", {"sigma": self.misfocus})
         blurred = blur(moved, family, params)[self.size : 2 * self.size, self.size : 2 * self.size]
         still, defocused = self.level * sharp, self.level * self.exposure * blurred + self.offset
         return self.record(still, rng), self.record(defocused, rng)
@@ -81,12 +99,18 @@ class Simulator:
     def record(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """What the file holds of a picture in linear light, decoded to linear light unless `srgb`."""
         picture = np.maximum(light, 0.0) + self.black
+        picture = picture * (1 + self.uneven * np.linspace(-0.5, 0.5, picture.shape[1]))
         if self.full_well is not None:
             picture = rng.poisson(picture * self.full_well) / self.full_well
         if self.snr_db is not None:
             picture = picture + rng.normal(0.0, 10 ** (-self.snr_db / 20), picture.shape)
+        if self.bayer:
+            picture = demosaiced(picture)
         if self.clip is not None:
             picture = np.minimum(picture, self.clip)
+        if self.tone:
+            encoded = encode_srgb(picture)
+            picture = decode_srgb((1 - self.tone) * encoded + self.tone * encoded**2 * (3 - 2 * encoded))
         if self.jpeg is not None:
             return decode_srgb(_through_jpeg(encode_srgb(picture), self.jpeg))
         if self.srgb:
@@ -95,6 +119,19 @@ class Simulator:
             levels = 2**self.bits - 1
             picture = np.round(np.clip(picture, 0, 1) * levels) / levels
         return picture
+
+
+def demosaiced(mosaic: np.ndarray) -> np.ndarray:
+    """Mean of the three colours of a grey scene seen through a Bayer pattern (RGGB), interpolated bilinearly."""
+    from scipy.ndimage import convolve
+
+    rows, columns = np.indices(mosaic.shape)
+    red, blue = (rows % 2 == 0) & (columns % 2 == 0), (rows % 2 == 1) & (columns % 2 == 1)
+    cross = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
+    square = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
+    green = convolve(np.where(red | blue, 0.0, mosaic), cross, mode="mirror")
+    others = sum(convolve(np.where(colour, mosaic, 0.0), square, mode="mirror") for colour in (red, blue))
+    return (green + others) / 3
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
@@ -148,6 +185,47 @@ def write_captures(
     text = [f"focus_m = {focus_m}", shots[0], camera_fields, *shots[1:]]
     (folder / "capture.toml").write_text("\n".join(text))
     return folder
+
+
+def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.01, kernel="disc", jpeg=90, exif=True):
+    """A phone's JPEGs of the printed target on a grey desk, focused at `focus_m`; returns radius in px by distance.
+
+    26 mm equivalent at f/1.8; `tone` is the strength of an S-curve that nobody undoes.
+    """
+    import OpenImageIO as oiio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    focal_mm, f_number = 5.4, 1.8
+    image_px = focal_mm / (36 * focal_mm / 26) * width / (1 - focal_mm / 1000 / focus_m)
+    height, fine = width * 3 // 4, 3
+    radius = {}
+    for i, distance in enumerate([focus_m, *distances]):
+        scale = image_px / distance / 1000  # px a mm
+        turn, (x0, y0) = np.deg2rad(1.5), (0.02 * width, -0.015 * width)
+        axis_x, axis_y = ((np.arange(n * fine) + 0.5) / fine - n / 2 for n in (width, height))
+        x, y = np.meshgrid(axis_x - x0, axis_y - y0)
+        x, y = (x * np.cos(turn) + y * np.sin(turn)) / scale, (y * np.cos(turn) - x * np.sin(turn)) / scale
+        light = np.where((np.abs(x) < 105) & (np.abs(y + 17) < 148), 0.8, 0.3 + 0.05 * np.sin(x / 30))
+        light[(np.abs(x) < 50) & (np.abs(y) < 50)] = 0.035
+        light[np.hypot(x, y) < 2.5] = 0.8
+        light = light.reshape(height, fine, width, fine).mean((1, 3)) * (1 + 0.1 * np.linspace(-1, 1, width))
+        radius[distance] = focal_mm / 2000 / f_number * image_px * abs(1 / focus_m - 1 / distance)
+        if radius[distance]:
+            wide = np.pad(light, 40, mode="edge")
+            light = blur(wide, kernel, {"radius": radius[distance]})[40:-40, 40:-40]
+        camera = Simulator(snr_db=-20 * np.log10(noise), bayer=True, tone=tone)
+        pixels = np.round(255 * encode_srgb(camera.record(light, np.random.default_rng(i)))).astype(np.uint8)
+        spec = oiio.ImageSpec(width, height, 3, "uint8")
+        spec.attribute("Compression", f"jpeg:{jpeg}")
+        if exif:
+            spec.attribute("Exif:FocalLength", focal_mm)
+            spec.attribute("FNumber", f_number)
+            spec.attribute("Exif:FocalLengthIn35mmFilm", 26)
+        out = oiio.ImageOutput.create(str(folder / f"img_{i:04d}.jpg"))
+        out.open(str(folder / f"img_{i:04d}.jpg"), spec)
+        out.write_image(np.ascontiguousarray(np.repeat(pixels[..., None], 3, 2)))
+        out.close()
+    return radius
 
 
 def _centre(square: np.ndarray, height: int, width: int) -> np.ndarray:

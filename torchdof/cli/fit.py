@@ -15,19 +15,24 @@ from rich.table import Table
 from torchdof import BlurTable
 from torchdof.cli.arguments import AsJson
 from torchdof.cli.printed import json_line
-from torchdof.fit.photo.manifest import Captures, read_captures
+from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
+from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
+from torchdof.fit.photo.target import SQUARE_MM, Paper, write_target
 from torchdof.fit.problems import FitError, FitWarning
 
 __all__ = ["fit"]
 
-_CAPTURE, _LENS, _OUT = "From photographs", "From a lens prescription", "Result"
+_TARGET, _CAPTURE, _LENS, _OUT = "With the printed target", "From photographs", "From a lens prescription", "Result"
 
 
 def fit(
     captures: Annotated[
         Path | None,
-        typer.Argument(help="Folder with photographs of a dot and their capture.toml.", show_default=False),
+        typer.Argument(
+            help="Folder with photographs: of a dot with their capture.toml, or of the printed target as they come.",
+            show_default=False,
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The table to write (JSON).", rich_help_panel=_OUT)] = Path(
         "table.json"
@@ -46,6 +51,14 @@ def fit(
             rich_help_panel=_CAPTURE,
         ),
     ] = "manifest",
+    target: Annotated[
+        Path | None,
+        typer.Option(help="Write the target to print (PDF), and nothing else.", rich_help_panel=_TARGET),
+    ] = None,
+    paper: Annotated[Paper, typer.Option(help="Its paper.", rich_help_panel=_TARGET)] = "a4",
+    square_mm: Annotated[
+        float, typer.Option(help="Side of the target's square as printed.", rich_help_panel=_TARGET)
+    ] = SQUARE_MM,
     root: Annotated[
         Path | None,
         typer.Option(
@@ -60,6 +73,16 @@ def fit(
     f_number: Annotated[float, typer.Option(help="Aperture of the lens.", rich_help_panel=_LENS)] = 2.0,
     focus_m: Annotated[float, typer.Option(help="Focus distance in metres; inf allowed.", rich_help_panel=_LENS)] = 2.0,
     nodes: Annotated[int, typer.Option(help="Distances traced.", rich_help_panel=_LENS)] = 33,
+    field_deg: Annotated[
+        float, typer.Option(help="Angle from the axis, degrees: 0 is the frame's centre.", rich_help_panel=_LENS)
+    ] = 0.0,
+    wavelengths: Annotated[
+        str | None,
+        typer.Option(
+            help="One table a colour: rgb, or micrometres like 0.65,0.55,0.45; for lenses with Abbe numbers.",
+            rich_help_panel=_LENS,
+        ),
+    ] = None,
     plots: Annotated[
         Path | None, typer.Option(help="Folder for pictures of the fits and the table.", rich_help_panel=_OUT)
     ] = None,
@@ -72,11 +95,23 @@ def fit(
 
         torchdof fit my-lens/ -o my-lens.json --plots pictures/
 
+    Or print a target, photograph it, and let the pictures tell the rest (see docs/phone.md):
+
+        torchdof fit --target target.pdf
+
+        torchdof fit photographs/ -o my-phone.json
+
     Or trace a lens:
 
         torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
     """
     console = Console(soft_wrap=True, quiet=as_json)
+    if target is not None:
+        if captures is not None or lens is not None:
+            raise FitError("--target writes the page to print; give it alone, and the photographs afterwards")
+        write_target(target, paper)
+        console.print(f"{target}: print it at 100 %, photograph it as it says, then: torchdof fit FOLDER -o table.json")
+        return
     if (captures is None) == (lens is None):
         raise FitError("give either a folder of captures or --lens FILE")
     if root is not None and lens is not None:
@@ -86,7 +121,7 @@ def fit(
     if plots is not None:
         plots.mkdir(parents=True, exist_ok=True)
     if lens is not None:
-        table = _trace(lens, f_number, focus_m, nodes, console)
+        table = _trace(lens, f_number, focus_m, nodes, field_deg, wavelengths, console)
         _lens_summary(table, console)
         _write(table, out, console)
         if as_json:
@@ -94,32 +129,99 @@ def fit(
         if plots is not None:
             _draw_table(table, plots, out.stem, console)
         return
+    if captures is not None and captures.is_dir() and not (captures / MANIFEST).is_file():
+        photographs = read_photographs(captures, square_mm=square_mm)
+        _tell(photographs, console)
+        command = f"torchdof fit {captures.name} --family {family} --accuracy-db {accuracy_db:g}"
+        result, messages = _fit_with_progress(photographs.captures, family, accuracy_db, command, None, console)
+        _summary(photographs.captures, result, messages, console)
+        _write(result.table, out, console)
+        _draw_sheet(photographs, result, out.with_suffix(".png"), console)
+        if as_json:
+            facts = _facts(photographs.captures, result, messages)
+            typer.echo(json_line({"out": str(out), **facts, "advice": list(photographs.advice)}))
+        return
     capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots, root=root)
+    first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
     for i, capture_set in enumerate(capture_sets):
-        target = out if len(capture_sets) == 1 else out.with_name(f"{out.stem}_{i:02d}.json")
+        table_file = out if len(capture_sets) == 1 else out.with_name(f"{out.stem}_{i:02d}.json")
         if len(capture_sets) > 1:
             console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
-        result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, console)
+        result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
+        first = first or result
         _summary(capture_set, result, messages, console)
-        _write(result.table, target, console)
+        _write(result.table, table_file, console)
         if as_json:
-            typer.echo(json_line({"out": str(target), **_facts(capture_set, result, messages)}))
+            typer.echo(json_line({"out": str(table_file), **_facts(capture_set, result, messages)}))
         if plots is not None:
-            _draw_fits(capture_set, result, plots, target.stem, console)
-            _draw_table(result.table, plots, target.stem, console)
+            _draw_fits(capture_set, result, plots, table_file.stem, console)
+            _draw_table(result.table, plots, table_file.stem, console)
 
 
-def _trace(lens: str, f_number: float, focus_m: float, nodes: int, console: Console) -> BlurTable:
-    from torchdof.fit.lens.lens import Lens
+def _trace(
+    source: str,
+    f_number: float,
+    focus_m: float,
+    nodes: int,
+    field_deg: float,
+    wavelengths: str | None,
+    console: Console,
+) -> BlurTable:
+    from torchdof.fit.lens.lens import RGB_UM, Lens
     from torchdof.fit.lens.trace import trace_table
 
+    lens = Lens.read(source)
+    try:
+        lines = RGB_UM if wavelengths == "rgb" else tuple(map(float, wavelengths.split(","))) if wavelengths else None
+    except ValueError:
+        raise FitError(f"--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45; got {wavelengths}") from None
+    if not 0 <= field_deg < 90:
+        raise FitError(f"--field-deg must be 0 to 90 degrees from the axis, got {field_deg:g}")
+    focal = lens.paraxial().focal_length
+    image_mm = focal if math.isinf(focus_m) else focal / (1 - focal / 1000 / focus_m)
     with console.status(f"tracing {nodes} distances"):
-        return trace_table(Lens.read(lens), f_number=f_number, focus_m=focus_m, nodes=nodes)
+        return trace_table(
+            lens,
+            f_number=f_number,
+            focus_m=focus_m,
+            nodes=nodes,
+            field_mm=image_mm * math.tan(math.radians(field_deg)),
+            wavelengths_um=lines,
+        )
+
+
+def _tell(photographs: Photographs, console: Console) -> None:
+    """What was found in the photographs, and what to do better, on one screen."""
+    shown = Table(title="the target in the photographs", title_justify="left")
+    for column in ("file", "distance m", "square px", "paper %", "edge px", ""):
+        shown.add_column(column, justify="right")
+    sharp = photographs.captures.notes["sharp"]
+    for picture in photographs.pictures:
+        shown.add_row(
+            picture.file, f"{picture.distance_m:.3f}", f"{picture.target.side_px:.0f}",
+            f"{100 * picture.target.white:.0f}", f"{1 / picture.sharpness:.1f}",
+            "in focus" if picture.file == sharp else "",
+        )  # fmt: skip
+    console.print(shown)
+    for sentence in photographs.advice:
+        console.print(f"better: {sentence}", style="cyan", markup=False, highlight=False)
+
+
+def _draw_sheet(photographs: Photographs, result: TableFit, target: Path, console: Console) -> None:
+    """Draws what was found, fitted and made of it; without matplotlib it says so."""
+    try:
+        from torchdof.fit.sheet import sheet_of_photographs
+
+        sheet_of_photographs(photographs, result).savefig(target)
+    except ModuleNotFoundError as error:
+        console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
+        return
+    console.print(str(target), markup=False, highlight=False)
 
 
 def _fit_with_progress(
-    captures: Captures, family: str, accuracy_db: float, command: str, console: Console
+    captures: Captures, family: str, accuracy_db: float, command: str, scale_of: TableFit | None, console: Console
 ) -> tuple[TableFit, list[str]]:
     """Fits one set of captures behind a progress bar; returns the fit and the warnings, each once."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
@@ -132,6 +234,7 @@ def _fit_with_progress(
             accuracy_db=accuracy_db,
             progress=lambda done, total, what: bar.update(job, completed=done, total=total, description=what),
             command=command,
+            scale_of=scale_of,
         )
     # "auto" fits a picture several times; what it says twice is said once
     return result, list(dict.fromkeys(str(w.message) for w in caught))
@@ -144,13 +247,13 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
         title_justify="left",
     )
     names = [n for n in result.fits[0].params if n != "values"]
-    for column in ("distance m", "coc px", *names, "residual %", "x noise", "magnification"):
+    for column in ("distance m", "coc px", "measured", *names, "residual %", "x noise", "magnification"):
         shown.add_column(column, justify="right")
     for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True):
         values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
         ratio = fitted.residual_over_noise
         shown.add_row(
-            f"{pair.distance_m:g}", f"{coc:+.2f}", *values, f"{100 * fitted.residual:.2f}",
+            f"{pair.distance_m:g}", f"{coc:+.2f}", f"{fitted.radius:.2f}", *values, f"{100 * fitted.residual:.2f}",
             "" if math.isnan(ratio) else f"{ratio:.2f}", f"{fitted.magnification:.4f}",
         )  # fmt: skip
     console.print(shown)

@@ -154,7 +154,8 @@ class RenderShards:
             batch: Columns ``shard`` and ``samples``.
 
         Returns:
-            Columns ``shard``, ``key``, ``image``, ``error`` ("" where there is none) and ``seconds``, a row a sample.
+            Columns ``shard``, ``key``, ``image``, ``error`` ("" where there is none) and ``seconds`` of the processor:
+            a row for each sample.
 
         Raises:
             OSError: If a shard cannot be written.
@@ -192,13 +193,13 @@ class RenderShards:
             return list(json.loads(notes.read_text(encoding="utf-8")))
         records, rows = [], []
         for sample in samples:
-            start = time.perf_counter()
+            start = time.process_time()
             error = ""
             try:
                 records.append(self._sample(sample))
             except (OSError, ValueError, MemoryError) as broken:
                 error = str(broken) or type(broken).__name__
-            seconds = time.perf_counter() - start
+            seconds = time.process_time() - start
             rows.append({"shard": shard, "key": sample["key"], "image": sample["image"], "error": error})
             rows[-1]["seconds"] = round(seconds, 4)
         with whole_file(notes) as part:

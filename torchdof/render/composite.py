@@ -118,7 +118,7 @@ def _composite_layers(
 
     # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
     # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
-    most = CHANNELS // (frame.colours + 3) if blurs[0].kernel.shape[0] == 1 else 1
+    most = CHANNELS // (frame.colours + 3) if blurs[0].kernel.shape[0] == 1 and blurs[0].cats_eye is None else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
         groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and frame.nodes[k] < 0), [[]])
@@ -161,6 +161,10 @@ def _scattered(
     if len(group) > 1 or each > 1:
         padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in group]
         kernels = torch.cat([kernel.repeat(channels // each, 1, 1) for kernel in padded])
+    cats_eye = blurs[group[0]].cats_eye
+    if cats_eye is not None:
+        yield cats_eye.scattered(terms, kernels, half)
+        return
     yield from scatter(terms, kernels, half).split(channels, 1)
 
 

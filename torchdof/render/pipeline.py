@@ -1,6 +1,7 @@
 """The chain: an image's surfaces and its highlights, the layers they lie in, scattered and composited."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
@@ -47,6 +48,9 @@ def blur(
 
     Without a plan each item gets its own.
     """
+    aperture = options.table.aperture
+    if is_traced() and aperture is not None and aperture.depends_on_place:
+        raise ValueError("a compiled or exported graph has one kernel a layer; take a table without vignetting")
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
     maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]
@@ -158,7 +162,10 @@ def _render_item(
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
     coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
-    splatted = len(plan.nodes) > 1 and (options.occlusion or coarse)
+    # a plane's one kernel is exact, but for where blocks of the frame share it
+    aperture = options.table.aperture
+    several = len(plan.nodes) > 1 or (aperture is not None and aperture.depends_on_place)
+    splatted = several and (options.occlusion or coarse)
 
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
@@ -222,7 +229,9 @@ def _composite(
     frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
-        scatter = convolve if layered else fold
+        aperture = options.table.aperture
+        turned = aperture is not None and not aperture.is_round
+        scatter = functools.partial(convolve, turned=turned) if layered else fold
         if options.occlusion:
             out = composite.over(frame, blurs, scatter)
             return out if splats is None else out + splats

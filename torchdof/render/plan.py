@@ -15,6 +15,7 @@ from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
+from .vignetting import CatsEye
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "tolerance_within"]
 
@@ -26,10 +27,14 @@ _kernels = KernelCache(256 * 2**20)
 
 @dataclasses.dataclass(frozen=True)
 class Blur:
-    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels."""
+    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
+
+    Where the lens's barrel shows, ``cats_eye`` tells what becomes of the kernel across the frame.
+    """
 
     kernel: Tensor
     scale: int
+    cats_eye: CatsEye | None = None
 
     @property
     def half(self) -> int:
@@ -161,7 +166,8 @@ class Plan:
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
-        scales = tuple(self._scale(coc) if coarse else 1 for coc in self.coc_px)
+        finest = 1.0 if table.aperture is None else table.aperture.finest
+        scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
         if torch.compiler.is_compiling():  # no names of this process's, such as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
@@ -177,7 +183,14 @@ class Plan:
                 reach_px = _kernels.get((lens, coc, width, scale), reach)
                 window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
-        return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        if table.aperture is None or not table.aperture.depends_on_place:
+            return blurs
+        frame = (int(size[0]), int(size[1]))
+        return [
+            dataclasses.replace(blur, cats_eye=CatsEye(table.aperture, coc / blur.scale, blur.scale, frame))
+            for blur, coc in zip(blurs, self.coc_px, strict=True)
+        ]
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
@@ -202,7 +215,7 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> T
     Each is interpolated between those of whole 1/32 px where no gradient asks for more. They are cut to what reaches
     within a frame whose longer side is ``longest`` pixels.
     """
-    if torch.is_grad_enabled() and coc_px.requires_grad:
+    if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
         kernels = table.kernels(coc_px, width)
     else:
         steps = coc_px.double() * KERNELS_PER_PX
@@ -224,6 +237,8 @@ def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, 
             coc *= shrink(table, coc, width / scale, scale)
         return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0].clone()
 
+    if torch.is_grad_enabled() and table.requires_grad:
+        return made()
     return _kernels.get((lens, coc_px, width, scale, window), made)
 
 

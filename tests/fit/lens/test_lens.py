@@ -83,9 +83,24 @@ def test_abbe_number_is_the_dispersion_between_c_and_f(tmp_path: Path) -> None:
     n_c, n_d, n_f = (lens.indices(at)[1] for at in (C_UM, D_UM, F_UM))
     assert n_d == pytest.approx(1.5168, abs=1e-12)
     assert (n_d - 1) / (n_f - n_c) == pytest.approx(64.17, rel=1e-12)
-    # BK7's catalogue has 1.51432 and 1.52238: two terms of Cauchy are good to 2e-4
-    assert (n_c, n_f) == pytest.approx((1.51432, 1.52238), abs=2e-4)
+    assert (n_c, n_f) == pytest.approx((1.51432, 1.52238), abs=5e-5)  # BK7's catalogue; two terms of Cauchy: 2e-4
     assert lens.dispersive and not Lens.read("wide_22mm").dispersive
+
+
+@pytest.mark.parametrize(
+    ("glass", "lines"),  # catalogue: C, e, F, g
+    [
+        ("1.51680/64.17/0.5349", (1.51432, 1.51872, 1.52238, 1.52668)),  # N-BK7
+        ("1.62004/36.37/0.5828", (1.61503, 1.62408, 1.63208, 1.64202)),  # F2
+        ("1.80518/25.43/0.6092", (1.79609, 1.81265, 1.82775, 1.84707)),  # SF6
+    ],
+)
+def test_three_numbers_of_a_catalogue_give_the_index_at_every_line(
+    glass: str, lines: tuple[float, ...], tmp_path: Path
+) -> None:
+    lens = lens_from(tmp_path, f"50 5 {glass} 20\n-50 0 1 20\n0 0 0 19\n")
+    found = [float(lens.indices(at)[1]) for at in (C_UM, 0.54607, F_UM, 0.43584)]
+    assert found == pytest.approx(lines, abs=1.5e-4)
 
 
 def test_crown_and_flint_bring_red_and_blue_together(tmp_path: Path) -> None:
@@ -97,10 +112,10 @@ def test_crown_and_flint_bring_red_and_blue_together(tmp_path: Path) -> None:
 
 
 def test_lines_are_read_back_as_the_same_lens(tmp_path: Path) -> None:
-    for text in (SINGLET, "inf 3 1.5 20\n-40 2 1 20\n0 0 0 10\n"):
+    for text in (SINGLET, "40 3 1.52/64/0.53 20\n-40 2 1 20\n0 0 0 10\n", "inf 3 1.5 20\n-40 2 1 20\n0 0 0 10\n"):
         lens = lens_from(tmp_path, text)
         again = lens_from(tmp_path, "\n".join(lens.lines()))
-        for name in ("radius", "thickness", "index", "abbe", "diameter"):
+        for name in ("radius", "thickness", "index", "abbe", "partial", "diameter"):
             np.testing.assert_array_equal(getattr(again, name), getattr(lens, name))
         assert again.stop == lens.stop
 
@@ -115,7 +130,7 @@ def test_source_is_kept() -> None:
         ("50 5 1.5 20\n0 1 0\n", r"line 2: expected the columns radius thickness index diameter, got 3"),
         ("50 5 1.5 20\n0 1 0 18\n-50 x 1 20\n", r"line 3, column thickness: expected a number, got 'x'"),
         ("50 5/2 1.5 20\n", r"line 1, column thickness: expected a number, got '5/2'"),
-        ("50 5 1.5/ 20\n", r"line 1, column index: expected a number or index/V, got '1.5/'"),
+        ("50 5 1.5/ 20\n", r"line 1, column index: expected a number, index/V or index/V/P_gF, got '1.5/'"),
         ("50 5 1.5/-3 20\n", r"line 1, column index: the Abbe number must be positive"),
         ("50 5 0.9 20\n", r"line 1, column index: index must be between 1 and 5"),
         ("50 5 0 20\n", r"line 1, column index: index must be between 1 and 5"),

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 
 from torchdof.fit import natural_psnr
-from torchdof.fit.photo.family_choice import choose
-from torchdof.optics.psf import disc, gaussian
+from torchdof.fit.photo.family_choice import choose, highlight_psnr
+from torchdof.optics.psf import disc, gaussian, ring
 
 
 def test_equal_kernels_reach_the_top_whatever_their_padding():
@@ -38,13 +37,19 @@ def test_psnr_is_that_of_an_image_with_the_spectrum():
     assert natural_psnr(first, second) == pytest.approx(direct, abs=0.3)
 
 
-def test_choice_prefers_cheap_then_likely_then_radial():
-    kernels = {"gaussian": gaussian(3.0), "disc": disc(6.0), "radial": disc(6.02)}
+def test_a_highlight_tells_a_ring_from_a_disc_where_a_photograph_hardly_does():
+    round_, rim = disc(8.0, size=33), ring(3.0, 4.0, size=33)
+    assert natural_psnr(round_, rim) > 37 and highlight_psnr(round_, rim) < 17
+    assert highlight_psnr(round_, disc(8.0, size=41)) > 190
+
+
+def test_choice_is_the_cheapest_that_looks_like_the_likeliest():
+    kernels = {"gaussian": gaussian(3.0), "disc": disc(6.0), "radial": disc(6.002)}
     arrays = {k: v.numpy() for k, v in kernels.items()}
-    assert choose(arrays, dict.fromkeys(arrays, 0.0), 45)[0] == "disc"
-    assert choose(arrays, dict.fromkeys(arrays, 0.0), 20)[0] == "gaussian"
+    family, why, psnr = choose(arrays, {"gaussian": 900.0, "disc": 5.0, "radial": 0.0}, 45)
+    assert family == "disc" and "the cheapest with 45 dB" in why and "against radial, the likeliest" in why
+    assert "gaussian" in why and "BIC +900" in why and psnr["radial"] == 200
+    assert choose(arrays, {"gaussian": 900.0, "disc": 5.0, "radial": 0.0}, 20)[0] == "gaussian"
     family, why, _ = choose(arrays, {"gaussian": 5.0, "disc": -5.0, "radial": 0.0}, 199)
-    assert family == "disc" and "noise hides" in why
-    family, why, psnr = choose(arrays, {"gaussian": 5.0, "disc": 5.0, "radial": 0.0}, 199)
-    assert family == "radial" and "no cheaper family" in why
-    assert psnr["radial"] == 200 and torch.is_tensor(kernels["disc"])
+    assert family == "disc" and "the lowest BIC (radial second by 5)" in why
+    assert choose(arrays, {"gaussian": 5.0, "disc": 5.0, "radial": 0.0}, 199)[0] == "radial"

@@ -6,11 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import center_of_mass, gaussian_filter, shift
+from scipy.signal import fftconvolve
 from scipy.stats import norm
 
 from torchdof.fit import fit_pair, natural_psnr
 from torchdof.fit import problems as p
+from torchdof.fit.photo.diagnostics import asymmetry_of
+from torchdof.fit.photo.kernel_image import fit_kernel_image
+from torchdof.fit.photo.pair import prepared_pair
 from torchdof.optics.psf import pixel_kernels
 
 STARS = Path(__file__).parents[2] / "data" / "defocused_stars"
@@ -158,9 +162,17 @@ def test_auto_takes_the_cheapest_family_that_is_enough(simulator, family, true):
     assert "60 dB" in fit.why and fit.psnr[family] >= 60
 
 
-def test_auto_is_content_with_less_where_less_is_asked(simulator):
+def test_auto_does_not_take_a_disc_for_a_ring(simulator):
+    # a photograph through the disc is within 45 dB, and every highlight is another one
+    fit = fit_pair(*simulator.Simulator().pair("ring", {"sigma": 3.0, "r_c": 4.0}))
+    assert fit.psnr["disc"] > 44.5 and fit.family == "ring" and "softm second by" in fit.why
+
+
+def test_auto_is_content_with_less_where_less_is_asked_and_says_what_it_leaves(simulator):
     pair = simulator.Simulator(snr_db=60).pair("softm", {"radius": 8.0, "sigma": 1.0, "b": 1.0, "m": 4.0})
-    assert fit_pair(*pair, accuracy_db=35).family == "gaussian"
+    with pytest.warns(p.ResidualWarning, match="would not be seen at accuracy_db"):
+        fit = fit_pair(*pair, accuracy_db=30)
+    assert fit.family == "gaussian" and "the cheapest with 30 dB" in fit.why and "softm, the likeliest" in fit.why
 
 
 def test_radial_follows_what_no_other_family_has(simulator):
@@ -247,11 +259,73 @@ def test_unclipped_captures_do_not_warn(simulator):
         fit_pair(*camera.pair("gaussian", {"sigma": 3.0}), "gaussian")
 
 
-def test_a_soft_sharp_picture_warns(simulator):
-    pair = simulator.Simulator(edge_sigma=2.5).pair("gaussian", {"sigma": 3.0})
-    with pytest.warns(p.NotInFocusWarning, match="a width of 2.. px") as caught:
-        fit_pair(*pair, "gaussian", files=("near.png", None))
-    assert caught[0].message.file == "near.png" and caught[0].message.number == pytest.approx(2.5, abs=0.2)
+def test_a_sharp_picture_out_of_focus_is_said_and_deconvolved(simulator):
+    pair = simulator.Simulator(misfocus=1.4).pair("gaussian", {"sigma": 4.0})
+    with pytest.warns(
+        p.NotInFocusWarning, match=r"a width of 1\.4 px, as out of focus; the dot was fitted as"
+    ) as caught:
+        fit = fit_pair(*pair, "gaussian", files=("near.png", None))
+    assert caught[0].message.file == "near.png" and caught[0].message.number == pytest.approx(1.4, abs=0.1)
+    assert off(fit, "sigma", 4.0) < 0.02  # 6 % with the soft dot as the source
+
+
+def test_softness_that_hardly_matters_is_not_said(simulator):
+    fit_pair(*simulator.Simulator(edge_sigma=0.7).pair("gaussian", {"sigma": 3.0}), "gaussian")
+    fit_pair(*simulator.Simulator(edge_sigma=0.9).pair("gaussian", {"sigma": 6.0}), "gaussian")
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_tone_curve_is_named_and_not_taken_for_a_lack_of_focus(simulator, seed):
+    pair = simulator.Simulator(tone=0.5, level=0.8).pair("gaussian", {"sigma": 3.0}, seed)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fit_pair(*pair, "gaussian")
+    said = [w.message for w in caught if isinstance(w.message, p.NotLinearWarning)]
+    assert len(said) == 1 and "a tone curve" in str(said[0])
+    assert not any(isinstance(w.message, p.NotInFocusWarning) for w in caught)
+
+
+def eye(clipped, radius=8.0, fine=8, size=31):
+    """A disc of which a second disc lets only a part through, as at a frame's corner."""
+    axis = (np.arange(size * fine) + 0.5) / fine - size / 2
+    x, y = np.meshgrid(axis, axis)
+    inside = (np.hypot(x, y) < radius) & (np.hypot(x - clipped * radius, y) < radius)
+    kernel = inside.reshape(size, fine, size, fine).mean((1, 3))
+    return kernel / kernel.sum()
+
+
+def blurred_by(kernel, simulator, seed, dot_radius=10.0, size=71):
+    rng = np.random.default_rng(seed)
+    dot = simulator.draw_dot(size, dot_radius)
+    return tuple(light + rng.normal(0, 0.01, light.shape) for light in (dot, fftconvolve(dot, kernel, mode="same")))
+
+
+def test_a_cat_s_eye_is_said_to_be_none_of_the_families(simulator):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fit = fit_pair(*blurred_by(eye(0.6), simulator, 0))
+    kinds = {type(w.message) for w in caught}
+    assert p.AsymmetryWarning in kinds and fit.asymmetry > 0.03
+
+
+def test_round_blur_is_never_said_to_be_uneven(simulator):
+    # the chance of the statistic is spread evenly between 0 and 1 where there is only noise
+    chances = []
+    for seed in range(24):
+        still, data = blurred_by(eye(0.0), simulator, seed, dot_radius=6.0, size=45)
+        pair, _ = prepared_pair(still, data, "auto", 1.0, None, (None, None))
+        pair.fit_moves = ("dx", "dy")
+        chances.append(asymmetry_of(pair, pair.solve("disc"))[1])
+    assert min(chances) > 1e-3 and 0.25 < np.mean(chances) < 0.75
+
+
+def test_a_kernel_image_has_the_shape_that_no_family_has(simulator):
+    image = fit_kernel_image(*blurred_by(eye(0.6), simulator, 0, size=61))
+    y, x = center_of_mass(eye(0.6))
+    true = np.maximum(shift(eye(0.6), (15 - y, 15 - x), order=1), 0.0)
+    assert image.kernel.min() >= 0 and image.kernel.sum() == pytest.approx(1)
+    assert natural_psnr(image.kernel, true / true.sum()) > 52  # the best round one: 42
+    assert image.residual < 1.1 * image.noise
 
 
 def test_no_dot_is_refused():

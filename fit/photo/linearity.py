@@ -1,0 +1,107 @@
+"""Whether a sharp picture of a dot is in linear light, and in focus: its noise and its edge tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..problems import NotInFocusWarning, NotLinearWarning, warn
+from ..result import Array
+from .dot import Dot, noise_inside
+from .dot_model import Edge, draw_edge, soft_edge
+
+__all__ = ["EXPLAINED", "SENSOR_BLUR_PX", "check_focus", "check_linearity", "focused"]
+
+EXPLAINED = 1.15
+"""Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
+
+SENSOR_BLUR_PX = 0.7
+"""Sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus, in both pictures."""
+
+_ENCODED = 0.7
+_UNFOCUSED_PX = 1.0  # no camera leaves an edge softer than this in focus
+_FOCUSED_PX = 0.5  # what it leaves on average: between a perfect lens and a demosaiced picture
+_MATTERS = 0.02  # share of the kernel's size
+_STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
+
+
+def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
+    """Warn where a sharp picture shows that it is not in linear light: by its noise, or by its dot's edge."""
+    inside = noise_inside(still, dot)
+    # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
+    if inside and dot.noise > (1 + 4 / np.sqrt(inside[1])) * inside[0] and dot.noise > 1e-4 * dot.peak:
+        ratio = dot.noise / max(inside[0], 1e-9 * dot.peak)
+        text = (
+            f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
+            "encoded; is the image linear? Decode it first"
+        )
+        warn(NotLinearWarning(text, file=file, number=ratio), stacklevel)
+        return
+    steepness, error = _steepness(still, dot, edge)
+    if steepness > max(_STEEP, _CERTAIN * error):
+        text = (
+            f"the dot's edge is steeper than pixels can be, by {100 * steepness:.0f} % of its level: a tone curve (an "
+            "S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without them"
+        )
+        warn(NotLinearWarning(text, file=file, number=steepness), stacklevel)
+        return
+    if edge.misfit < EXPLAINED:
+        return
+    bent = soft_edge(still, dot, fit_exponent=True)
+    if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
+        text = (
+            f"the dot's edge is that of light to the power {bent.exponent:.2f}, as in a picture that is left sRGB "
+            "encoded (about 0.45); is the image linear? Decode it first"
+        )
+        warn(NotLinearWarning(text, file=file, number=bent.exponent), stacklevel)
+
+
+def focused(edge: Edge) -> Edge:
+    """The edge as it would be in focus: softer than any camera in focus leaves it, it is deconvolved to the usual."""
+    return replace(edge, softness=_FOCUSED_PX) if edge.softness > _UNFOCUSED_PX else edge
+
+
+def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None, stacklevel: int = 4) -> None:
+    """Warn where the sharp picture is softer than a camera in focus leaves it, and the kernel's size feels it.
+
+    Args:
+        edge: of the sharp dot.
+        radius_px: of the uniform disc with the fitted kernel's second moment.
+        deconvolved: whether the kernel was fitted to the dot as it would be in focus, see :func:`focused`.
+        file: named in the warning.
+        stacklevel: where the warning points.
+    """
+    if edge.softness <= SENSOR_BLUR_PX or edge.radius <= 2 * edge.softness:
+        return
+    # along an axis a disc of radius R has a variance of R^2 / 4
+    excess = edge.softness**2 - SENSOR_BLUR_PX**2
+    share = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
+    if share < _MATTERS:
+        return
+    text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px"
+    if edge.softness > _UNFOCUSED_PX and deconvolved:
+        text += (
+            ", as out of focus; the dot was fitted as it would be in focus. If its printed edge is that soft, the "
+            f"kernel is too large by {100 * share:.0f} %. Better focus again"
+        )
+    elif edge.softness > _UNFOCUSED_PX:
+        text += f", as out of focus; the kernel is too small by {100 * share:.0f} %: focus again"
+    else:
+        text += f"; if the printed dot's edge is sharp, the kernel is too small by {100 * share:.0f} %"
+    warn(NotInFocusWarning(text, file=file, number=edge.softness), stacklevel)
+
+
+def _steepness(still: Array, dot: Dot, edge: Edge) -> tuple[float, float]:
+    """How much brighter the upper half of an edge is than its pixels' coverage, and the lower darker, and its error.
+
+    An S-curve spreads the levels of half-covered pixels apart. No blur does: it brings them together.
+    """
+    rows, columns = np.indices(still.shape).astype(np.float64)
+    coverage = draw_edge(rows, columns, edge.x, edge.y, edge.radius, edge.softness)
+    residual = (still - dot.background) / edge.level - coverage
+    low, high = (coverage > 0.02) & (coverage < 0.4), (coverage > 0.6) & (coverage < 0.98)
+    if min(low.sum(), high.sum()) < 8:
+        return 0.0, np.inf
+    error = np.sqrt(sum(float(residual[side].var(ddof=1)) / side.sum() for side in (low, high)))
+    return float(residual[high].mean() - residual[low].mean()), float(error)

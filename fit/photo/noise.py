@@ -1,0 +1,79 @@
+"""How the noise of neighbouring pixels goes together: demosaicing, denoising and JPEG make it smooth.
+
+Noise that is alike in neighbours averages out more slowly than its pixels' number says, and second differences, which
+see only what changes from pixel to pixel, take it for less than it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..result import Array, Mask
+
+__all__ = ["LAGS", "correlate", "correlation_of", "fine_share", "independent_share"]
+
+LAGS = 6
+"""Pixels up to which noise may go together; demosaicing reaches 2, a JPEG's blocks 7."""
+
+_FEWEST = 300  # pixels below which a correlation is not worth estimating
+_CLEAR = 4.0  # standard errors above which a correlation is taken for one
+
+
+def correlation_of(values: Array, used: Mask) -> Array:
+    """Correlation of a picture's pixels with their neighbours.
+
+    Args:
+        values: `[H, W]`, noise around 0; pixels that are not used may hold anything finite.
+        used: `[H, W]`, which pixels to look at.
+
+    Returns:
+        `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the middle; 0 at lags where chance would explain what there is. Its spectrum is
+        nowhere negative.
+    """
+    size = 2 * LAGS + 1
+    white = np.zeros((size, size))
+    white[LAGS, LAGS] = 1.0
+    count = int(used.sum())
+    power = float(np.mean(values[used] ** 2)) if count else 0.0
+    if count < _FEWEST or power <= 0:
+        return white
+    # outliers (dust, an edge that is not quite fitted) count as five deviations
+    limit = 5 * np.sqrt(power)
+    kept = np.where(used, np.clip(values, -limit, limit), 0.0)
+    shape = tuple(n + LAGS for n in values.shape)
+    spectrum, seen = np.fft.rfft2(kept, shape), np.fft.rfft2(used.astype(np.float64), shape)
+    sums, pairs = (np.fft.irfft2(np.abs(s) ** 2, shape) for s in (spectrum, seen))
+    around = np.ix_(np.arange(-LAGS, LAGS + 1), np.arange(-LAGS, LAGS + 1))
+    sums, pairs = sums[around], np.maximum(np.round(pairs[around]), 1.0)
+    found = sums / pairs
+    found = found / max(float(found[LAGS, LAGS]), np.finfo(float).tiny)
+    # neighbours' correlation makes the estimates of the others less certain
+    certain = _CLEAR * np.sqrt(np.sum(np.where(np.abs(found) > _CLEAR / np.sqrt(pairs), found, 0.0) ** 2) / pairs)
+    found = np.where(np.abs(found) > certain, found, 0.0)
+    wide = np.zeros((4 * size, 4 * size))
+    wide[:size, :size] = found
+    spectrum_of_found = np.fft.rfft2(np.roll(wide, (-LAGS, -LAGS), (0, 1))).real
+    found = np.roll(np.fft.irfft2(np.maximum(spectrum_of_found, 0.0), wide.shape), (LAGS, LAGS), (0, 1))[:size, :size]
+    found = found / found[LAGS, LAGS]
+    return np.asarray(np.where(np.abs(found) > 1e-9, found, 0.0))  # without the transform's rounding
+
+
+def correlate(pictures: Array, correlation: Array) -> Array:
+    """Pictures `[n, H, W]` convolved with a correlation: its product with each, as a matrix over the pixels."""
+    from scipy.ndimage import convolve
+
+    if np.count_nonzero(correlation) == 1:
+        return pictures
+    return np.stack([convolve(p, correlation, mode="constant") for p in pictures])
+
+
+def fine_share(correlation: Array) -> float:
+    """Share of the noise's variance that mixed second differences see: 1 where neighbours are independent."""
+    second = np.convolve([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
+    middle = slice(LAGS - 2, LAGS + 3)
+    return float(max(np.sum(np.outer(second, second) * correlation[middle, middle]) / 36.0, 1e-4))
+
+
+def independent_share(correlation: Array) -> float:
+    """How many independent pixels a pixel is worth, at most 1."""
+    return float(min(1.0, 1.0 / max(correlation.sum(), 1e-3)))

@@ -1,0 +1,253 @@
+"""Photographs of the printed target as they come from a camera or phone; they tell distances, focus and tone curve.
+
+The square's size gives each distance, the sharpest picture is the one in focus, EXIF knows the lens. The light of the
+dot, in units of the white paper beside it, must be its printed area however it is blurred: what a tone curve changes
+about that gives the curve away, and it is undone.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchdof.io.images import read_image
+from torchdof.io.metadata import camera_facts
+from torchdof.io.transfer import decode, encode
+
+from ..problems import DotNotFoundError, FitError, ManifestError
+from ..result import Array
+from .crop import Capture
+from .manifest import Captures
+from .target import DOT_MM, SQUARE_MM, Target, find_target
+
+__all__ = ["Photograph", "Photographs", "read_photographs"]
+
+_READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
+_FOREIGN = {
+    ".heic": "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)",
+    ".dng": "develop it to linear 16-bit TIFF (dcraw -4 -T, or a converter's linear profile) and copy its EXIF",
+}
+_FOREIGN |= {".heif": _FOREIGN[".heic"], ".avif": _FOREIGN[".heic"]}
+_FOREIGN |= dict.fromkeys((".cr2", ".cr3", ".nef", ".arw", ".raf"), _FOREIGN[".dng"])
+_WINDOW = 0.36  # half the dot's window, of the square's side
+_SAME_PLACE = 0.03  # as a share of the distance
+_PRINTED = 0.01  # how exactly the dot's light can be known
+_BENT = (0.15, 0.3)  # expected size of a and b
+_CERTAIN = 9.0  # drop of chi squared that calls for a tone curve
+_CURVED = 0.05  # least bend of a tone curve that is worth saying
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One photograph with the target in it.
+
+    Attributes:
+        file: its name.
+        light: `[H, W]`, mean of the colours in linear light, the tone curve undone.
+        target: where the target is.
+        distance_m: of the target from the lens, by its size.
+        sharpness: steepest slope of the dot's edge over its height, 1/px.
+        clipped: whether the paper is at the top of the scale.
+    """
+
+    file: str
+    light: Array
+    target: Target
+    distance_m: float
+    sharpness: float
+    clipped: bool
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """A folder of photographs, ready to be fitted.
+
+    Attributes:
+        captures: for `fit_captures`.
+        pictures: every photograph with a target, by distance.
+        tone: (a, b) of the tone curve that was undone, see :func:`untoned`.
+        advice: what to do better, a sentence each.
+    """
+
+    captures: Captures
+    pictures: tuple[Photograph, ...]
+    tone: tuple[float, float]
+    advice: tuple[str, ...]
+
+
+def read_photographs(folder: str | os.PathLike[str], *, square_mm: float = SQUARE_MM) -> Photographs:
+    """Read a folder of photographs of the target, without any description.
+
+    Args:
+        folder: with the photographs; other files are left alone.
+        square_mm: side of the black square as printed, mm.
+
+    Raises:
+        FitError: fewer than two photographs show the target, or no EXIF tells the lens.
+        OSError: a picture is damaged.
+    """
+    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *_FOREIGN))
+    for path in files:
+        if path.suffix.lower() in _FOREIGN:
+            raise FitError(f"{path.suffix} is not read here: {_FOREIGN[path.suffix.lower()]}", file=str(path))
+    if len(files) < 2:
+        raise ManifestError(
+            "there is neither a capture.toml nor two photographs (.jpg .png .tif .exr) of the target that "
+            "torchdof fit --target target.pdf makes",
+            file=str(folder),
+        )
+    pictures, advice, facts, width, integers = [], [], dict[str, float](), 0, True
+    for path in files:
+        picture = read_image(path)
+        light = picture.pixels[0, : 3 if len(picture.channels) >= 3 else 1].mean(0).double().numpy()
+        try:
+            target = find_target(light, file=str(path))
+        except DotNotFoundError as error:
+            advice.append(f"{path.name}: left out, {str(error).split(': ', 1)[1]}")
+            continue
+        if width and light.shape[1] != width:
+            raise FitError(f"is {light.shape[1]} px wide, the others {width}: all from one camera", file=str(path))
+        if not facts:
+            facts, width = camera_facts(picture.metadata, light.shape[1]), light.shape[1]
+        integers = integers and picture.sample in ("8", "16")
+        clipped = picture.sample in ("8", "16") and target.white > 0.98
+        pictures.append(Photograph(path.name, light, target, 0.0, _sharpness(light, target), clipped))
+    if len(pictures) < 2:
+        raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=str(folder))
+    missing = [n for n in ("focal_length_mm", "f_number", "sensor_width_mm") if n not in facts]
+    if missing:
+        raise ManifestError(
+            f"EXIF does not tell {', '.join(missing)}: share the originals, or describe them in a capture.toml",
+            file=str(folder),
+        )
+    tone = _tone_curve(pictures, square_mm) if integers and len(pictures) >= 4 else (0.0, 0.0)
+    if max(map(abs, tone)) > _CURVED:
+        pictures = [replace(p, light=untoned(p.light, tone)) for p in pictures]
+        pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
+        advice.append(
+            f"a tone curve was found by the light of the dot and undone (a = {tone[0]:+.2f}, b = {tone[1]:+.2f}): raw "
+            "pictures need no such guess"
+        )
+    else:
+        tone = (0.0, 0.0)
+    sharp = max(pictures, key=lambda p: p.sharpness)
+    focal_px = facts["focal_length_mm"] * width / facts["sensor_width_mm"]
+    image_px, focus_m = focal_px, 1.0
+    for _ in range(20):  # the image distance grows with the focus, which it tells
+        focus_m = image_px * square_mm / 1000 / sharp.target.side_px
+        image_px = focal_px / (1 - facts["focal_length_mm"] / 1000 / focus_m)
+    pictures = sorted(
+        (replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures),
+        key=lambda p: p.distance_m,
+    )
+    advice += _advice(pictures, sharp.file, focus_m)
+    moved = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _SAME_PLACE]
+    if not moved:
+        raise FitError("all photographs were taken at one distance: step back, without refocusing", file=str(folder))
+    captures = Captures(
+        pairs=tuple(_pair(sharp, p, str(Path(folder))) for p in moved),
+        focus_m=focus_m,
+        width_px=width,
+        focal_length_mm=facts["focal_length_mm"],
+        f_number=facts["f_number"],
+        sensor_width_mm=facts["sensor_width_mm"],
+        name=Path(folder).resolve().name,
+        notes={
+            "target_square_mm": square_mm,
+            "pictures": [p.file for p in pictures],
+            "sharp": sharp.file,
+            "tone_curve": list(tone),
+            "from_exif": ["focal_length_mm", "f_number", "sensor_width_mm"],
+        },
+    )
+    return Photographs(captures, tuple(pictures), tone, tuple(advice))
+
+
+def untoned(light: Array, tone: tuple[float, float]) -> Array:
+    """Light with a tone curve undone: on the encoded level e, `e + a e (1 - e) + b e (1 - e) (1 - 2 e)`.
+
+    An S-curve `e - t e (1 - e) (1 - 2 e)`, which is `(1 - t) e + t e^2 (3 - 2 e)`, is undone by b near t.
+    """
+    e = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None], "srgb", False, False)
+    e = e + e * (1 - e) * (tone[0] + tone[1] * (1 - 2 * e))
+    return np.asarray(decode(e.clamp(0.0, 1.0), "srgb", False, False)[0, 0].numpy())
+
+
+def _pair(sharp: Photograph, blurred: Photograph, folder: str) -> Capture:
+    half = int(_WINDOW * min(sharp.target.side_px, blurred.target.side_px))
+    cut = [
+        p.light[round(t.y) - half : round(t.y) + half + 1, round(t.x) - half : round(t.x) + half + 1]
+        for p, t in ((sharp, sharp.target), (blurred, blurred.target))
+    ]
+    files = (os.path.join(folder, sharp.file), os.path.join(folder, blurred.file))
+    return Capture(cut[0], cut[1], blurred.distance_m, files=files, white=1.0 if sharp.clipped else None)
+
+
+def _sharpness(light: Array, target: Target) -> float:
+    from scipy.ndimage import gaussian_gradient_magnitude
+
+    half, y, x = int(0.06 * target.side_px) + 4, round(target.y), round(target.x)
+    around = light[y - half : y + half + 1, x - half : x + half + 1]
+    return float(gaussian_gradient_magnitude(around, 0.7).max() / (target.white - target.black))
+
+
+def _tone_curve(pictures: Sequence[Photograph], square_mm: float) -> tuple[float, float]:
+    """The tone curve under which every dot sends the light of its printed area; none where noise would explain it."""
+    from scipy.optimize import least_squares
+
+    dots = []
+    for p in pictures:
+        half = int(_WINDOW * p.target.side_px)
+        y, x = round(p.target.y), round(p.target.x)
+        window = p.light[y - half : y + half + 1, x - half : x + half + 1]
+        distance = np.hypot(*(np.indices(window.shape) - half))
+        inside, around = distance < 0.12 * p.target.side_px, (distance > 0.2 * p.target.side_px) & (distance < half)
+        area = math.pi * (DOT_MM / 2 * p.target.side_px / square_mm) ** 2
+        # a demosaiced pixel's noise goes together in about nine neighbours
+        noise = 3 * float(window[around].std()) * math.sqrt(inside.sum()) / (p.target.white * area)
+        dots.append((window, inside, around, p.target.white, area, math.hypot(noise, _PRINTED)))
+
+    def misfit(values: Array) -> Array:
+        tone, found = (float(values[0]), float(values[1])), []
+        for window, inside, around, white, area, error in dots:
+            level = untoned(window, tone)
+            black, paper = float(level[around].mean()), float(untoned(np.array([[white]]), tone)[0, 0])
+            light = float((level - black)[inside].sum()) / (paper - black) / area
+            found.append((math.log(max(light, 1e-3)) - values[2]) / error)
+        return np.array([*found, values[0] / _BENT[0], values[1] / _BENT[1]])
+
+    bounds = ([-0.8, -0.8, -1.0], [0.8, 0.8, 1.0])
+    solution = least_squares(misfit, [0.0, 0.0, 0.0], bounds=bounds, x_scale=0.1)
+    straight = least_squares(lambda v: misfit(np.array([0.0, 0.0, v[0]])), [0.0])
+    if 2 * (straight.cost - solution.cost) < _CERTAIN:
+        return 0.0, 0.0
+    return float(solution.x[0]), float(solution.x[1])
+
+
+def _advice(pictures: Sequence[Photograph], sharp: str, focus_m: float) -> list[str]:
+    """What to do better, a sentence each."""
+    advice = []
+    dot_px = next(p.target.side_px for p in pictures if p.file == sharp) * DOT_MM / SQUARE_MM / 2
+    if dot_px < 6:
+        advice.append(f"the sharp dot has a radius of {dot_px:.1f} px, 8 to 20 are best: go nearer")
+    away = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _SAME_PLACE]
+    if len(away) < 4:
+        advice.append(f"{len(away)} distances out of focus: five to nine make a better table")
+    if all(p.distance_m > focus_m for p in away):
+        advice.append("no picture is nearer than the focus: there the table will be the mirror image of the far side")
+    for p in pictures:
+        if p.clipped:
+            advice.append(f"{p.file}: the paper is clipped; expose a stop less")
+        if p.target.white < 0.15:
+            advice.append(f"{p.file}: the paper is at {100 * p.target.white:.0f} % of white; expose more")
+        if p.target.elongation > 1.03:
+            advice.append(
+                f"{p.file}: the square is {p.target.elongation:.2f} times as long as wide; look at it square on"
+            )
+    return advice

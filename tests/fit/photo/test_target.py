@@ -1,0 +1,107 @@
+"""The printed target: the page, finding it on a desk, and what photographs of it tell without any description."""
+
+import re
+
+import numpy as np
+import pytest
+
+from torchdof.fit import problems as p
+from torchdof.fit.photo.photographs import Photograph, _tone_curve, read_photographs, untoned
+from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, write_target
+from torchdof.io.images import read_image
+
+
+@pytest.mark.parametrize(("paper", "width", "height"), [("a4", 595.28, 841.89), ("letter", 612.0, 792.0)])
+def test_the_page_is_a_pdf_whose_objects_are_where_it_says(tmp_path, paper, width, height):
+    write_target(tmp_path / "target.pdf", paper)
+    data = (tmp_path / "target.pdf").read_bytes()
+    box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", data)
+    assert (float(box[1]), float(box[2])) == pytest.approx((width, height), abs=0.01)
+    start = int(re.search(rb"startxref\n(\d+)", data)[1])
+    assert data[start:].startswith(b"xref\n0 6")
+    for number, place in enumerate(re.findall(rb"(\d{10}) 00000 n", data), start=1):
+        assert data[int(place) :].startswith(b"%d 0 obj" % number)
+    assert b"torchdof fit FOLDER" in data and data.count(b" c ") >= 2
+    # every line of text lies on the page and below the square
+    lines = [float(y) for y in re.findall(rb"Td? ?[\d.]+ ([\d.-]+) Td", data)]
+    assert all(5 < y < height * 25.4 / 72 - 160 for y in lines)
+
+
+def test_another_file_or_paper_is_refused(tmp_path):
+    with pytest.raises(p.FitError, match=r"name it .*target\.pdf"):
+        write_target(tmp_path / "target.png")
+    with pytest.raises(p.FitError, match="paper must be one of a4, letter"):
+        write_target(tmp_path / "target.pdf", "a3")
+
+
+@pytest.fixture(scope="module")
+def folder(simulator, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("phone")
+    radius = simulator.write_photographs(folder, 0.2, [0.3, 0.5], width=640, tone=0.0, noise=0.004)
+    return folder, radius
+
+
+def test_the_target_is_found_on_a_desk_and_measured(folder):
+    light = read_image(folder[0] / "img_0001.jpg").pixels[0].mean(0).double().numpy()
+    target = find_target(light)
+    image_px = 26 / 36 * 640 / (1 - 0.0054 / 0.2)
+    assert target.side_px == pytest.approx(SQUARE_MM * image_px / 300, rel=2e-3)
+    assert (target.x, target.y) == pytest.approx((319.5 + 12.8, 239.5 - 9.6), abs=0.3)
+    assert target.white == pytest.approx(0.8, rel=0.03) and target.elongation < 1.01
+    with pytest.raises(p.DotNotFoundError, match="no target found"):
+        find_target(np.random.default_rng(0).random((200, 300)))
+    with pytest.raises(p.DotNotFoundError):  # a black square without a dot is something else
+        hidden = light.copy()
+        rows, columns = np.indices(light.shape)
+        hidden[np.hypot(rows - target.y, columns - target.x) < 0.2 * target.side_px] = 0.035
+        find_target(hidden)
+
+
+def test_photographs_tell_their_distances_and_the_focus(folder):
+    found = read_photographs(folder[0])
+    assert [q.distance_m for q in found.pictures] == pytest.approx([0.2, 0.3, 0.5], rel=3e-3)
+    captures = found.captures
+    assert captures.focus_m == pytest.approx(0.2, rel=3e-3) and captures.notes["sharp"] == "img_0000.jpg"
+    assert [c.distance_m for c in captures] == pytest.approx([0.3, 0.5], rel=3e-3)
+    assert captures.width_px == 640
+    assert (captures.focal_length_mm, captures.f_number) == pytest.approx((5.4, 1.8))
+    assert captures.sensor_width_mm == pytest.approx(36 * 5.4 / 26)
+    assert any("five to nine" in sentence for sentence in found.advice)
+
+
+def test_a_target_printed_at_another_size_scales_the_distances(folder):
+    assert read_photographs(folder[0], square_mm=95.0).captures.focus_m == pytest.approx(0.19, rel=3e-3)
+
+
+def test_what_cannot_be_read_says_what_to_do(simulator, tmp_path):
+    with pytest.raises(p.ManifestError, match="neither a capture.toml nor two photographs"):
+        read_photographs(tmp_path)
+    simulator.write_photographs(tmp_path, 0.2, [0.3], width=480, tone=0.0, exif=False)
+    with pytest.raises(p.ManifestError, match="EXIF does not tell focal_length_mm, f_number, sensor_width_mm"):
+        read_photographs(tmp_path)
+    (tmp_path / "img_9.heic").write_bytes(b"")
+    with pytest.raises(p.FitError, match="heic is not read here: convert it to JPEG"):
+        read_photographs(tmp_path)
+
+
+def _photographs(simulator, tone, seed=0):
+    """Dots as they would be in large photographs, blurred more and more, with an S-curve that nobody undid."""
+    rng, found = np.random.default_rng(seed), []
+    for i, radius in enumerate((0.0, 8.0, 16.0, 24.0, 32.0)):
+        side, size = 320.0, 321
+        dot = simulator.draw_dot(size, DOT_MM / 2 * side / SQUARE_MM, oversample=4)
+        dot = simulator.blur(dot, "disc", {"radius": radius}) if radius else dot
+        light = simulator.Simulator(tone=tone, snr_db=50).record(0.03 + 0.75 * dot, rng)
+        white = float(simulator.Simulator(tone=tone, snr_db=None).record(np.array([[0.78]]), rng)[0, 0])
+        found.append(Photograph(f"{i}.jpg", light, Target(160.0, 160.0, side, 1.0, white, 0.03), 1.0, 0.5, False))
+    return found
+
+
+def test_a_tone_curve_is_found_by_the_light_of_the_dot_and_undone(simulator):
+    assert _tone_curve(_photographs(simulator, 0.0), SQUARE_MM) == (0.0, 0.0)
+    tone = _tone_curve(_photographs(simulator, 0.5), SQUARE_MM)
+    levels = np.linspace(0.05, 0.75, 20)[None]
+    curved = simulator.Simulator(tone=0.5, snr_db=None).record(levels, np.random.default_rng(0))
+    # up to a common factor, which no kernel feels
+    before, after = (v / v[0, -1] - levels / levels[0, -1] for v in (curved, untoned(curved, tone)))
+    assert np.abs(after).max() < 0.4 * np.abs(before).max()
