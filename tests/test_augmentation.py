@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+import torchdof.augmentation
 import torchdof.io.transfer
 from torchdof import BlurTable, Camera, depth_of_field
 from torchdof.augmentation import DepthAugmentationSequential, RandomDepthOfField
@@ -42,6 +43,21 @@ def test_it_is_the_rendering_of_what_was_drawn() -> None:
     )
     assert torch.equal(out[chosen], expected)
     assert torch.equal(out[~chosen], image[~chosen])
+
+
+def test_images_that_are_left_out_are_not_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered = []
+
+    def noted(image: Tensor, *arguments: Any, **options: Any) -> Tensor:
+        rendered.append(len(image))
+        return depth_of_field(image, *arguments, **options)
+
+    monkeypatch.setattr(torchdof.augmentation, "depth_of_field", noted)
+    image, depth = sample()
+    drawn = {**random_dof().forward_parameters(tuple(image.shape)), "batch_prob": torch.tensor([0.0, 1.0, 0.0, 0.0])}
+    random_dof(p=0.5)(image, depth, params=drawn)
+    random_dof(p=0.0)(image, depth)
+    assert rendered == [1]
 
 
 def test_encoded_images_are_blurred_in_linear_light() -> None:
@@ -142,11 +158,11 @@ def test_image_depth_and_masks_stay_aligned() -> None:
     assert out.shape == (4, 3, 12, 16) and moved.shape == moved_labels.shape == (4, 1, 12, 16)
     assert torch.equal(moved_labels, (moved > 2).float())
     assert set(moved.unique().tolist()) <= {0.0, *depth.unique().tolist()}  # no depth is made up
-    geometric = K.AugmentationSequential(*list(pipeline.children())[:3], data_keys=["input", "mask"])
-    sharp, same = geometric(image, depth, params=pipeline._params[:3])
+    drawn, steps = pipeline._params or [], list[Any](pipeline.children())
+    sharp, same = K.AugmentationSequential(*steps[:3], data_keys=["input", "mask"])(image, depth, params=drawn[:3])
     assert torch.equal(same, moved)
-    assert torch.equal(out, dof(sharp, moved, params=pipeline._params[3].data))
-    again = pipeline(image, depth, labels, params=pipeline._params)
+    assert torch.equal(out, dof(sharp, moved, params=drawn[3].data))
+    again = pipeline(image, depth, labels, params=drawn)
     assert all(torch.equal(a, b) for a, b in zip(again, (out, moved, moved_labels), strict=True))
 
 
@@ -155,7 +171,8 @@ def test_a_dict_goes_through_the_sequence() -> None:
     pipeline = DepthAugmentationSequential(K.RandomHorizontalFlip(p=1.0), random_dof(), data_keys=None)
     out = pipeline({"image": image, "mask_depth": depth, "mask_labels": depth.clone(), "name": "a"})
     assert torch.equal(out["mask_depth"], depth.flip(-1)) and torch.equal(out["mask_labels"], depth.flip(-1))
-    assert torch.equal(out["image"], random_dof()(image.flip(-1), depth.flip(-1), params=pipeline._params[1].data))
+    drawn: Any = pipeline._params
+    assert torch.equal(out["image"], random_dof()(image.flip(-1), depth.flip(-1), params=drawn[1].data))
     assert out["name"] == "a"
 
 

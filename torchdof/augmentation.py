@@ -111,7 +111,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
             "table": drawn["table"].long().clamp_max(len(self.renderings) - 1),
         }
 
-    def forward(
+    def forward(  # type: ignore[override]  # the depth comes second, where Kornia has the parameters
         self,
         input: Any,
         depth: Tensor | None = None,
@@ -234,7 +234,7 @@ class DepthAugmentationSequential(AugmentationSequential):
         (torch.Size([2, 3, 8, 12]), torch.Size([2, 1, 8, 12]), torch.Size([2, 1, 8, 12]))
     """
 
-    def __init__(self, *args: nn.Module, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.transform_op = _DepthOps(self.data_keys)
 

@@ -108,15 +108,15 @@ class DepthOfField(nn.Module):
             ValueError: If shapes, types or values are not as described, or a tensor comes from ``torch.vmap``.
         """
         options, axes = self.options, leading_axes(image)
-        focus_m, f_number = numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
         background = flattened(axes, "background", background, "C")
         background_depth = flattened(axes, "background_depth", background_depth)
-        coc = self._coc_px(image, depth, focus_m, f_number, "depth")
+        coc = self._coc_px(image, depth, *lens, "depth")
         validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
-            behind = self._coc_px(background, background_depth, focus_m, f_number, "background_depth")
+            behind = self._coc_px(background, background_depth, *lens, "background_depth")
         attention = flattened(axes, "attention", attention)
         return restored(axes, _blur(image, coc, options, plan, background, behind, attention))
 
@@ -151,11 +151,12 @@ class DepthOfField(nn.Module):
         options = self.options
         depth = validation.stack(rgba, depth_m, options.check)
         batch, count, _, height, width = rgba.shape
-        maps = depth.expand(batch, -1, 1, height, width).transpose(1, 2).flatten(2, 3)  # [B, 1, N * H, W]
+        maps = depth.expand(batch, -1, 1, height, width)
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
-        coc = self._coc_px(rgba.new_empty(batch, 1, count * height, width), maps, focus_m, f_number, "depth_m")
-        return _rendered(pipeline.blur_stack, rgba, coc.unflatten(2, (count, height)).transpose(1, 2), options)
+        frame = rgba.new_empty(batch, 1, height, width)
+        cocs = [self._coc_px(frame, layer, focus_m, f_number, "depth_m") for layer in maps.unbind(1)]
+        return _rendered(pipeline.blur_stack, rgba, torch.stack(cocs, 1), options)
 
     def coc_px(
         self,
@@ -172,9 +173,9 @@ class DepthOfField(nn.Module):
             ValueError: As :meth:`forward`; so does a lens that blurs beyond what numbers hold.
         """
         axes = leading_axes(image)
-        focus_m, f_number = numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number)
+        lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
-        return restored(axes, _with_edges(image, self._coc_px(image, depth, focus_m, f_number, "depth"), self.options))
+        return restored(axes, _with_edges(image, self._coc_px(image, depth, *lens, "depth"), self.options))
 
     def _coc_px(
         self,
@@ -354,7 +355,7 @@ def _blur(
     hidden = None if background is None or background_coc_px is None else (background, background_coc_px)
     if hidden is not None and not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
-    _check_attention(attention, plan)
+    _check_attention(attention, plan, options)
     coc_px = _with_edges(image, coc_px, options)
     return _rendered(pipeline.blur_attended, image, coc_px, plan, options, hidden, attention)
 
@@ -400,11 +401,14 @@ def _check_plan(plan: Plan | None) -> None:
         )
 
 
-def _check_attention(attention: Attention | None, plan: Plan | None) -> None:
+def _check_attention(attention: Attention | None, plan: Plan | None, options: Options) -> None:
     """Refuse attention where it cannot be paid: beside a plan, which holds one tolerance, and where code is traced."""
     if attention is None:
         return
     if plan is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
+    aperture = options.table.aperture
+    if aperture is not None and aperture.depends_on_place:
+        raise ValueError("attention renders a part of the frame by itself; take a table without vignetting")
     if validation.is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")

@@ -33,6 +33,7 @@ NAMED = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
 """For looking around, for judging a picture, and one that differs by less than a display shows."""
 
 _DISC = BlurTable.disc()  # one for all: what was computed of a table is kept with it
+_LATER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # of the camera; older states lack them
 _Spelled = TypeVar("_Spelled")
 
 
@@ -84,6 +85,11 @@ class Options:
                 raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
         if not isinstance(self.method, str) or self.method not in ("layered", "fold"):
             raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
+        aperture = self.table.aperture
+        if self.method == "fold" and aperture is not None and aperture.depends_on_place:
+            raise ValueError(
+                "method='fold' has one kernel a blur radius; take 'layered', or a table without vignetting"
+            )
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
         reach = self.max_coc_px
@@ -211,6 +217,7 @@ def read_state(state: Any) -> tuple[Camera, Options]:
     camera = state["camera"]
     if not isinstance(camera, Mapping):
         raise ValueError(f"camera of the state must be a dict, got {show(camera)}")
+    camera = {**_LATER_NUMBERS, **camera}
     _fields("camera of the state", camera, list(Camera.__dataclass_fields__))
     try:
         restored_camera = Camera(**camera)

@@ -8,6 +8,7 @@ albumentations' Defocus one disc: neither knows depth, so they are a measure of 
 """
 
 import argparse
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -72,7 +73,7 @@ def works(image: Tensor, depth: Tensor) -> dict[str, Callable[[], object]]:
         right = DepthOfField(camera, **options)(decode(image, "srgb", False, False), depth, **lens)  # type: ignore[arg-type]
         if not torch.allclose(out, encode(right, "srgb", False, False), atol=1e-6):
             raise RuntimeError(f"{name}: the picture is not the rendering of its parameters")
-        compared[f"torchdof RandomDepthOfField, {name}"] = lambda aug=aug: aug(image, depth)
+        compared[f"torchdof RandomDepthOfField, {name}"] = functools.partial(aug, image, depth)
     box = RandomBoxBlur((11, 11), p=1.0)
     compared["kornia RandomBoxBlur, 11 x 11"] = lambda: box(image)
     try:

@@ -1,6 +1,7 @@
 import csv
 import importlib.metadata
 import importlib.util
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -199,6 +200,15 @@ def test_bench_measures_ones_own_scene_and_writes(files: tuple[Path, Path], tmp_
     assert math.isinf(float(rows[5]["psnr_db"]))
 
 
+def test_json_holds_the_rows_that_are_printed(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = [row(EXACT, 0.5, 0.0), row(speed.Setting("layered", False, 1 / 255), 0.1, math.nan)]
+    monkeypatch.setattr(speed, "measure_all", lambda *_: (measured, 0.02))
+    facts = json.loads(run(*files, "--json", "--focus-m", 2).stdout)
+    assert facts["scene"] == "image.exr" and facts["unit_s"] == 0.02 and facts["scans"] == []
+    assert [cost["median_s"] for cost in facts["settings"]] == [0.5, 0.1]
+    assert facts["settings"][0]["setting"]["tolerance"] == 0.0 and facts["settings"][1]["rms_255"] == "nan"
+
+
 def test_bench_focuses_where_it_is_told(files: tuple[Path, Path], tmp_path: Path) -> None:
     how = RenderSettings(focus=[(0, 1.0)])
     subject = from_files(*files, how)
@@ -230,6 +240,8 @@ def test_alpha_is_left_out(tmp_path: Path) -> None:
         (["TINY", "TINY", "--depth-kind", "z"], "from 16 pixels a side on"),
         (["--focus-m", "2"], "the built-in scene has its own camera"),
         (["--truth", "."], "give a folder with --out"),
+        (["--truth", ".", "--json"], "leave --json out"),
+        (["IMAGE", "DEPTH", "--fill-depth", "x"], "--fill-depth expects nearest, far or metres"),
         (["--truth", ".", "--scan"], "leave IMAGE and DEPTH out, and --onnx, --compile and --scan"),
     ],
 )

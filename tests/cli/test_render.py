@@ -298,7 +298,8 @@ def test_json_says_for_programs_what_the_line_says(scene: Path) -> None:
     assert there == {"out": "out.0001.exr", "is_there_already": True}
     assert [frame["out"] for frame in frames] == ["out.0002.exr", "out.0003.exr"]
     camera = {"focus_m": "inf", "f_number": 1.4, "focal_length_mm": 50.0, "sensor_width_mm": 4.0}
-    assert frames[0]["camera"] == pytest.approx(camera) and frames[0]["assumed"] == []
+    straight = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}
+    assert frames[0]["camera"] == {**camera, **straight} and frames[0]["assumed"] == []
     radius = float(lens(math.inf).coc_px(depth(), WIDTH).abs().max())
     assert frames[0]["largest_coc_px"] == pytest.approx(radius) and frames[0]["table"] == "disc"
 
@@ -458,7 +459,10 @@ def test_missing_depth_frame_is_found_before_anything_is_rendered(scene: Path) -
             ("image.exr", "depth.npy", "--focus-m", "2", "--depth-kind", "relative", "--near-m", "5", "--far-m", "1"),
             "depth.npy: near_m must be nearer than far_m",
         ),
-        (("image.exr", "depth.npy", "--focus-m", "2", "--value-range", "3"), "--value-range expects LOW,HIGH"),
+        (
+            ("image.exr", "depth.npy", "--focus-m", "2", "--value-range", "3"),
+            "--value-range expects two numbers such as 0,255",
+        ),
         (("image.exr", "depth.npy", "--focus-m", "2", "--layer", "b"), "image.exr: has no layer 'b'"),
         (("image.exr", "small.npy", "--focus-m", "2"), "small.npy: depth is 3 x 4 pixels and the image 24 x 16"),
         (("image.exr", "depth.####.npy", "--focus-m", "2"), "image.exr: is a single image"),
@@ -502,3 +506,43 @@ def test_python_dash_m_is_the_command(scene: Path) -> None:
     )
     assert result.returncode == 2
     assert result.stderr == "error: none.npy: there is no such file\n"
+
+
+def test_options_shape_the_blur_and_the_focus(scene: Path) -> None:
+    line = run(
+        *("image.exr", "depth.npy", "-o", "out.exr", "--focus-range", "1.5,1.8", "--tilt", "3", "--swing", "-1", *LENS),
+        *("--blades", "5", "--rotation", "15", "--curvature", "0.2", "--squeeze", "1.5", "--vignetting", "0.3"),
+    )
+    assert "focus 1.5 to 1.8 m" in line and "tilt 3 degrees" in line and "swing -1 degrees" in line
+    assert "5 blades, curvature 0.2, turned by 15, squeeze 1.5, vignetting 0.3" in line
+    camera = lens(1.0).replace(focus_range_m=(1.5, 1.8), tilt_deg=3.0, swing_deg=-1.0)
+    table = torchdof.BlurTable.polygon(5, 15.0, 0.2, squeeze=1.5, vignetting=0.3)
+    expected = torchdof.depth_of_field(image(), depth(), camera, table=table)
+    torch.testing.assert_close(read_image("out.exr").pixels, expected, rtol=0, atol=1e-6)
+
+
+def test_a_picture_can_be_the_aperture(scene: Path) -> None:
+    mask = torch.zeros(1, 3, 8, 8)
+    mask[..., 1:7, 1:3] = 1.0
+    write_image("slit.png", Picture(mask, sample="8", transfer="srgb"))
+    run("image.exr", "depth.npy", "-o", "out.exr", "--focus-m", "6", "--aperture", "slit.png", *LENS)
+    table = torchdof.BlurTable.from_aperture(mask[0, 0])
+    expected = torchdof.depth_of_field(image(), depth(), lens(6.0), table=table)
+    torch.testing.assert_close(read_image("out.exr").pixels, expected, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--focus-m", "2", "--focus-range", "1,2"), "--focus-m and --focus-range both say where to focus"),
+        (("--focus-range", "2,1"), "--focus-range must go from near to far"),
+        (("--focus-range", "2"), "--focus-range expects two numbers such as 1.5,2.2"),
+        (("--focus-m", "2", "--tilt", "95"), "--tilt must be in (-90, 90) degrees"),
+        (("--focus-m", "2", "--blades", "2"), "--blades must be a whole number from 3 to 64"),
+        (("--focus-m", "2", "--rotation", "5"), "--rotation turns blades or an image"),
+        (("--focus-m", "2", "--squeeze", "0"), "--squeeze must be a number from 0.1 to 10"),
+        (("--focus-m", "2", "--blades", "5", "--aperture", "a.png"), "--aperture is the whole opening"),
+    ],
+)
+def test_shapes_and_ranges_that_make_no_sense_are_refused(scene: Path, options: tuple[str, ...], message: str) -> None:
+    assert message in run("image.exr", "depth.npy", "-o", "out.exr", *options, *LENS, code=2)

@@ -24,6 +24,7 @@ RUN += [ROOT / "docs" / "index.md"]
 _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
 _COMMAND = re.compile(r"(?:^|`)\s*((?:python -m )?torchdof (?:[a-z]+)(?: [^`\n\\]*(?:\\\n[^`\n\\]*)*)?)", re.M)
 _LINK = re.compile(r"""\]\((?P<link>[^)\s]+)\)|src="(?P<source>[^"]+)\"""")
+_PATH = re.compile(r"(?:`| )((?:examples|tests|docs|fit|export|torchdof|optics|render|depth)/[a-z_/]+(?:\.[a-z]+|/))")
 _ALIKE_DB = 33.0  # of a JPEG with what it was made from, and then some
 
 
@@ -84,6 +85,12 @@ def test_links_to_files_lead_somewhere(name: str) -> None:
         link = (match["link"] or match["source"]).partition("#")[0]
         if link and not link.startswith(("http:", "https:")):
             assert ((ROOT / name).parent / link).exists(), link
+
+
+@pytest.mark.parametrize("name", _names(PAGES))
+def test_files_that_a_page_names_are_there(name: str) -> None:
+    for path in _PATH.findall((ROOT / name).read_text()):
+        assert (ROOT / path).exists() or (ROOT / "torchdof" / path).exists(), path
 
 
 def test_readme_is_short_and_names_folders_and_extras_that_exist() -> None:

@@ -26,7 +26,7 @@ def example(**changes: Any) -> dict[str, Any]:
     """A whole table as stored, with fields changed; a field set to None is left out."""
     data: dict[str, Any] = {
         "schema": "torchdof/blur-table",
-        "version": 1,
+        "version": 2,
         "name": "lens",
         "family": "ring",
         "unit": "mm",
@@ -276,8 +276,8 @@ NOT_FINITE = [1.0, math.nan, 2.0]
     [
         ({"schema": None}, "schema must be 'torchdof/blur-table', got None"),
         ({"schema": "lut"}, "schema must be 'torchdof/blur-table', got 'lut'"),
-        ({"version": 2}, "version must be 1, got 2; update torchdof"),
-        ({"version": None}, "version must be 1, got None"),
+        ({"version": 3}, "version must be 1 or 2, got 3; update torchdof"),
+        ({"version": None}, "version must be 1 or 2, got None"),
         ({"family": None}, "family is missing"),
         ({"unit": None}, "unit is missing"),
         ({"coc": None}, "coc is missing"),

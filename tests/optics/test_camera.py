@@ -278,3 +278,140 @@ def test_a_camera_cannot_be_changed_in_place_and_replace_refuses_unknown_names()
         setattr(Camera(), "focus_m", 3.0)  # noqa: B010
     with pytest.raises(TypeError, match="focus"):
         Camera().replace(focus=3.0)
+
+
+def test_a_range_is_in_focus_from_end_to_end_and_blur_grows_from_its_ends() -> None:
+    camera = Camera(focal_length_mm=50.0, f_number=2.0, focus_range_m=(1.5, 2.2))
+    depth = depth_of(0.7, 1.2, 1.5, 1.8, 2.2, 2.5, math.inf)
+    scale = camera.aperture_radius_m * camera.focal_px(1920)
+    expected = [1 / 1.5 - 1 / 0.7, 1 / 1.5 - 1 / 1.2, 0.0, 0.0, 0.0, 1 / 2.2 - 1 / 2.5, 1 / 2.2]
+    coc = camera.coc_px(depth, 1920).flatten()
+    assert_close(coc, scale * torch.tensor(expected, dtype=coc.dtype), rtol=1e-12, atol=0)
+    assert coc[2:5].eq(0.0).all()
+    assert camera.focus_m == pytest.approx(2 / (1 / 1.5 + 1 / 2.2), rel=1e-12)
+    near, far = camera.sharp_limits_m(1.0, 1920)
+    assert float(camera.coc_px(depth_of(near), 1920)) == pytest.approx(-1.0, rel=1e-9)
+    assert float(camera.coc_px(depth_of(far), 1920)) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_range_of_no_length_is_one_distance_and_may_reach_to_infinity() -> None:
+    depth = depth_of(0.7, 2.0, 9.0, math.inf)
+    one, none = Camera(focus_m=2.0), Camera(focus_range_m=(2.0, 2.0))
+    assert_close(none.coc_px(depth, 100), one.coc_px(depth, 100), rtol=1e-12, atol=0)
+    assert Camera(focus_range_m=(2.0, math.inf)).coc_px(depth, 100).flatten().tolist()[1:] == [0.0, 0.0, 0.0]
+
+
+def test_a_focus_distance_beside_a_range_is_refused() -> None:
+    camera = Camera(focus_range_m=(1.0, 2.0))
+    with pytest.raises(ValueError, match="focus_m is told by the camera's focus_range_m"):
+        camera.replace(focus_m=3.0)
+    assert camera.replace(focus_range_m=None, focus_m=3.0).focus_m == 3.0
+    assert camera.replace(f_number=2.0).focus_range_m == (1.0, 2.0)
+
+
+@pytest.mark.parametrize("value", [(2.0, 1.0), (0.0, 1.0), (1.0,), 3.0, (1.0, "far"), (math.nan, 2.0)])
+def test_what_is_no_range_is_refused(value: Any) -> None:
+    with pytest.raises(ValueError, match="^focus_range_m must"):
+        Camera(focus_range_m=value)
+
+
+def plane_in_focus(camera: Camera, x: float, y: float, size: tuple[int, int]) -> float:
+    """Depth in focus at a pixel, from where a plane through the lens equation's hinge meets the pixel's ray."""
+    height, width = size
+    focal = float(camera.focal_length_mm) / 1000.0
+    tilt, swing = math.radians(float(camera.tilt_deg)), math.radians(float(camera.swing_deg))
+    normal = (math.sin(swing) * math.cos(tilt), math.sin(tilt))
+    slope_x, slope_y = ((v - n / 2) / float(camera.focal_px(width)) for v, n in ((x, width), (y, height)))
+    # all points (X, Y, Z) with Z / s + (n_x X + n_y Y) / f = 1; at Z = 0 that is the hinge, f / sin(tilt) away
+    return 1.0 / (1.0 / float(camera.focus_m) + (normal[0] * slope_x + normal[1] * slope_y) / focal)
+
+
+@pytest.mark.parametrize(("tilt", "swing"), [(3.0, 0.0), (0.0, -2.0), (4.0, 1.5)])
+def test_a_tilted_lens_is_in_focus_on_the_plane_through_its_hinge(tilt: float, swing: float) -> None:
+    camera = Camera(focal_length_mm=80.0, focus_m=3.0, tilt_deg=tilt, swing_deg=swing)
+    height, width = 6, 9
+    depth = torch.tensor(
+        [
+            [plane_in_focus(camera, column + 0.5, row + 0.5, (height, width)) for column in range(width)]
+            for row in range(height)
+        ],
+        dtype=torch.float64,
+    )[None, None]
+    assert_close(camera.coc_px(depth, width), torch.zeros_like(depth), rtol=0, atol=1e-12)
+    scale = camera.aperture_radius_m * camera.focal_px(width)
+    behind = camera.coc_px(1.2 * depth, width)
+    assert_close(behind, scale * (1 / depth - 1 / (1.2 * depth)), rtol=1e-9, atol=0)
+    # a map at twice the resolution sees the same plane
+    fine = camera.coc_px(torch.full((1, 1, 2 * height, 2 * width), 2.0, dtype=torch.float64), width)
+    coarse = camera.coc_px(torch.full((1, 1, height, width), 2.0, dtype=torch.float64), width)
+    assert_close(torch.nn.functional.avg_pool2d(fine, 2), coarse, rtol=1e-9, atol=1e-12)
+
+
+def test_planes_of_one_tilt_meet_at_the_hinge_below_the_lens() -> None:
+    hinge = 0.08 / math.sin(math.radians(5.0))
+    for focus_m in (1.0, 4.0, math.inf):
+        camera = Camera(focal_length_mm=80.0, focus_m=focus_m, tilt_deg=5.0)
+        rows = [300.5, 380.5]  # below the middle of 400
+        depths = [plane_in_focus(camera, 50.0, row, (400, 100)) for row in rows]
+        heights = [z * (row - 200) / float(camera.focal_px(100)) for z, row in zip(depths, rows, strict=True)]
+        slope = (heights[1] - heights[0]) / (depths[1] - depths[0])
+        assert heights[0] - slope * depths[0] == pytest.approx(hinge, rel=1e-9)
+        full = torch.full((1, 1, 400, 100), 9.0, dtype=torch.float64)
+        full[0, 0, 300, :] = depths[0]
+        full[0, 0, 380, :] = depths[1]
+        assert camera.coc_px(full, 100)[0, 0, [300, 380]].abs().max() < 1e-12
+
+
+def test_coc_is_differentiable_in_the_range_and_the_angles() -> None:
+    depth = torch.tensor([0.7, 1.3, 4.0, 9.0], dtype=torch.float64).reshape(1, 1, 2, 2).requires_grad_()
+    values = [torch.tensor([v], dtype=torch.float64, requires_grad=True) for v in (1.2, 2.0, 3.0, -2.0)]
+
+    def coc(depth: Tensor, near: Tensor, far: Tensor, tilt: Tensor, swing: Tensor) -> Tensor:
+        return Camera(focus_range_m=(near, far), tilt_deg=tilt, swing_deg=swing).coc_px(depth, 100)
+
+    assert torch.autograd.gradcheck(coc, (depth, *values))
+
+
+@pytest.mark.parametrize("angle", [90.0, math.nan, "3", torch.tensor([95.0]), True])
+def test_a_bad_angle_is_refused_by_name(angle: Any) -> None:
+    for name in ("tilt_deg", "swing_deg"):
+        with pytest.raises(ValueError, match=f"^{name} must be"):
+            Camera(**{name: angle})
+
+
+def test_a_tilted_lens_is_focused_on_what_is_pointed_at() -> None:
+    camera = Camera(focal_length_mm=80.0, tilt_deg=3.0, swing_deg=-1.0)
+    depth = torch.linspace(1.0, 5.0, 60 * 80, dtype=torch.float64).reshape(1, 1, 60, 80)
+    focused = camera.focus_at(depth, 70.5, 50.5, patch=1)
+    assert abs(float(focused.coc_px(depth, 80)[0, 0, 50, 70])) < 1e-9
+
+
+def test_focus_on_takes_the_median_of_the_subject() -> None:
+    depth = torch.tensor([[1.0, 2.0, 3.0, math.nan], [9.0, 9.0, 9.0, 9.0]]).reshape(1, 1, 2, 4)
+    mask = torch.tensor([[1, 1, 1, 1], [0, 0, 0, 0]]).reshape(1, 1, 2, 4)
+    assert Camera().focus_on(depth, mask > 0).focus_m == 2.0
+    weighted = torch.tensor([[0.1, 0.2, 0.8, 5.0], [0, 0, 0, 0]]).reshape(1, 1, 2, 4)
+    assert Camera().focus_on(depth, weighted).focus_m == 3.0
+    both = Camera().focus_on(torch.cat([depth, depth + 1]), mask > 0).focus_m
+    assert torch.as_tensor(both).tolist() == [2.0, 3.0]
+    for bad, message in (
+        (mask[..., :3] > 0, "must have the depth's shape"),
+        (mask < 0, "no valid depth where"),
+        (-weighted, ">= 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Camera().focus_on(depth, bad)
+
+
+def test_focus_in_a_box_prefers_its_middle() -> None:
+    depth = torch.full((1, 1, 40, 40), 6.0)
+    depth[..., 10:30, 10:30] = 2.0  # a third of the box's pixels
+    assert Camera().focus_in(depth, (2, 2, 38, 38)).focus_m == 2.0
+    assert Camera().focus_in(depth, (30, 30, 40, 40)).focus_m == 6.0
+    for box, message in (
+        ((50, 50, 60, 60), "hold pixels of the frame"),
+        ((1, 2, 3), "must be \\(left, top"),
+        ((0, 0, 9, "x"), "must be"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Camera().focus_in(depth, box)  # type: ignore[arg-type]

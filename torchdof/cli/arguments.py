@@ -1,5 +1,6 @@
 """Options that several commands take alike: the lens, the numbers of a depth map, the blur, and what is printed."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -8,8 +9,11 @@ __all__ = [
     "BLUR",
     "DEPTH",
     "LENS",
+    "ApertureImage",
     "ApertureRadiusM",
     "AsJson",
+    "Blades",
+    "Curvature",
     "DepthChannel",
     "DepthOffset",
     "DepthScale",
@@ -23,10 +27,13 @@ __all__ = [
     "NearM",
     "NoOcclusion",
     "RelativeKind",
+    "Rotation",
     "SensorWidthMm",
+    "Squeeze",
     "TableName",
     "ToleranceText",
     "ValueRange",
+    "Vignetting",
 ]
 
 LENS, DEPTH, BLUR = "Focus and lens", "Depth map", "Blur"
@@ -43,6 +50,23 @@ FovDeg = Annotated[
 ]
 ApertureRadiusM = Annotated[
     float | None, typer.Option(help="Radius of the opening, with --fov-deg.", rich_help_panel=LENS)
+]
+
+Blades = Annotated[int, typer.Option(help="Aperture blades, from 3; 0 is a round lens.", rich_help_panel=BLUR)]
+Rotation = Annotated[
+    float,
+    typer.Option(help="Degrees by which blades or image are turned, counter-clockwise.", rich_help_panel=BLUR),
+]
+Curvature = Annotated[float, typer.Option(help="Of the blades: 0 straight, 1 a circle.", rich_help_panel=BLUR)]
+Squeeze = Annotated[
+    float, typer.Option(help="Height of the blur over its width; 2 for an anamorphic lens.", rich_help_panel=BLUR)
+]
+Vignetting = Annotated[
+    float, typer.Option(help="Cat's eyes towards the corners: 0 none, 1 closed.", rich_help_panel=BLUR)
+]
+ApertureImage = Annotated[
+    Path | None,
+    typer.Option(metavar="IMAGE", help="Picture of the opening, bright where light passes.", rich_help_panel=BLUR),
 ]
 
 DepthScale = Annotated[float | None, typer.Option(help="0.001 for maps in millimetres.", rich_help_panel=DEPTH)]

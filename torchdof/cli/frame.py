@@ -18,7 +18,6 @@ from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
 from ..module import blur_by_coc, depth_of_field
-from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
 from ..options import Options
 from ..validation import coc_of_lens, image_and_map, same_aspect
@@ -82,15 +81,20 @@ class Rendered:
     def __str__(self) -> str:
         settings, parts = self.settings, []
         if self.camera is not None:
+            ends = self.camera.focus_range_m or (self.camera.focus_m,)
             parts.append(
-                f"focus {self.camera.focus_m:.4g} m, f/{self.camera.f_number:.3g}, "
+                f"focus {' to '.join(f'{end:.4g}' for end in ends)} m, f/{self.camera.f_number:.3g}, "
                 f"{self.camera.focal_length_mm:.4g} mm on {self.camera.sensor_width_mm:.4g} mm"
             )
+            angles = {"tilt": self.camera.tilt_deg, "swing": self.camera.swing_deg}
+            parts += [f"{name} {angle:.4g} degrees" for name, angle in angles.items() if angle != 0.0]
         parts.append(f"blur radius up to {self.largest_coc_px:.1f} px")
         if settings.show_focus:
             parts.append("focus shown: near orange, sharp green, far blue")
         else:
             parts.append(f"{self.table}, {settings.method}")
+            if settings.table.aperture is not None:
+                parts.append(repr(settings.table.aperture).removeprefix("Aperture(").removesuffix(")"))
             parts += [] if settings.occlusion else ["no occlusion"]
         if self.holes:
             parts.append(f"{self.holes} px of depth filled ({settings.fill})")
@@ -101,11 +105,17 @@ class Rendered:
         """The same for programs, as JSON-like data."""
         settings, names = self.settings, ("focus_m", "f_number", "focal_length_mm", "sensor_width_mm")
         camera = None if self.camera is None else {name: float(getattr(self.camera, name)) for name in names}
+        if self.camera is not None and camera is not None:
+            ends = self.camera.focus_range_m
+            camera |= {"focus_range_m": None if ends is None else [float(end) for end in ends]}
+            camera |= {"tilt_deg": float(self.camera.tilt_deg), "swing_deg": float(self.camera.swing_deg)}
         facts: dict[str, Any] = {"out": self.out, "camera": camera, "assumed": self.remarks}
         facts |= {"largest_coc_px": self.largest_coc_px, "width": self.size[0], "height": self.size[1]}
         facts |= {"filled_px": self.holes, "show_focus": settings.show_focus}
         if not settings.show_focus:
-            facts |= {"table": self.table, "method": settings.method, "occlusion": settings.occlusion}
+            aperture = settings.table.aperture
+            facts |= {"table": self.table, "aperture": None if aperture is None else aperture.to_dict()}
+            facts |= {"method": settings.method, "occlusion": settings.occlusion}
             facts |= {"tolerance": settings.tolerance, "attention": settings.attention}
         return facts | {"seconds": self.seconds, "device": str(settings.device)}
 
@@ -182,7 +192,7 @@ def render_frame(
         table = settings.table
         if picture.has_alpha and table.channels > 1:  # alpha is blurred as green is
             params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
-            table = BlurTable(table.family, table.coc, params, unit=table.unit, sensor_width_mm=table.sensor_width_mm)
+            table = table.replace(params=params)
         options = Options(
             table, settings.tolerance, settings.occlusion, method=settings.method, depth_edges=settings.depth_edges
         ).arguments()

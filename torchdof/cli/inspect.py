@@ -104,7 +104,7 @@ def inspect(
         near_m=near_m,
         far_m=far_m,
         relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range),
+        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
         fill=None if fill_depth is None else parse_fill(fill_depth),
         strict=strict,
     )

@@ -21,6 +21,7 @@ _MODULES = {
     "export": "torchdof.cli.export",
     "bench": "torchdof.cli.bench",
     "inspect": "torchdof.cli.inspect",
+    "tables": "torchdof.cli.tables",
 }
 
 

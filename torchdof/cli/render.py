@@ -29,8 +29,11 @@ from .arguments import (
     BLUR,
     DEPTH,
     LENS,
+    ApertureImage,
     ApertureRadiusM,
     AsJson,
+    Blades,
+    Curvature,
     DepthChannel,
     DepthOffset,
     DepthScale,
@@ -44,15 +47,18 @@ from .arguments import (
     NearM,
     NoOcclusion,
     RelativeKind,
+    Rotation,
     SensorWidthMm,
+    Squeeze,
     TableName,
     ToleranceText,
     ValueRange,
+    Vignetting,
 )
 from .doubts import Said
 from .frame import Frame, read_frame, render_frame
 from .printed import json_line
-from .settings import RenderSettings, load_table, pick_device
+from .settings import RenderSettings, load_aperture, load_table, pick_device
 
 __all__ = ["parse_attention", "parse_fill", "parse_point", "parse_range", "render"]
 
@@ -92,6 +98,25 @@ def render(
             rich_help_panel=LENS,
         ),
     ] = None,
+    focus_range: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NEAR,FAR",
+            help="In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
+            rich_help_panel=LENS,
+        ),
+    ] = None,
+    tilt: Annotated[
+        float,
+        typer.Option(
+            help="Degrees by which the lens is tilted down: focus comes nearer towards the bottom.",
+            rich_help_panel=LENS,
+        ),
+    ] = 0.0,
+    swing: Annotated[
+        float,
+        typer.Option(help="Degrees to the right: focus comes nearer towards the right.", rich_help_panel=LENS),
+    ] = 0.0,
     f_number: FNumber = None,
     focal_length_mm: FocalLengthMm = None,
     sensor_width_mm: SensorWidthMm = None,
@@ -131,6 +156,12 @@ def render(
         ),
     ] = "auto",
     table: TableName = "disc",
+    blades: Blades = 0,
+    rotation: Rotation = 0.0,
+    curvature: Curvature = 0.0,
+    squeeze: Squeeze = 1.0,
+    aperture: ApertureImage = None,
+    vignetting: Vignetting = 0.0,
     tolerance: ToleranceText = "final",
     attention: Annotated[
         str | None,
@@ -203,6 +234,10 @@ def render(
     --steady filters depth that flickers along time, where neither image nor depth moved; a part of a sequence, or the
     rest of it with --resume, comes out as the whole would: up to 63 frames before it are read first.
 
+    Seven blades on an anamorphic lens, all from 1.5 to 2.2 m in focus:
+
+        torchdof render shot.exr -o out.exr --focus-range 1.5,2.2 --blades 7 --rotation 15 --squeeze 2
+
     A stereo disparity map with holes (scale: baseline in metres * focal length in pixels):
 
         torchdof render l.png disp.npz -o out.png --focus-m 2 --depth-kind disparity --depth-scale 192 --fill-depth far
@@ -218,6 +253,9 @@ def render(
     settings = RenderSettings(
         focus=None if focus_m is None else parse_focus(focus_m),
         focus_at=None if focus_at is None else parse_point(focus_at),
+        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
+        tilt_deg=tilt,
+        swing_deg=swing,
         f_number=f_number,
         focal_length_mm=focal_length_mm,
         sensor_width_mm=sensor_width_mm,
@@ -231,10 +269,10 @@ def render(
         near_m=near_m,
         far_m=far_m,
         relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range),
+        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
         fill=None if fill_depth is None else parse_fill(fill_depth),
         depth_edges="as given" if depth_edges == "as-given" else depth_edges,
-        table=load_table(table),
+        table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)),
         tolerance=tolerance_of_text(tolerance),
         attention=None if attention is None else parse_attention(attention),
         occlusion=not no_occlusion,
@@ -377,16 +415,16 @@ def parse_attention(text: str) -> tuple[float, float, float]:
     return x, y, radius
 
 
-def parse_range(text: str) -> tuple[float, float]:
-    """Reads ``LOW,HIGH``.
+def parse_range(text: str, option: str, example: str) -> tuple[float, float]:
+    """Reads two numbers, as of an option's example.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If these are none.
     """
     try:
         low, high = (float(part) for part in text.split(","))
     except ValueError:
-        raise ValueError(f"--value-range expects LOW,HIGH such as 0,255, got {text!r}") from None
+        raise ValueError(f"{option} expects two numbers such as {example}, got {text!r}") from None
     return low, high
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -14,16 +15,18 @@ from ..depth.holes import Fill
 from ..depth.kinds import DepthKind
 from ..depth.relative import RelativeKind
 from ..io.decode import PixelType
+from ..io.images import read_image
 from ..io.metadata import camera_facts
 from ..io.sequence import focus_at_frame
 from ..io.transfer import Transfer
+from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..optics.table_file import shipped
 from ..options import Method
 from ..validation import number, show
 
-__all__ = ["RenderSettings", "load_table", "pick_device"]
+__all__ = ["RenderSettings", "load_aperture", "load_table", "pick_device"]
 
 _OPTIONS = {
     "focal_length_mm": "--focal-length-mm",
@@ -32,6 +35,9 @@ _OPTIONS = {
     "sensor_width_mm": "--sensor-width-mm",
     "fov_x_deg": "--fov-deg",
     "aperture_radius_m": "--aperture-radius-m",
+    "focus_range_m": "--focus-range",
+    "tilt_deg": "--tilt",
+    "swing_deg": "--swing",
 }
 _IDEAL = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
@@ -44,6 +50,9 @@ class RenderSettings:
     Args:
         focus: Keyframes (frame, metres); a plain distance is one keyframe.
         focus_at: Pixel (x, y) to focus on.
+        focus_range: Nearest and farthest distance in focus.
+        tilt_deg: Degrees by which the lens is tilted down.
+        swing_deg: Degrees by which it is turned to the right.
         f_number: Focal length over aperture diameter.
         focal_length_mm: Focal length in millimetres.
         sensor_width_mm: Width of the sensor in millimetres.
@@ -81,6 +90,9 @@ class RenderSettings:
 
     focus: list[tuple[int, float]] | None = None
     focus_at: tuple[float, float] | None = None
+    focus_range: tuple[float, float] | None = None
+    tilt_deg: float = 0.0
+    swing_deg: float = 0.0
     f_number: float | None = None
     focal_length_mm: float | None = None
     sensor_width_mm: float | None = None
@@ -111,11 +123,21 @@ class RenderSettings:
     strict: bool = False
 
     def __post_init__(self) -> None:
-        if self.focus is not None and self.focus_at is not None:
-            raise ValueError("--focus-m and --focus-at both say where to focus; give one of them")
+        places = {"--focus-m": self.focus, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
+        given = [option for option, place in places.items() if place is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} both say where to focus; give one of them")
         if self.depth_kind == "coc":
-            camera = ("focus", "focus_at", "f_number", "focal_length_mm", "sensor_width_mm", "aperture_radius_m")
-            if any(getattr(self, name) is not None for name in camera):
+            camera = (
+                "focus",
+                "focus_at",
+                "focus_range",
+                "f_number",
+                "focal_length_mm",
+                "sensor_width_mm",
+                "aperture_radius_m",
+            )
+            if self.tilt_deg or self.swing_deg or any(getattr(self, name) is not None for name in camera):
                 raise ValueError(
                     "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
                 )
@@ -156,7 +178,7 @@ class RenderSettings:
         focus_m = math.inf
         if self.focus is not None:
             focus_m = focus_at_frame(self.focus, frame)
-        elif self.focus_at is None:
+        elif self.focus_at is None and self.focus_range is None:
             if "focus_m" not in facts:
                 raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
             focus_m = facts["focus_m"]
@@ -168,7 +190,7 @@ class RenderSettings:
             if radius_m is None:
                 raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
             with _by_option(_OPTIONS):
-                return Camera.from_fov(self.fov_x_deg, radius_m, focus_m), remarks
+                return Camera.from_fov(self.fov_x_deg, radius_m, focus_m).replace(**self._moved()), remarks
         lens: dict[str, float] = {}
         for name, assumed in _ASSUMED.items():
             stated = getattr(self, name)
@@ -178,7 +200,12 @@ class RenderSettings:
                 remarks.append(f"{words} {'from the file' if name in facts else 'assumed'}")
         names = {name: self._name_of(name) for name in _OPTIONS}
         with _by_option(names):
-            return Camera(lens["focal_length_mm"], lens["f_number"], focus_m, lens["sensor_width_mm"]), remarks
+            camera = Camera(lens["focal_length_mm"], lens["f_number"], focus_m, lens["sensor_width_mm"])
+            return camera.replace(**self._moved()), remarks
+
+    def _moved(self) -> dict[str, Any]:
+        """What of the camera is no number of its lens: the range in focus and how the lens is tilted."""
+        return {"focus_range_m": self.focus_range, "tilt_deg": self.tilt_deg, "swing_deg": self.swing_deg}
 
     def stated(self, camera: Camera) -> dict[str, Any]:
         """The numbers of a camera by the options, or the file, that they are from."""
@@ -194,10 +221,11 @@ class RenderSettings:
     def _name_of(self, name: str) -> str:
         """What the user knows a number of the camera as: the option that states it, or the file's own."""
         if name == "focus_m":
-            stated = self.focus is not None or self.focus_at is not None
+            stated = any(place is not None for place in (self.focus, self.focus_at, self.focus_range))
             option = "--focus-at" if self.focus_at is not None else "--focus-m"
+            option = option if self.focus_range is None else "--focus-range"
         else:
-            stated, option = getattr(self, name, None) is not None, _OPTIONS[name]
+            stated, option = name == "focus_range_m" or getattr(self, name, None) is not None, _OPTIONS[name]
         return option if stated else f"{option} (not given)"
 
 
@@ -211,21 +239,55 @@ def _by_option(names: Mapping[str, str]) -> Iterator[None]:
         raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
 
 
-def load_table(name: str) -> BlurTable:
+def load_table(name: str, aperture: Aperture | None = None) -> BlurTable:
     """A blur table by name ("disc", "gaussian", a shipped one) or by the path of its JSON file.
+
+    With an aperture, it takes the place of the table's own.
 
     Raises:
         ValueError: If it is not valid.
         FileNotFoundError: If there is no such table; the message lists those there are.
         OSError: If the file cannot be read.
     """
-    if isinstance(name, str) and name in _IDEAL:
-        return _IDEAL[name]()
     try:
-        return BlurTable.load(name)
+        table = _IDEAL[name]() if isinstance(name, str) and name in _IDEAL else BlurTable.load(name)
     except FileNotFoundError:
         names = ", ".join([*_IDEAL, *shipped()])
         raise FileNotFoundError(f"no blur table {show(name)}: neither a file nor one of {names}") from None
+    return table if aperture is None else table.with_aperture(aperture)
+
+
+def load_aperture(
+    blades: int, rotation: float, curvature: float, squeeze: float, image: Path | None, vignetting: float = 0.0
+) -> Aperture | None:
+    """The opening that these options mean; None if they mean a round one.
+
+    Raises:
+        ValueError: If they contradict each other, or one is out of its range.
+        OSError: If the image cannot be read.
+    """
+    if image is not None and (blades or curvature):
+        raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
+    if blades == 0 and image is None and curvature:
+        raise ValueError("--curvature is that of blades; give --blades too")
+    if blades == 0 and image is None and rotation:
+        raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
+    mask = None
+    if image is not None:
+        picture = read_image(image)
+        light = picture.pixels[0, :-1] if picture.has_alpha else picture.pixels[0]
+        mask = light.mean(0)
+    with _by_option(
+        {
+            "blades": "--blades",
+            "rotation_deg": "--rotation",
+            "curvature": "--curvature",
+            "squeeze": "--squeeze",
+            "vignetting": "--vignetting",
+        }
+    ):
+        aperture = Aperture(blades, rotation, curvature, squeeze, mask, vignetting)
+    return None if aperture.is_round and squeeze == 1.0 and not aperture.depends_on_place else aperture
 
 
 def pick_device(name: str) -> torch.device:

@@ -20,7 +20,7 @@ __all__ = ["DepthWarning", "Doubt", "check", "coc_doubts", "depth_doubts"]
 
 _FACTORS = (0.001, 0.01, 1000.0, 100.0)  # millimetres and centimetres; and what was taken for such and is none
 _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # what counts as in focus: the larger of both
-_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
+_NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
 _FAR_OFF = 30.0  # times that the focus may be nearer or farther than all depth where the blur tells nothing
 _FAR_M, _HAND_M = 500.0, 0.1
 _LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # a real macro lens reaches half the frame's width
@@ -98,12 +98,16 @@ def depth_doubts(
     real_tensor("depth", depth, "[B, 1, H, W] in metres")
     if depth.ndim != 4 or depth.shape[1] != 1:
         raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
-    numbers = [torch.as_tensor(getattr(camera, name)).reshape(-1) for name in _NUMBERS]
+    in_focus = camera.focus_range_m or (camera.focus_m, camera.focus_m)
+    lens = [getattr(camera, name) for name in _NUMBERS]
+    numbers = [torch.as_tensor(value).reshape(-1) for value in (*lens, *in_focus)]
     batch = max(depth.shape[0], *(x.numel() for x in numbers))
     found: dict[str, Doubt] = {}
     for item in range(batch):
+        *lens, near, far = (float(x[min(item, x.numel() - 1)]) for x in numbers)
+        # straight: doubts do not ask where in the frame a depth lies
         single = camera.replace(
-            **{name: float(x[min(item, x.numel() - 1)]) for name, x in zip(_NUMBERS, numbers, strict=True)}
+            **dict(zip(_NUMBERS, lens, strict=True)), focus_range_m=(near, far), tilt_deg=0.0, swing_deg=0.0
         )
         for doubt in _doubts(depth[min(item, depth.shape[0] - 1)], single, kind, scale):
             found.setdefault(doubt.name, doubt)

@@ -25,7 +25,7 @@ class Summary:
         samples: Samples that were written.
         shards: Shards that hold them.
         broken: Image file and error of each sample that could not be made.
-        seconds: Sum over the samples of the time each took, in one process.
+        seconds: Of the processor, over all samples.
     """
 
     samples: int
@@ -98,12 +98,11 @@ def make_dataset(
     summary = summary_of(out)
     _describe(out, summary, settings)
     if made:
-        seconds = time.perf_counter() - start
         say(
             f"{made} samples in {seconds:.1f} s: {made / seconds:.2f} images/s, {made / seconds / workers:.2f} a worker"
         )
-    for image, error in summary.broken:
-        say(f"left out: {error}" if error.startswith(image) else f"left out: {image}: {error}")
+    for image, problem in summary.broken:
+        say(f"left out: {problem}" if problem.startswith(image) else f"left out: {image}: {problem}")
     return summary
 
 
@@ -183,7 +182,7 @@ them.
 | samples | {summary.samples}, {settings["copies"]} of each image |
 | shards | {summary.shards}, {settings["format"]} |
 | inputs left out | {len(summary.broken)}, listed in broken.txt |
-| time | {pace} a sample, one core |
+| time | {pace} of one core a sample |
 | focus | {focus[0]:g} to {focus[1]:g} m, evenly in 1 / metres |
 | opening | f/{opening[0]:g} to f/{opening[1]:g}, evenly in stops |
 | camera | {settings["camera"]}, but for focus and opening |

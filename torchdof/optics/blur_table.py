@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..validation import WHOLE_NUMBERS, floating, number, pixels_wide, real_tensor, show
 from . import psf, table_file
+from .aperture import Aperture, Number
 
 __all__ = ["BlurTable"]
 
@@ -19,6 +20,7 @@ _MOST_NODES = 4096
 _COC_RANGE = (1e-9, 1e6)
 _WIDEST = 1e4  # times the circle of confusion; a blur that is not of the focus shows at small ones
 _STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
+_RIM_POWER = 4.0  # of the radius, with which a rim grows
 _TRIED_AT_ONCE = 64
 _TRIED_PX = (0.5, 6.0)  # radii of the widest kernel tried
 
@@ -44,6 +46,8 @@ class BlurTable:
         name: Short name.
         provenance: Where the numbers are from (camera, source, date, command): a JSON-like dict.
         residual: Relative residual of the fit at each node ``[N]``.
+        aperture: What the lens's opening is where it is not round (:class:`torchdof.optics.aperture.Aperture`): the
+            family is multiplied by it, and turned by half in front of the focus plane.
 
     Raises:
         ValueError: If a field is not as described; the message names it.
@@ -69,6 +73,7 @@ class BlurTable:
         name: str = "",
         provenance: Mapping[str, Any] | None = None,
         residual: Sequence[float] | Tensor | None = None,
+        aperture: Aperture | None = None,
     ) -> None:
         if not isinstance(family, str) or family not in psf.FAMILIES:
             raise ValueError(f"family must be one of {', '.join(psf.FAMILIES)}, got {show(family)}")
@@ -104,6 +109,9 @@ class BlurTable:
         self.strength = self._per_node("strength", strength)
         self.residual = self._per_node("residual", residual)
         self.provenance = dict(provenance or {})
+        if aperture is not None and not isinstance(aperture, Aperture):
+            raise ValueError(f"aperture must be an Aperture or None, got {show(aperture)}")
+        self.aperture = aperture
         self._fingerprint: str | None = None
         self._sides = {sign: self._side(sign) for sign in (-1, 1)}
         for sign in (-1, 1):
@@ -130,6 +138,104 @@ class BlurTable:
         """
         return cls("gaussian", [1.0], {"sigma": [sigma_per_coc]}, name="gaussian")
 
+    @classmethod
+    def polygon(
+        cls,
+        blades: int = 7,
+        rotation_deg: Number = 0.0,
+        curvature: float = 0.0,
+        *,
+        squeeze: Number = 1.0,
+        rim: float = 0.0,
+        vignetting: float | tuple[float, float] = 0.0,
+    ) -> "BlurTable":
+        """A lens whose aperture blades leave a polygon open, inscribed in the circle of confusion.
+
+        Args:
+            blades: How many, from 3.
+            rotation_deg: Turns the polygon counter-clockwise, as it shows behind the focus plane; at 0 a corner points
+                up. A float, or a tensor ``[]`` that a gradient is taken to.
+            curvature: 0 for straight blades to 1 for a circle.
+            squeeze: Height of the blur over its width, 2 for a common anamorphic lens; the circle of confusion is the
+                height. A float, or a tensor ``[]`` that a gradient is taken to.
+            rim: How much brighter the blur is at the circle around the opening than in its middle, as that of an
+                over-corrected lens is (spherical aberration); >= -1, and negative where it is darker.
+            vignetting: How much the lens cuts cat's eyes towards the corners of the frame, 0 to 1; with a second
+                number, the radius of its rim over that of the opening (:class:`torchdof.optics.aperture.Aperture`).
+
+        Raises:
+            ValueError: If a number is out of its range.
+
+        Example:
+            >>> BlurTable.polygon(6, rotation_deg=15.0, squeeze=2.0)
+            BlurTable('polygon', disc, 1 node, Aperture(6 blades, turned by 15, squeeze 2))
+        """
+        opening = Aperture(blades, rotation_deg, curvature, squeeze, vignetting=vignetting)
+        return cls._of_rim(rim, "polygon").with_aperture(opening)
+
+    @classmethod
+    def from_aperture(
+        cls,
+        image: Tensor,
+        rotation_deg: Number = 0.0,
+        *,
+        squeeze: Number = 1.0,
+        rim: float = 0.0,
+        vignetting: float | tuple[float, float] = 0.0,
+    ) -> "BlurTable":
+        """A lens with any opening: each point out of focus is drawn as this image, as large as its circle of confusion.
+
+        Args:
+            image: Transmission ``[H, W]`` >= 0, linear, of the square around the opening as it shows behind the focus
+                plane; the longer side spans the circle of confusion. More than 128 pixels are averaged down.
+            rotation_deg: As in :meth:`polygon`.
+            squeeze: As in :meth:`polygon`.
+            rim: As in :meth:`polygon`.
+            vignetting: As in :meth:`polygon`.
+
+        Raises:
+            ValueError: If the image is no transmission, or a number is out of its range.
+
+        Example:
+            >>> BlurTable.from_aperture(torch.eye(9))
+            BlurTable('aperture', disc, 1 node, Aperture(mask 9 x 9))
+        """
+        opening = Aperture(rotation_deg=rotation_deg, squeeze=squeeze, mask=image, vignetting=vignetting)
+        return cls._of_rim(rim, "aperture").with_aperture(opening)
+
+    @classmethod
+    def _of_rim(cls, rim: float, name: str) -> "BlurTable":
+        """An ideal disc, or one whose edge is brighter than its middle."""
+        number("rim", rim)
+        if rim == 0.0:
+            return cls("disc", [1.0], {"radius": [1.0]}, name=name)
+        return cls("softm", [1.0], {"radius": [1.0], "sigma": [0.0], "b": [rim], "m": [_RIM_POWER]}, name=name)
+
+    def with_aperture(self, aperture: Aperture | None) -> "BlurTable":
+        """The same lens with another opening; None leaves it round.
+
+        Example:
+            >>> BlurTable.gaussian().with_aperture(Aperture(blades=5))
+            BlurTable('gaussian', gaussian, 1 node, Aperture(5 blades))
+        """
+        return self.replace(aperture=aperture)
+
+    def replace(self, **changes: Any) -> "BlurTable":
+        """The same table with some arguments of the constructor changed.
+
+        Raises:
+            ValueError: If one is not as described there.
+            TypeError: If a name is unknown.
+        """
+        names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture")
+        kept = {"family": self.family, "coc": self.coc, "params": self._params}
+        return BlurTable(**{**kept, **{name: getattr(self, name) for name in names}, **changes})
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether a gradient is to be taken to the aperture's rotation or squeeze."""
+        return self.aperture is not None and self.aperture.requires_grad
+
     def fingerprint(self) -> str:
         """Hash of all that kernels depend on: tables with the same numbers share it. Kept once it is made.
 
@@ -140,6 +246,7 @@ class BlurTable:
         if self._fingerprint is None:
             facts: list[Any] = [self.family, self.unit, self.sensor_width_mm, self._px_per_unit(1.0), self.coc.tolist()]
             facts += [(name, value.tolist()) for name, value in self._params.items()]
+            facts.append(None if self.aperture is None else self.aperture.to_dict())
             self._fingerprint = hashlib.sha256(repr(facts).encode()).hexdigest()
         return self._fingerprint
 
@@ -180,6 +287,9 @@ class BlurTable:
     def kernels(self, coc_px: Tensor, width: float, size: int | None = None, window: int | None = None) -> Tensor:
         """Kernels at a signed coc: what the PSF does to a picture made of pixels (:mod:`torchdof.optics.psf`).
 
+        They are those of the middle of the frame. In front of the focus plane an opening that is not round shows turned
+        by half.
+
         In focus the kernel is a single pixel, for what is in focus is as sharp in the image as it shall be. Where the
         table has a blur of its own there, that fades in with the square of the coc until ``|coc_px| = 1``.
 
@@ -190,7 +300,8 @@ class BlurTable:
             window: Odd width of the middle part that is wanted, which then holds its share of the light; None is all.
 
         Returns:
-            ``[n, channels, size, size]``, float64, non-negative, each summing to 1. Differentiable in ``coc_px``.
+            ``[n, channels, size, size]``, float64, non-negative, each summing to 1. Differentiable in ``coc_px``, and
+            in the aperture's rotation and squeeze where these are tensors.
 
         Example:
             >>> BlurTable.disc().kernels(torch.tensor([-2.0, 0.0, 2.0]), width=100).shape
@@ -199,7 +310,10 @@ class BlurTable:
         params = self.params(coc_px, width)
         if coc_px.ndim != 1 or not coc_px.numel():
             raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
-        kernels = psf.pixel_kernels(self.family, params, size, window).transpose(0, 1)
+        kernels = psf.pixel_kernels(self.family, params, size, window, self.aperture).transpose(0, 1)
+        if self.aperture is not None and not self.aperture.is_round:
+            behind = (coc_px.detach() >= 0).to(kernels.device)[:, None, None, None]
+            kernels = torch.where(behind, kernels, kernels.flip(-2, -1))
         if all(psf.support(self.family, self._side_params(sign, torch.zeros(1))) == 0.0 for sign in (-1, 1)):
             return kernels
         fade = coc_px.to(torch.float64).square().clamp(max=1.0)[:, None, None, None]
@@ -211,7 +325,7 @@ class BlurTable:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
         number("coc_px", coc_px, unit="pixels")
         signed = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
-        return psf.support(self.family, self.params(signed, width))
+        return psf.support(self.family, self.params(signed, width), self.aperture)
 
     def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
         """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
@@ -234,10 +348,15 @@ class BlurTable:
         """
         signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64)
         params = self.params(signed, width)
-        size = psf.width_of(self.family, params, size)
+        size = psf.width_of(self.family, params, size, self.aperture)
         axis = torch.arange(size, dtype=torch.float64) - size // 2
-        r = torch.hypot(axis[:, None], axis[None, :])
+        opening = self.aperture or Aperture()
+        r = torch.hypot(axis[:, None], axis[None, :] * opening.squeeze)
         texture = psf.profile(self.family, r.flatten(), params).unflatten(-1, (size, size))
+        if not opening.is_round:
+            pixel = 1.0 / psf.opening_radius(self.family, params)
+            shares = opening.shares(size // 2, pixel, pixel * opening.squeeze)
+            texture = texture * (shares if signed >= 0 else shares.flip(-2, -1))
         if self.strength is None:
             return texture
         nearest = (self.coc - signed / self._px_per_unit(width)).abs().argmin()
@@ -285,6 +404,7 @@ class BlurTable:
             "strength": None if self.strength is None else self.strength.tolist(),
             "residual": None if self.residual is None else self.residual.tolist(),
             "provenance": self.provenance,
+            "aperture": None if self.aperture is None else self.aperture.to_dict(),
         }
         return table_file.stamped({k: v for k, v in fields.items() if v is not None})
 
@@ -295,12 +415,16 @@ class BlurTable:
         Raises:
             ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
         """
-        return cls(**table_file.fields_of(data))
+        fields = table_file.fields_of(data)
+        if fields.get("aperture") is not None:
+            fields["aperture"] = Aperture.from_dict(fields["aperture"])
+        return cls(**fields)
 
     def __repr__(self) -> str:
         nodes = f"{len(self.coc)} node{'s' if len(self.coc) > 1 else ''}"
         colours = f", {self.channels} channels" if self.channels > 1 else ""
-        return f"BlurTable({self.name or 'unnamed'!r}, {self.family}, {nodes}{colours})"
+        opening = "" if self.aperture is None else f", {self.aperture!r}"
+        return f"BlurTable({self.name or 'unnamed'!r}, {self.family}, {nodes}{colours}{opening})"
 
     def _px_per_unit(self, width: float) -> float:
         if self.unit == "relative":

@@ -8,8 +8,16 @@ Sign and axis conventions are stated here once; every other module links to this
 * ``coc_px = (A / 2) * F * (1/s - 1/z)`` with ``A`` the aperture diameter [m], ``s`` the focus distance [m] and ``F``
   the image distance over the pixel pitch [px]. For a camera of focal length ``f``, f-number ``n`` and sensor width
   ``w``: ``A = f / n``, image distance ``s f / (s - f)``, pitch ``w / width``.
+* A lens whose axis points ``swing`` to the right and ``tilt`` down, while the sensor stays, is in focus on a plane
+  through the focus distance on the image's axis (Scheimpflug): ``1/s`` above becomes ``1/s + (n_x x + n_y y) / (F f)``,
+  with ``(n_x, n_y) = (sin swing cos tilt, sin tilt)`` and ``(x, y)`` the pixel's place from the image's centre, to the
+  right and down. All such planes of one tilt meet ``f / sin tilt`` below the lens (the hinge). The image distance is
+  that of the lens when it is straight.
+* A range in focus is sharp from end to end; beyond each, blur is that of a lens focused on this end.
 
-Reference: Potmesil and Chakravarty, "A lens and aperture camera model for synthetic image generation", SIGGRAPH 1981.
+Reference:
+    Potmesil and Chakravarty, "A lens and aperture camera model for synthetic image generation", SIGGRAPH 1981.
+    Merklinger, "Focusing the View Camera", 1996 (the hinge rule).
 """
 
 import dataclasses
@@ -23,6 +31,7 @@ from ..validation import floating, is_traced, pixels_wide, real_tensor, show, wh
 
 __all__ = ["CAMERA_NUMBERS", "Camera"]
 
+_MAY_BE_INFINITE = ("focus_m", "focus_range_m")
 CAMERA_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
 
 Number = float | Tensor
@@ -39,9 +48,14 @@ class Camera:
         sensor_width_mm: Width of the part of the sensor that the image shows, in millimetres, > 0.
         focus_breathing: True for a real lens, whose image distance ``s f / (s - f)`` grows (and whose field of view
             narrows) as it focuses nearer. False for the convention of computer graphics, which keeps the field of view.
+        focus_range_m: ``(near, far)``: all between these distances is in focus, and blur grows from there on. It takes
+            the place of ``focus_m``, which becomes the distance halfway in ``1 / z``. None is one distance.
+        tilt_deg: Degrees by which the lens points down, in (-90, 90): with a positive tilt the plane in focus comes
+            nearer towards the bottom of the image, as along the ground. The sensor stays upright.
+        swing_deg: Degrees by which the lens points to the right: focus comes nearer towards the right.
 
     Raises:
-        ValueError: If a number is not positive, or the focus is not beyond the focal length of a breathing lens.
+        ValueError: If a number is out of its range, or the focus is not beyond the focal length of a breathing lens.
 
     Example:
         >>> camera = Camera(focal_length_mm=50.0, f_number=1.8, focus_m=2.0)
@@ -55,8 +69,19 @@ class Camera:
     focus_m: Number = 2.0
     sensor_width_mm: Number = 36.0
     focus_breathing: bool = True
+    focus_range_m: tuple[Number, Number] | None = None
+    tilt_deg: Number = 0.0
+    swing_deg: Number = 0.0
 
     def __post_init__(self) -> None:
+        if self.focus_range_m is not None:
+            near, far = _checked_range(self.focus_range_m)
+            object.__setattr__(self, "focus_range_m", (near, far))
+            dioptres = 1.0 / near + 1.0 / far
+            halfway = 2.0 / dioptres if isinstance(dioptres, Tensor) or dioptres > 0 else math.inf
+            object.__setattr__(self, "focus_m", halfway)
+        for name in ("tilt_deg", "swing_deg"):
+            _check_angle(name, getattr(self, name))
         for name in CAMERA_NUMBERS:
             value = getattr(self, name)
             _check_number(name, value)
@@ -142,20 +167,39 @@ class Camera:
         known = z > 0
         z = torch.where(known, z, 1.0)
         scale = _column(self.aperture_radius_m * self.focal_px(width), z)
-        s = _column(self.focus_m, z)
-        both_finite = torch.isfinite(z) & torch.isfinite(s)
-        z_safe = torch.where(both_finite, z, 1.0)
-        s_safe = torch.where(both_finite, s, 1.0)
-        dioptres = torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
+        shift = self._tilted_dioptres(z, width)
+        if self.focus_range_m is None:
+            dioptres = _dioptres_behind(z, _column(self.focus_m, z)) + shift
+        else:
+            near, far = (_dioptres_behind(z, _column(end, z)) + shift for end in self.focus_range_m)
+            dioptres = near.clamp(max=0.0) + far.clamp_min(0.0)
         return torch.where(known, scale * dioptres, torch.nan)
+
+    def _tilted_dioptres(self, depth: Tensor, width: int) -> Tensor | float:
+        """What a tilted lens adds to the inverse of the focus distance at each pixel ``[B, 1, H, W]``, in 1/m."""
+        tilt, swing = self.tilt_deg, self.swing_deg
+        if not isinstance(tilt, Tensor) and not isinstance(swing, Tensor) and tilt == swing == 0.0:
+            return 0.0
+        tilt, swing = (torch.deg2rad(_column(angle, depth)) for angle in (tilt, swing))
+        rows, columns = (
+            torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 - n / 2 for n in depth.shape[-2:]
+        )
+        pitch = width / depth.shape[-1] / _column(self.focal_px(width), depth)  # of the map, at a distance of 1
+        along = torch.sin(swing) * torch.cos(tilt) * columns + torch.sin(tilt) * rows[:, None]
+        return along * pitch / _column(self.focal_length_mm / 1000.0, depth)
 
     def replace(self, **changes: Any) -> "Camera":
         """The same camera with some numbers changed; names are those of the constructor.
 
         Raises:
-            ValueError: If a new number is outside its range.
+            ValueError: If a new number is outside its range, or a focus distance is given where a range is in focus.
             TypeError: If a name is unknown.
         """
+        if "focus_m" in changes and changes.get("focus_range_m", self.focus_range_m) is not None:
+            raise ValueError(
+                "focus_m is told by the camera's focus_range_m, got focus_m as well; "
+                "change focus_range_m, or take it away with camera.replace(focus_range_m=None)"
+            )
         return dataclasses.replace(self, **changes)
 
     def focus_at(self, depth: Tensor, x: float, y: float, patch: int = 5) -> "Camera":
@@ -174,9 +218,7 @@ class Camera:
         Raises:
             ValueError: If the pixel lies outside the frame or the patch holds no valid depth.
         """
-        real_tensor("depth", depth, "[B, 1, H, W] in metres")
-        if depth.ndim != 4 or depth.shape[1] != 1 or not depth.numel():
-            raise ValueError(f"depth must be [B, 1, H, W] in metres, got {list(depth.shape)}")
+        _check_map("depth", depth)
         whole("patch", patch, 1, 2**31)
         for value in (x, y):
             if isinstance(value, bool) or not isinstance(value, int | float):
@@ -185,16 +227,86 @@ class Camera:
         if not (0 <= x < width and 0 <= y < height):
             raise ValueError(f"focus point ({x}, {y}) must lie in the frame of {width} x {height} pixels (x, y)")
         column, row, reach = int(x), int(y), patch // 2
-        window = depth[
-            :, 0, max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1
-        ].flatten(1)
+        weight = torch.zeros_like(depth[:1])
+        weight[..., max(0, row - reach) : row + reach + 1, max(0, column - reach) : column + reach + 1] = 1.0
+        return self._focused(depth, weight, f"within {reach} pixels of ({x}, {y}); choose another focus point")
+
+    def focus_on(self, depth: Tensor, focus_mask: Tensor) -> "Camera":
+        """This camera focused on a subject: on the median of its depths, each weighted by the mask.
+
+        Args:
+            depth: ``[B, 1, H, W]``, metres; what is not > 0 is left out.
+            focus_mask: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, >= 0: how much each pixel is the subject's.
+
+        Returns:
+            A camera with that ``focus_m``: a float for one item, else ``[B]``.
+
+        Raises:
+            ValueError: If the shapes are not as described, or the subject has no valid depth.
+
+        Example:
+            >>> depth = torch.tensor([1.0, 1.2, 1.4, 6.0]).reshape(1, 1, 1, 4)
+            >>> round(Camera().focus_on(depth, depth < 2).focus_m, 3)
+            1.2
+        """
+        _check_map("depth", depth)
+        mask = focus_mask.to(depth.dtype) if isinstance(focus_mask, Tensor) else focus_mask
+        _check_map("focus_mask", mask)
+        if mask.shape[0] not in (1, depth.shape[0]) or mask.shape[1:] != depth.shape[1:]:
+            raise ValueError(f"focus_mask must have the depth's shape {list(depth.shape)}, got {list(mask.shape)}")
+        if not bool((mask >= 0).all()):
+            raise ValueError("focus_mask must be >= 0 everywhere")
+        return self._focused(depth, mask, "where focus_mask is above 0")
+
+    def focus_in(self, depth: Tensor, box: tuple[float, float, float, float]) -> "Camera":
+        """This camera focused on what fills a box, as autofocus does: the median, weighted towards the box's middle.
+
+        Weights fall as a Gaussian whose standard deviation is half the box's half sides.
+
+        Args:
+            depth: ``[B, 1, H, W]``, metres; what is not > 0 is left out.
+            box: ``(left, top, right, bottom)`` in pixels from the frame's top left corner.
+
+        Returns:
+            A camera with that ``focus_m``: a float for one item, else ``[B]``.
+
+        Raises:
+            ValueError: If the box holds no pixel's centre, or no valid depth.
+        """
+        _check_map("depth", depth)
+        if len(box) != 4 or any(isinstance(v, bool) or not isinstance(v, int | float) for v in box):
+            raise ValueError(f"box must be (left, top, right, bottom) in pixels, got {show(box)}")
+        weights = []
+        for low, high, size in ((box[1], box[3], depth.shape[-2]), (box[0], box[2], depth.shape[-1])):
+            place = torch.arange(size, dtype=depth.dtype, device=depth.device) + 0.5
+            within = (place >= low) & (place <= high)
+            if not bool(within.any()):
+                raise ValueError(
+                    f"box must be (left, top, right, bottom) and hold pixels of the frame of {depth.shape[-1]} x "
+                    f"{depth.shape[-2]}, got {show(box)}"
+                )
+            away = (place - (low + high) / 2) / max((high - low) / 4, 1e-3)
+            weights.append(torch.where(within, torch.exp(-0.5 * away.square()), 0.0))
+        return self._focused(depth, (weights[0][:, None] * weights[1])[None, None], f"in the box {show(box)}")
+
+    def _focused(self, depth: Tensor, weight: Tensor, where: str) -> "Camera":
+        """This camera with the weighted median of the distances that would bring each pixel into focus."""
+        distance = depth
+        far = dataclasses.replace(self, focus_m=math.inf, focus_range_m=None)
+        shift = far._tilted_dioptres(depth, int(depth.shape[-1]))
+        if isinstance(shift, Tensor):  # smaller by 1 - f / s where the lens breathes
+            breathing = 1.0 - _column(self.focal_length_mm / 1000.0, depth) * shift if self.focus_breathing else 1.0
+            distance = breathing / (1.0 / depth - shift)
         medians = []
-        for values in window:
-            valid = values[values > 0]
-            if valid.numel() == 0:
-                raise ValueError(f"no valid depth within {reach} pixels of ({x}, {y}); choose another focus point")
-            medians.append(valid.median())
-        return self.replace(focus_m=float(medians[0]) if len(medians) == 1 else torch.stack(medians))
+        for values, share, valid in zip(distance, weight.expand(depth.shape), depth > 0, strict=True):
+            counts = valid & (share > 0)
+            if not bool(counts.any()):
+                raise ValueError(f"no valid depth {where}")
+            medians.append(_weighted_median(values[counts], share[counts]))
+        if not all(float(median) > 0 for median in medians):
+            raise ValueError(f"no focus brings the depth {where} onto the tilted plane; tilt less")
+        focus_m = float(medians[0]) if len(medians) == 1 else torch.stack(medians)
+        return self.replace(focus_m=focus_m)
 
     def hyperfocal_m(self, coc_px: float, width: int) -> Number:
         """Nearest focus distance at which infinity is still acceptably sharp.
@@ -221,22 +333,45 @@ class Camera:
             width: Width of the image in pixels.
 
         Returns:
-            ``(near, far)`` in metres, floats or ``[B]``; far is ``inf`` at and beyond the hyperfocal distance.
+            ``(near, far)`` in metres on the image's axis, floats or ``[B]``; far is ``inf`` at and beyond the
+            hyperfocal distance.
         """
         _check_number("coc_px", coc_px)
         scale = self.aperture_radius_m * self.focal_px(width)
         dioptres = coc_px / scale if isinstance(scale, Tensor) or scale > 0 else math.inf
-        near, far = 1.0 / (1.0 / self.focus_m + dioptres), 1.0 / self.focus_m - dioptres
+        nearest, farthest = self.focus_range_m or (self.focus_m, self.focus_m)
+        near, far = 1.0 / (1.0 / nearest + dioptres), 1.0 / farthest - dioptres
         if isinstance(far, Tensor):
             return near, torch.where(far > 0, 1.0 / far, torch.inf)
         return near, 1.0 / far if far > 0 else math.inf
 
     def __repr__(self) -> str:
-        numbers = [f"{_show(self.focal_length_mm)} mm", f"f/{_show(self.f_number)}", f"focus {_show(self.focus_m)} m"]
+        focus = _show(self.focus_m)
+        if self.focus_range_m is not None:
+            focus = " to ".join(_show(end) for end in self.focus_range_m)
+        numbers = [f"{_show(self.focal_length_mm)} mm", f"f/{_show(self.f_number)}", f"focus {focus} m"]
         numbers.append(f"sensor {_show(self.sensor_width_mm)} mm")
         if not self.focus_breathing:
             numbers.append("fixed field of view")
+        for name, angle in (("tilt", self.tilt_deg), ("swing", self.swing_deg)):
+            if isinstance(angle, Tensor) or angle != 0.0:
+                numbers.append(f"{name} {_show(angle)} degrees")
         return f"Camera({', '.join(numbers)})"
+
+
+def _dioptres_behind(z: Tensor, s: Tensor) -> Tensor:
+    """``1/s - 1/z``, exactly 0 at ``z = s``, for finite and infinite distances."""
+    both_finite = torch.isfinite(z) & torch.isfinite(s)
+    z_safe = torch.where(both_finite, z, 1.0)
+    s_safe = torch.where(both_finite, s, 1.0)
+    return torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
+
+
+def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:
+    """The value ``[]`` up to which half of the weights of values ``[n]`` lie."""
+    values, order = values.sort()
+    summed = weights[order].double().cumsum(0)
+    return values[int((summed >= 0.5 * summed[-1]).nonzero()[0])]
 
 
 def _largest(value: Number) -> float:
@@ -265,10 +400,46 @@ def _check_number(name: str, value: Number) -> None:
     else:
         raise ValueError(f"{name} must be a float or a floating-point tensor [B], got {type(value).__name__}")
     if not good and not isinstance(value, Tensor):
-        raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {show(value)}")
+        raise ValueError(
+            f"{name} must be positive{'' if name in _MAY_BE_INFINITE else ' and finite'}, got {show(value)}"
+        )
     # compared, not asked for: in compiled code a number that differs between two cameras is a variable
-    if not good or (name != "focus_m" and (_largest(value) if isinstance(value, Tensor) else value) == math.inf):
-        raise ValueError(f"{name} must be positive{'' if name == 'focus_m' else ' and finite'}, got {_show(value)}")
+    if not good or (
+        name not in _MAY_BE_INFINITE and (_largest(value) if isinstance(value, Tensor) else value) == math.inf
+    ):
+        raise ValueError(
+            f"{name} must be positive{'' if name in _MAY_BE_INFINITE else ' and finite'}, got {_show(value)}"
+        )
+
+
+def _check_angle(name: str, value: Number) -> None:
+    """Refuse an angle that is none, or turns the lens away."""
+    shaped = isinstance(value, Tensor) and value.ndim <= 1 and floating(value) and value.numel() > 0
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    if not shaped and not plain:
+        raise ValueError(f"{name} must be degrees, a float or a floating-point tensor [B], got {show(value)}")
+    if not is_traced() and not bool((torch.as_tensor(value).detach().abs() < 90.0).all()):
+        raise ValueError(f"{name} must be in (-90, 90) degrees, got {_show(value)}")
+
+
+def _checked_range(value: Any) -> tuple[Number, Number]:
+    """The ends of a range in focus, or a refusal."""
+    if not isinstance(value, tuple | list) or len(value) != 2:
+        raise ValueError(f"focus_range_m must be (near, far) in metres, got {show(value)}")
+    near, far = value
+    for end in (near, far):
+        _check_number("focus_range_m", end)
+    if not is_traced() and not bool((torch.as_tensor(near).detach() <= torch.as_tensor(far).detach()).all()):
+        raise ValueError(f"focus_range_m must go from near to far, got ({_show(near)}, {_show(far)})")
+    return near, far
+
+
+def _check_map(name: str, value: Any) -> None:
+    """Refuse what is no map ``[B, 1, H, W]``."""
+    real_tensor(name, value, "[B, 1, H, W]" + (" in metres" if name == "depth" else ""))
+    if value.ndim != 4 or value.shape[1] != 1 or not value.numel():
+        unit = " in metres" if name == "depth" else ""
+        raise ValueError(f"{name} must be [B, 1, H, W]{unit}, got {list(value.shape)}")
 
 
 def _column(value: Number, like: Tensor) -> Tensor:

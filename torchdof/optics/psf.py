@@ -19,6 +19,12 @@ round. A cell's integral is exact for ``gaussian`` and ``disc``. For the others 
 by circles into thin slices, the area of each slice is exact (circle against square), and within a slice ``f`` is
 replaced by its mean over r, which has a closed form for every family.
 
+An aperture (:mod:`torchdof.optics.aperture`) multiplies the profile. The circle around the opening has the radius
+``radius``, ``2 sigma`` of a ``gaussian`` or ``r_c + 2 sigma`` of a ``ring``, and what of the profile lies outside of
+the opening is cut off. What a ``disc`` puts into a cell is the opening's area there. For the other families each cell
+(a ninth of it, in a kernel of up to 64 cells a side) holds the profile's mean in it times its open area. A squeeze
+makes the cells wider, as seen from a lens that is round.
+
 Reference:
     Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
     of the Optical Society of America A 4(12), 1987 (the spectrum).
@@ -35,9 +41,21 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..validation import WHOLE_NUMBERS, real_tensor, show
+from .aperture import Aperture
 from .kernel_cache import KernelCache
 
-__all__ = ["FAMILIES", "disc", "gaussian", "profile", "radial", "pixel_kernels", "ring", "softm", "support"]
+__all__ = [
+    "FAMILIES",
+    "disc",
+    "gaussian",
+    "opening_radius",
+    "profile",
+    "radial",
+    "pixel_kernels",
+    "ring",
+    "softm",
+    "support",
+]
 
 FAMILIES: dict[str, tuple[str, ...]] = {
     "gaussian": ("sigma",),
@@ -58,6 +76,8 @@ _LARGEST = 2**16 + 1  # px; a kernel that wide takes 34 GB
 _ALWAYS_WHOLE = 256  # px on each side of the centre; a kernel up to there is computed whole, whatever its window
 _AT_ONCE = 2**20  # slices computed together
 _CELLS = 16  # cells from the centre to the end of a PSF that is so many pixels large or smaller
+_PARTS = 3  # of a cell along each axis, where an opening cuts the profile of a kernel that is not large
+_MASS_CELLS = 60  # cells on each side over which the light of a large shaped kernel is summed
 _AROUND = 2  # pixels around a kernel on which its values depend
 _quadrants = KernelCache(64 * 2**20)
 _RINGS = 2**14  # the whole of a larger kernel is summed in so many; agrees with its pixels' sum to 1e-6
@@ -162,7 +182,11 @@ def radial(values: Tensor, radius: Number, size: int | None = None) -> Tensor:
 
 
 def pixel_kernels(
-    family: str, params: Mapping[str, Number], size: int | None = None, window: int | None = None
+    family: str,
+    params: Mapping[str, Number],
+    size: int | None = None,
+    window: int | None = None,
+    aperture: Aperture | None = None,
 ) -> Tensor:
     """Kernel of a family by name: what its PSF does to a picture made of pixels.
 
@@ -172,9 +196,11 @@ def pixel_kernels(
             broadcast against each other.
         size: Odd width of the kernel; None takes the smallest that holds the largest kernel asked for.
         window: Odd width of the middle part that is wanted; None is all. Only that is computed of a large kernel.
+        aperture: The opening that the profile is multiplied by; None is a round one.
 
     Returns:
-        ``[..., size, size]``, float64, non-negative, each kernel summing to 1. What lies beyond ``size`` is cut off.
+        ``[..., size, size]``, float64, non-negative, each kernel summing to 1, as behind the focus plane. What lies
+        beyond ``size`` is cut off.
         With a smaller ``window``, that part of it: ``[..., window, window]``, summing to its share of the light.
 
     Raises:
@@ -182,19 +208,25 @@ def pixel_kernels(
     """
     checked = _checked(family, params)
     if window is None:
-        whole = part = width_of(family, checked, size) // 2
+        whole = part = width_of(family, checked, size, aperture) // 2
     else:
-        whole = half_width(support(family, checked)) if size is None else width_of(family, checked, size) // 2
+        reach_px = support(family, checked, aperture)
+        whole = half_width(reach_px) if size is None else width_of(family, checked, size) // 2
         part = min(whole, width_of(family, checked, window) // 2)
     half = whole if whole <= _ALWAYS_WHOLE else part
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in checked.items()}
-    reach = _reach(family, lengths)
-    cell = (reach / _CELLS).clamp(max=1.0)
-    in_cells = {k: v / cell if k in LENGTHS else v for k, v in lengths.items()}
-    farthest = math.ceil(min(float(reach.detach().max()), half + _AROUND))  # pixels, which are cells in large kernels
-    cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, whole))
-    kernel = _settled(_interpolated(cells, cell, half + _AROUND))[..., _AROUND:-_AROUND, _AROUND:-_AROUND]
-    total = kernel.sum((-2, -1), keepdim=True) if half == whole else _mass(family, in_cells, whole)[..., None, None]
+    reach = _reach(family, lengths, aperture)
+    squeeze = 1.0 if aperture is None else aperture.squeeze
+    high, wide = (reach / _CELLS).clamp(max=1.0), (reach / squeeze / _CELLS).clamp(max=1.0)  # of a cell, in pixels
+    in_cells = {k: v / high if k in LENGTHS else v for k, v in lengths.items()}
+    aspect = None if aperture is None else wide * squeeze / high  # of a cell, as seen from a lens that is round
+    farthest = math.ceil(min(support(family, lengths, aperture), half + _AROUND))  # px, which are cells if many
+    cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, whole, aperture, aspect))
+    kernel = _settled(_interpolated(cells, high, wide, half + _AROUND))[..., _AROUND:-_AROUND, _AROUND:-_AROUND]
+    if half == whole:
+        total = kernel.sum((-2, -1), keepdim=True)
+    else:
+        total = _mass(family, in_cells, whole, aperture, aspect)[..., None, None]
     centre = torch.zeros_like(kernel)
     centre[..., half, half] = 1.0
     # too small to hold any light in float64, or all of it beyond size: a single pixel
@@ -236,19 +268,20 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
     return torch.where(r <= radius, mixed, 0.0)
 
 
-def support(family: str, params: Mapping[str, Number]) -> float:
+def support(family: str, params: Mapping[str, Number], aperture: Aperture | None = None) -> float:
     """Radius in pixels beyond which a kernel holds less than 4e-6 of its light (for the largest parameters given)."""
-    return float(_reach(family, _checked(family, params)).detach().max())
+    reach = float(_reach(family, _checked(family, params), aperture).detach().max())
+    return reach if aperture is None else reach * aperture.widest
 
 
-def width_of(family: str, params: Mapping[str, Number], size: int | None) -> int:
+def width_of(family: str, params: Mapping[str, Number], size: int | None, aperture: Aperture | None = None) -> int:
     """Width in pixels of kernels: ``size`` if that is one, else the smallest that holds the largest kernel.
 
     Raises:
         ValueError: If the size is not odd and positive, or the kernel would be too wide.
     """
     if size is None:
-        size = 2 * half_width(support(family, params)) + 1
+        size = 2 * half_width(support(family, params, aperture)) + 1
         if size > _LARGEST:
             raise ValueError(
                 f"a kernel must be at most {_LARGEST} pixels wide, got parameters that need {size}; state its size"
@@ -302,8 +335,10 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
     return torch.tensor(value, dtype=torch.float64, device=device)
 
 
-def _reach(family: str, params: Mapping[str, Tensor]) -> Tensor:
-    """Radius beyond which a profile holds next to no light, in the unit of its lengths: ``[...]``."""
+def _reach(family: str, params: Mapping[str, Tensor], aperture: Aperture | None = None) -> Tensor:
+    """Radius beyond which a profile holds next to no light, in the unit of its lengths, without squeeze: ``[...]``."""
+    if aperture is not None and not aperture.is_round:
+        return opening_radius(family, params)
     if family == "gaussian":
         return 5.0 * params["sigma"]
     if family == "ring":
@@ -313,22 +348,54 @@ def _reach(family: str, params: Mapping[str, Tensor]) -> Tensor:
     return params["radius"]
 
 
+def opening_radius(family: str, params: Mapping[str, Tensor]) -> Tensor:
+    """Radius of the circle around the opening that a profile is multiplied by, in the unit of its lengths."""
+    if family == "gaussian":
+        return 2.0 * params["sigma"]  # the disc of the same second moment
+    return params["r_c"] + 2.0 * params["sigma"] if family == "ring" else params["radius"]
+
+
 def _tilt(r: Tensor, params: Mapping[str, Tensor]) -> Tensor:
     farthest = torch.exp(_TILT_EXPONENT / params["m"].detach().clamp_min(1.0))  # a larger power would overflow
     return (1.0 + params["b"] * torch.minimum(r / params["radius"], farthest) ** params["m"]).clamp_min(0.0)
 
 
-def _cells(family: str, lengths: Mapping[str, Tensor], half: int, whole: int) -> Tensor:
-    """Integral of a profile over each square cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``.
+def _cells(
+    family: str,
+    lengths: Mapping[str, Tensor],
+    half: int,
+    whole: int,
+    aperture: Aperture | None = None,
+    aspect: Tensor | None = None,
+) -> Tensor:
+    """Integral of a PSF over each cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``, but for a factor.
 
-    They are the middle of a PSF that reaches ``whole`` pixels.
+    They are the middle of a PSF that reaches ``whole`` pixels. Cells are ``aspect`` times as wide as high.
     """
+    slices = 16 if whole <= 64 else 8
+    if aperture is None or aperture.is_round:
+        return _round_cells(family, lengths, half, slices, aspect)
+    radius = opening_radius(family, lengths)
+    if family == "disc":
+        return aperture.shares(half, 1.0 / radius, aspect / radius)
+    count = _PARTS if half <= _CACHED_HALF_WIDTH else 1
+    fine = count * half + count // 2
+    in_parts = {k: v * count if k in LENGTHS else v for k, v in lengths.items()}
+    light = _round_cells(family, in_parts, fine, slices // count, aspect)
+    lit = _round_cells("disc", {"radius": _reach(family, in_parts)}, fine, slices, aspect)  # where the profile has any
+    share = aperture.shares(fine, 1.0 / (count * radius), aspect / (count * radius))
+    parts = torch.where(lit > 0, light / torch.where(lit > 0, lit, 1.0), 0.0) * share
+    return parts.unflatten(-1, (-1, count)).unflatten(-3, (-1, count)).mean((-3, -1))
+
+
+def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, slices: int, aspect: Tensor | None) -> Tensor:
+    """Integral of a profile over each cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``."""
     if family == "gaussian":
-        quadrant = _gaussian_quadrant(lengths["sigma"], half)
+        quadrant = _gaussian_quadrant(lengths["sigma"], half, aspect)
     elif family == "disc":
-        quadrant = _disc_quadrant(lengths["radius"], half)
+        quadrant = _disc_quadrant(lengths["radius"], half, aspect)
     else:
-        quadrant = _sliced_quadrant(family, lengths, half, slices=16 if whole <= 64 else 8)
+        quadrant = _sliced_quadrant(family, lengths, half, slices, aspect)
     cells = torch.cat([quadrant[..., 1:, :].flip(-2), quadrant], -2)
     return torch.cat([cells[..., 1:].flip(-1), cells], -1)
 
@@ -342,21 +409,24 @@ def _sharpened(cells: Tensor) -> Tensor:
     return cells
 
 
-def _interpolated(cells: Tensor, cell: Tensor, half: int) -> Tensor:
+def _interpolated(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tensor:
     """Integrals of a PSF with the interpolator of each pixel: ``[..., 2 half + 1, 2 half + 1]``.
 
     The PSF is given in cells ``[..., n, n]`` of so many pixels ``[...]``. A pixel is at most twice what linear
     interpolation would give it, which leaves out the interpolator's ripples where the PSF has no light.
     """
     n = cells.shape[-1] // 2
-    if bool((cell == 1.0).all()):  # an interpolator is 0 at other pixels
+    if bool((high == 1.0).all() and (wide == 1.0).all()):  # an interpolator is 0 at other pixels
         return functional.pad(cells, (half - n,) * 4)
     pixel = torch.arange(-half, half + 1, dtype=torch.float64, device=cells.device)[:, None]
-    place = cell[..., None, None] * torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
-    away = (pixel - place).abs()  # [..., pixels, cells]
-    spline, line = _cardinal_spline(away), (1.0 - away).clamp_min(0.0)
-    at_most = 2.0 * (line @ cells @ line.transpose(-2, -1)).clamp_min(0.0)
-    return torch.minimum(spline @ cells @ spline.transpose(-2, -1), at_most)
+    splines, lines = [], []
+    for cell in (high, wide):
+        place = cell[..., None, None] * torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
+        away = (pixel - place).abs()  # [..., pixels, cells]
+        splines.append(_cardinal_spline(away))
+        lines.append((1.0 - away).clamp_min(0.0))
+    at_most = 2.0 * (lines[0] @ cells @ lines[1].transpose(-2, -1)).clamp_min(0.0)
+    return torch.minimum(splines[0] @ cells @ splines[1].transpose(-2, -1), at_most)
 
 
 def _cardinal_spline(t: Tensor) -> Tensor:
@@ -393,27 +463,34 @@ def _neighbours(values: Tensor) -> Tensor:
     return rows[..., :-2, :] + rows[..., 2:, :] + columns[..., :-2] + columns[..., 2:]
 
 
-def _gaussian_quadrant(sigma: Tensor, half: int) -> Tensor:
-    """Integral of a Gaussian over each pixel right of and below its centre: ``[..., half + 1, half + 1]``."""
+def _gaussian_quadrant(sigma: Tensor, half: int, aspect: Tensor | None = None) -> Tensor:
+    """Integral of a Gaussian over each cell right of and below its centre: ``[..., half + 1, half + 1]``."""
+    down = _gaussian_line(sigma, half)
+    across = down if aspect is None else _gaussian_line(sigma / aspect, half)
+    return down.unsqueeze(-1) * across.unsqueeze(-2)
+
+
+def _gaussian_line(sigma: Tensor, half: int) -> Tensor:
+    """Integral of a Gaussian over each unit step from its centre on: ``[..., half + 1]``."""
     edges = torch.arange(half + 2, dtype=torch.float64, device=sigma.device) - 0.5
     cumulative = torch.erf(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
     tail = torch.erfc(edges / (math.sqrt(2) * sigma.unsqueeze(-1)))
     # erf loses the tail, erfc the centre: each where it is exact
-    line = torch.where(edges[:-1] < 1.0, cumulative[..., 1:] - cumulative[..., :-1], tail[..., :-1] - tail[..., 1:])
-    return line.unsqueeze(-1) * line.unsqueeze(-2)
+    return torch.where(edges[:-1] < 1.0, cumulative[..., 1:] - cumulative[..., :-1], tail[..., :-1] - tail[..., 1:])
 
 
-def _disc_quadrant(radius: Tensor, half: int) -> Tensor:
-    """Area of a disc in each pixel right of and below its centre, ``[..., half + 1, half + 1]``, each axis included."""
+def _disc_quadrant(radius: Tensor, half: int, aspect: Tensor | None = None) -> Tensor:
+    """Area of a disc in each cell right of and below its centre, ``[..., half + 1, half + 1]``, each axis included."""
     radius = radius[..., None, None]
     index = torch.arange(half + 1, dtype=torch.float64, device=radius.device)
     edge = torch.cat([index.new_zeros(1), index + 0.5])
-    covered = _corner_area(edge[None, :], edge[:, None], radius).diff(dim=-1).diff(dim=-2).clamp_min(0.0)
-    width = edge.diff()
+    across = edge if aspect is None else edge * aspect[..., None]  # [..., half + 2]
+    covered = _corner_area(across[..., None, :], edge[:, None], radius).diff(dim=-1).diff(dim=-2).clamp_min(0.0)
+    width, breadth = edge.diff(), across.diff()
     # outside and inside the circle without the rounding of differences
-    nearest = torch.hypot(edge[:-1, None], edge[None, :-1])
-    farthest = torch.hypot(edge[1:, None], edge[None, 1:])
-    covered = torch.where(farthest <= radius, width[:, None] * width[None, :], covered)
+    nearest = torch.hypot(edge[:-1, None], across[..., None, :-1])
+    farthest = torch.hypot(edge[1:, None], across[..., None, 1:])
+    covered = torch.where(farthest <= radius, width[:, None] * breadth[..., None, :], covered)
     return torch.where(nearest < radius, covered, 0.0) * _twice(index)
 
 
@@ -423,30 +500,50 @@ def _twice(index: Tensor) -> Tensor:
     return twice[:, None] * twice[None, :]
 
 
-def _sliced_quadrant(family: str, lengths: Mapping[str, Tensor], half: int, slices: int) -> Tensor:
+def _sliced_quadrant(
+    family: str, lengths: Mapping[str, Tensor], half: int, slices: int, aspect: Tensor | None = None
+) -> Tensor:
     """Integral of any profile over each cell right of and below its centre, cut by circles into thin slices."""
     rows = max(1, _AT_ONCE // ((half + 1) * slices))
     strips = []
     for top in range(0, half + 1, rows):
         part = (half, slices, top, min(top + rows, half + 1))
-        cut = functools.partial(_cut_quadrant, *part)
-        parts = _quadrants.get(part, cut) if half <= _CACHED_HALF_WIDTH else cut()
+        if aspect is None:
+            cut = functools.partial(_cut_quadrant, *part)
+            parts = _quadrants.get(part, cut) if half <= _CACHED_HALF_WIDTH else cut()
+        else:
+            parts = _slices(*part, aspect)
         inner, outer, area = (t.to(lengths[FAMILIES[family][-1]].device) for t in parts)
         strips.append((_slice_means(family, lengths, inner, outer) * area).sum(-1).unflatten(-1, (-1, half + 1)))
     return torch.cat(strips, -2)
 
 
-def _mass(family: str, lengths: Mapping[str, Tensor], half: int) -> Tensor:
-    """Sum over the pixels of a kernel with so many of them on each side of its centre, from rings: ``[...]``."""
-    reach = _reach(family, lengths)
-    side = torch.full_like(reach, half + 0.5)
+def _mass(
+    family: str,
+    lengths: Mapping[str, Tensor],
+    half: int,
+    aperture: Aperture | None = None,
+    aspect: Tensor | None = None,
+) -> Tensor:
+    """Sum over the pixels of a kernel with so many of them on each side of its centre, from rings: ``[...]``.
+
+    That of a shaped one is summed over coarser cells.
+    """
+    side = torch.full_like(_reach(family, lengths), half + 0.5)
+    if aperture is not None and not aperture.is_round:
+        pixels = (half + 0.5) / (_MASS_CELLS + 0.5)  # of a coarser cell
+        coarse = {k: v / pixels if k in LENGTHS else v for k, v in lengths.items()}
+        return _cells(family, coarse, _MASS_CELLS, half, aperture, aspect).sum((-2, -1)) * pixels**2
+    across = side if aspect is None else side * aspect
     if family == "gaussian":
-        return (2.0 * torch.erf(side / (math.sqrt(2) * lengths["sigma"]))) ** 2
+        root = math.sqrt(2) * lengths["sigma"]
+        return 4.0 * torch.erf(side / root) * torch.erf(across / root)
     if family == "disc":
-        return 4.0 * _corner_area(side, side, lengths["radius"])
+        return 4.0 * _corner_area(across, side, lengths["radius"])
+    reach = _reach(family, lengths)
     share = torch.linspace(0.0, 1.0, _RINGS + 1, dtype=torch.float64, device=reach.device)
-    r = torch.minimum(2.0 * reach, math.sqrt(2) * side).detach()[..., None, None] * share  # [..., 1, rings]
-    area = 4.0 * _corner_area(side[..., None, None], side[..., None, None], r).diff(dim=-1)
+    r = torch.minimum(2.0 * reach, torch.hypot(side, across)).detach()[..., None, None] * share  # [..., 1, rings]
+    area = 4.0 * _corner_area(across[..., None, None], side[..., None, None], r).diff(dim=-1)
     return (_slice_means(family, lengths, r[..., :-1], r[..., 1:]) * area).sum((-2, -1))
 
 
@@ -492,13 +589,19 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
 
 @torch.inference_mode(False)  # what is kept must serve autograd as well
 def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Slices of the pixels of a quadrant's rows: inner and outer radius and area, each ``[pixels, slices]``."""
-    index = torch.arange(half + 1, dtype=torch.float64)
+    """Slices of the square cells of a quadrant's rows."""
+    return _slices(half, slices, top, bottom, torch.ones((), dtype=torch.float64))
+
+
+def _slices(half: int, slices: int, top: int, bottom: int, aspect: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Slices of the cells of a quadrant's rows: inner and outer radius and area, each ``[..., cells, slices]``."""
+    index = torch.arange(half + 1, dtype=torch.float64, device=aspect.device)
     low, high = (index - 0.5).clamp_min(0.0), index + 0.5
     low_y, low_x = (v.flatten()[:, None] for v in torch.meshgrid(low[top:bottom], low, indexing="ij"))
     high_y, high_x = (v.flatten()[:, None] for v in torch.meshgrid(high[top:bottom], high, indexing="ij"))
+    low_x, high_x = (v * aspect[..., None, None] for v in (low_x, high_x))
     nearest, farthest = torch.hypot(low_y, low_x), torch.hypot(high_y, high_x)
-    fractions = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64)
+    fractions = torch.linspace(0.0, 1.0, slices + 1, dtype=torch.float64, device=aspect.device)
     r = nearest + (farthest - nearest) * fractions
     covered = (
         _corner_area(high_x, high_y, r)
@@ -507,7 +610,7 @@ def _cut_quadrant(half: int, slices: int, top: int, bottom: int) -> tuple[Tensor
         + _corner_area(low_x, low_y, r)
     )
     covered = covered * _twice(index)[top:bottom].flatten()[:, None]
-    return r[:, :-1].contiguous(), r[:, 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
+    return r[..., :-1].contiguous(), r[..., 1:].contiguous(), covered.diff(dim=-1).clamp_min(0.0)
 
 
 def _corner_area(x: Tensor, y: Tensor, r: Tensor) -> Tensor:

@@ -12,11 +12,12 @@ from ..validation import show
 __all__ = ["fields_of", "find", "read", "shipped", "stamped", "write"]
 
 SCHEMA = "torchdof/blur-table"
-VERSION = 1
+VERSION = 2
+READABLE = (1, 2)  # the first knows no aperture
 _SHIPPED = Path(__file__).parent / "tables"
 _REQUIRED = ("family", "unit", "coc", "params")
-_KNOWN = {*_REQUIRED, "schema", "version", "name", "sensor_width_mm", "strength", "residual", "provenance"}
-_KINDS = {"family": str, "unit": str, "params": dict, "name": str, "provenance": dict}
+_KNOWN = {*_REQUIRED, "schema", "version", "name", "sensor_width_mm", "strength", "residual", "provenance", "aperture"}
+_KINDS = {"family": str, "unit": str, "params": dict, "name": str, "provenance": dict, "aperture": dict}
 
 
 def find(source: str | os.PathLike[str]) -> Path:
@@ -81,8 +82,9 @@ def fields_of(data: Any) -> dict[str, Any]:
         raise ValueError(f"a blur table must be a JSON object, got {type(data).__name__}")
     if not isinstance(data.get("schema"), str) or data["schema"] != SCHEMA:
         raise ValueError(f"schema must be {SCHEMA!r}, got {show(data.get('schema'))}; is this a blur table?")
-    if not isinstance(data.get("version"), int) or data["version"] != VERSION:
-        raise ValueError(f"version must be {VERSION}, got {show(data.get('version'))}; update torchdof to read it")
+    if not isinstance(data.get("version"), int) or data["version"] not in READABLE:
+        readable = " or ".join(map(str, READABLE))
+        raise ValueError(f"version must be {readable}, got {show(data.get('version'))}; update torchdof to read it")
     for field in _REQUIRED:
         if field not in data:
             raise ValueError(f"{field} is missing")

@@ -1,4 +1,4 @@
-"""Scatter of layers by convolution: a scatter with one kernel that a half turn does not change is one.
+"""Scatter of layers by convolution: a scatter with one kernel is one with the kernel turned by half.
 
 Light scattered over the frame's border is lost, nothing comes in.
 """
@@ -20,7 +20,7 @@ DIRECT_TAPS = 21 * 21
 _FOURIER_STEP = 128  # lengths of a Fourier transform: those with large prime factors are slow
 
 
-def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
+def convolve(light: Tensor, kernels: Tensor, halo: int = 0, turned: bool = False) -> Tensor:
     """Scatter with one kernel a channel, by convolution.
 
     Small kernels are applied directly, large ones through a Fourier transform in float64: in float32 a highlight would
@@ -28,8 +28,9 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
 
     Args:
         light: ``[B, C, H, W]``.
-        kernels: ``[1 or C, k, k]``, symmetric under a half turn, k odd.
+        kernels: ``[1 or C, k, k]``, k odd.
         halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
+        turned: Whether kernels must be turned by half; those of a round lens need not, which spares a graph the step.
     """
     half, channels = kernels.shape[-1] // 2, light.shape[1]
     if halo > half:
@@ -48,6 +49,7 @@ def convolve(light: Tensor, kernels: Tensor, halo: int = 0) -> Tensor:
     if spare and light.device.type == "cpu":
         light = functional.pad(light, (0, 0, 0, 0, 0, spare))
         kernels = functional.pad(kernels, (0, 0, 0, 0, 0, spare)) if kernels.shape[0] > 1 else kernels
+    kernels = kernels.flip(-2, -1) if turned else kernels
     weights = kernels.expand(light.shape[1], -1, -1).unsqueeze(1)
     return functional.conv2d(light, weights, padding=half - halo, groups=light.shape[1])[:, :channels]
 

@@ -31,14 +31,8 @@ _factors = KernelCache(2**20)
 
 
 def downsampled(values: Tensor, scale: int) -> Tensor:
-    """Mean of each ``scale x scale`` values, a power of two: ``[..., H, W] -> [..., H / scale, W / scale]``.
-
-    By halves, for a sum could overflow.
-    """
-    for _ in range(scale.bit_length() - 1):
-        rows = torch.lerp(values[..., 0::2, :], values[..., 1::2, :], 0.5)
-        values = torch.lerp(rows[..., 0::2], rows[..., 1::2], 0.5)
-    return values
+    """Mean of each ``scale x scale`` values: ``[B, C, H, W] -> [B, C, H / scale, W / scale]``."""
+    return values if scale == 1 else functional.avg_pool2d(values, scale)
 
 
 def upsampled(values: Tensor, scale: int) -> Tensor:
@@ -78,7 +72,7 @@ def _fitted(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
     errors = []
     for factor in factors.tolist():
         coarse = _spectrum(table, coc_px * factor, width, _PERIOD)
-        errors.append((coarse**2 * chain - 2 * coarse * meant).sum())
+        errors.append((coarse.abs() ** 2 * chain - 2 * (coarse.conj() * meant).real).sum())
     # the error of a disc ripples with where its edge lies between pixels: a parabola through it does not
     powers = torch.stack([factors**2, factors, torch.ones_like(factors)], 1)
     bend, slope, _ = torch.linalg.lstsq(powers, torch.stack(errors)[:, None]).solution[:, 0].tolist()
@@ -91,7 +85,7 @@ def _spectrum(table: BlurTable, coc_px: float, width: float, length: int) -> Ten
     half = kernel.shape[-1] // 2
     period = kernel.new_zeros(length, length)
     period[: kernel.shape[-1], : kernel.shape[-1]] = kernel
-    return torch.fft.fft2(period.roll((-half, -half), (0, 1))).real
+    return torch.fft.fft2(period.roll((-half, -half), (0, 1)))
 
 
 def _aliases(values: Tensor, scale: int) -> Tensor:
@@ -101,10 +95,12 @@ def _aliases(values: Tensor, scale: int) -> Tensor:
 
 def _by_moments(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
     """The factor that leaves out the second moments of averaging and interpolation."""
-    # second moment of the kernel along an axis; that of a large one from a smaller one of the same shape
+    # second moment of the kernel, mean of both axes; that of a large one from a smaller one of the same shape
     smaller = max(1.0, min(table.reach_px(coc_px, width) / _MOMENT_REACH, abs(coc_px)))
     kernel = table.kernels(torch.tensor([coc_px / smaller], dtype=torch.float64), width / smaller)[0]
     axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
-    variance = smaller**2 * (float((kernel.mean(0).sum(0) * axis**2).sum()))
+    lines = kernel.mean(0).sum(0), kernel.mean(0).sum(1)
+    variances = [(line * axis**2).sum() - (line * axis).sum() ** 2 for line in lines]
+    variance = smaller**2 * float(sum(variances)) / 2
     others = 1 / 4 - 1 / (12 * scale**2)
     return math.sqrt(max(_LEAST**2, 1 - others / variance))

@@ -24,6 +24,7 @@ from ..optics.blur_table import BlurTable
 from .disocclusion import HIDDEN_WEIGHT
 from .plan import kernels_for
 from .surfaces import Surface
+from .vignetting import passed
 
 __all__ = ["FACTOR", "Highlights", "extract", "splat", "threshold"]
 
@@ -135,6 +136,7 @@ def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable
     in the light and coc of the rays and in what is in their way.
     """
     batch, _, height, width = shown[0].coc_px.shape
+    aperture = table.aperture
     longest = max(height, width)
     source, light, coc = (torch.cat(parts, -1) for parts in zip(*rays, strict=True))
     order = torch.argsort(coc.detach().abs())
@@ -156,6 +158,10 @@ def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
         kernels = kernels_for(table, coc[part], width, longest).to(light.dtype)  # [n, 1 or C, k, k]
+        if aperture is not None and aperture.depends_on_place:
+            half_diagonal = 0.5 * math.hypot(height, width)
+            y, x = ((row[part] + 0.5 - height / 2) / half_diagonal, (column[part] + 0.5 - width / 2) / half_diagonal)
+            kernels = passed(kernels, aperture, coc[part], y, x)
         half = kernels.shape[-1] // 2
         step = torch.arange(-half, half + 1, device=light.device)
         landing = kernels * light[:, part].t()[:, :, None, None]

@@ -1,10 +1,9 @@
 """The chain: an image's surfaces and its highlights, the layers they lie in, scattered and composited."""
 
 import dataclasses
+import functools
 import math
-from collections.abc import Callable, Sequence
-from contextvars import ContextVar
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -15,29 +14,17 @@ from ..validation import is_traced
 from . import compiled, composite, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
+from .exporting import exported_graph, where_needed
+from .layer_weights import blur_axis
 from .matting import matte
 from .plan import Blur, Plan, tolerance_within
 from .scatter import fold
 from .surfaces import Frame, Surface, framed, surfaces_of_image
 
-__all__ = ["Tiling", "blur", "blur_attended", "blur_stack", "tiling"]
+__all__ = ["blur", "blur_attended", "blur_stack"]
 
 _REACH = 4.0  # blur radii within which what lies around a pixel can change it: its light, and what is filled in behind
 _SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
-
-
-class Tiling(NamedTuple):
-    """How an exported graph goes over a frame: ``render`` takes it, its kernels and what renders one piece of it.
-
-    ``align`` tells what the frame must be a multiple of, given the pixels that the widest kernel reaches.
-    """
-
-    align: Callable[[int], int]
-    render: Callable[[Frame, Sequence[Blur], Callable[[Frame, Sequence[Blur]], Tensor]], Tensor]
-
-
-tiling: ContextVar[Tiling | None] = ContextVar("tiling", default=None)
-"""Set by whoever exports a graph; frames are rendered whole else."""
 
 
 def blur(
@@ -47,6 +34,9 @@ def blur(
 
     Without a plan each item gets its own.
     """
+    aperture = options.table.aperture
+    if is_traced() and aperture is not None and aperture.depends_on_place:
+        raise ValueError("a compiled or exported graph has one kernel a layer; take a table without vignetting")
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
     maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]
@@ -158,7 +148,10 @@ def _render_item(
     crisp_px = plan.crisp_px if options.method == "layered" else math.inf
     coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
-    splatted = len(plan.nodes) > 1 and (options.occlusion or coarse)
+    # a plane's one kernel is exact, but for where blocks of the frame share it
+    aperture = options.table.aperture
+    several = len(plan.nodes) > 1 or (aperture is not None and aperture.depends_on_place)
+    splatted = several and (options.occlusion or coarse)
 
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
@@ -181,7 +174,8 @@ def _render_item(
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
     out = out if has_room else out / scale
-    return out if valid is None else torch.where(valid, out, image)
+    out = out if valid is None else torch.where(valid, out, image)
+    return where_needed(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
 
 def _before_background(
@@ -215,14 +209,16 @@ def _composite(
 ) -> Tensor:
     """Surfaces, and the light of highlights, to a picture."""
     light = surfaces[0].light
-    layered, tiles = options.method == "layered", tiling.get() if torch.compiler.is_exporting() else None
+    layered, graph = options.method == "layered", exported_graph()
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
-    align = None if tiles is None else tiles.align
+    align = None if graph is None else graph.align
     lit = options.occlusion or options.normalize
     frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
-        scatter = convolve if layered else fold
+        aperture = options.table.aperture
+        turned = aperture is not None and not aperture.is_round
+        scatter = functools.partial(convolve, turned=turned) if layered else fold
         if options.occlusion:
             out = composite.over(frame, blurs, scatter)
             return out if splats is None else out + splats
@@ -230,4 +226,4 @@ def _composite(
             return composite.accumulate_once(frame, blurs, options.normalize)
         return composite.accumulate(frame, blurs, scatter, options.normalize, splats)
 
-    return picture(frame, blurs) if tiles is None else tiles.render(frame, blurs, picture)
+    return picture(frame, blurs) if graph is None else graph.render(frame, blurs, picture)

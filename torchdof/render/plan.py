@@ -15,21 +15,27 @@ from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
+from .vignetting import CatsEye
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "tolerance_within"]
 
 KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
+_LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
 _SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
 _kernels = KernelCache(256 * 2**20)
 
 
 @dataclasses.dataclass(frozen=True)
 class Blur:
-    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels."""
+    """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
+
+    Where the lens's barrel shows, ``cats_eye`` tells what becomes of the kernel across the frame.
+    """
 
     kernel: Tensor
     scale: int
+    cats_eye: CatsEye | None = None
 
     @property
     def half(self) -> int:
@@ -161,23 +167,33 @@ class Plan:
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
-        scales = tuple(self._scale(coc) if coarse else 1 for coc in self.coc_px)
-        if torch.compiler.is_compiling():  # no names of this process's, such as a cache's keys, in what is compiled
+        finest = 1.0 if table.aperture is None else table.aperture.finest
+        scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
+        lens = table.fingerprint()
+        if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
             parts = flat.split([math.prod(shape) for shape in shapes])
-            longest = [(torch.sym_max(*size) + s - 1) // s for s in scales]
-            bank = [_masked(k.reshape(shape), n) for k, shape, n in zip(parts, shapes, longest, strict=True)]
+            bank = [_masked(k.reshape(shape), size, s) for k, shape, s in zip(parts, shapes, scales, strict=True)]
+        elif is_traced():
+            whole = [_kernel(table, lens, c, width, s, None) for c, s in zip(self.coc_px, scales, strict=True)]
+            bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
-            lens = table.fingerprint()
             bank = []
             for coc, scale in zip(self.coc_px, scales, strict=True):
-                longest_px = -(-max(size) // scale)
+                longest_px = max(-(-max(size) // scale), _LEAST_CUT)
                 reach = functools.partial(table.reach_px, coc / scale, width / scale)
                 reach_px = _kernels.get((lens, coc, width, scale), reach)
                 window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
-        return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        if table.aperture is None or not table.aperture.depends_on_place:
+            return blurs
+        frame = (int(size[0]), int(size[1]))
+        return [
+            dataclasses.replace(blur, cats_eye=CatsEye(table.aperture, coc / blur.scale, blur.scale, frame))
+            for blur, coc in zip(blurs, self.coc_px, strict=True)
+        ]
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
@@ -202,7 +218,7 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> T
     Each is interpolated between those of whole 1/32 px where no gradient asks for more. They are cut to what reaches
     within a frame whose longer side is ``longest`` pixels.
     """
-    if torch.is_grad_enabled() and coc_px.requires_grad:
+    if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
         kernels = table.kernels(coc_px, width)
     else:
         steps = coc_px.double() * KERNELS_PER_PX
@@ -224,6 +240,8 @@ def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, 
             coc *= shrink(table, coc, width / scale, scale)
         return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0].clone()
 
+    if torch.is_grad_enabled() and table.requires_grad:
+        return made()
     return _kernels.get((lens, coc_px, width, scale, window), made)
 
 
@@ -245,8 +263,11 @@ for _constant in (_constant_shapes, _constant_kernels):  # one result each, for 
     _constant._dynamo_marked_constant = True  # type: ignore[union-attr]
 
 
-def _masked(kernel: Tensor, longest: int) -> Tensor:
-    """A kernel of traced code, which keeps its size: taps that reach beyond a frame ``longest`` pixels long are 0."""
+def _masked(kernel: Tensor, size: tuple[int, int], scale: int) -> Tensor:
+    """A kernel of traced code, which keeps its size: taps that reach beyond a frame of a size are 0."""
     half = kernel.shape[-1] // 2
+    if half < _LEAST_CUT:
+        return kernel
+    longest = torch.sym_max((torch.sym_max(*size) + scale - 1) // scale, _LEAST_CUT)
     within = (torch.arange(-half, half + 1, device=kernel.device).abs() < longest).to(kernel.dtype)
     return kernel * within * within[:, None]

@@ -9,6 +9,8 @@ import { Stage } from './stage.mjs'
 
 const $ = (id) => document.getElementById(id)
 const HORIZON_M = 1000 // farther is all the same to a lens
+const NEEDS_DEPTH =
+  'Now add its depth map: a grey picture of distances, from an estimator such as Depth Anything, a depth camera or a renderer.'
 const SETTLED_MS = 250 // no change for so long: the full size is worth its time
 
 let camera
@@ -25,9 +27,10 @@ const fNumber = () => fNumberOf(Number($('aperture').value))
 const stage = new Stage($('frame'), focusAt)
 const renderer = new Renderer({
   onSharp: (picture) => stage.showSharp(picture),
-  onBegin: (expectedMs, isHalf) => {
+  onBegin: (expectedMs, isHalf, isReady) => {
     stage.beginProgress(expectedMs)
-    if (isHalf) return
+    if (!isReady) say('Loading the lens…')
+    if (isHalf || !isReady) return
     const about = expectedMs === null ? '' : ` about ${seconds(expectedMs)}`
     say(`Rendering ${scene.width} × ${scene.height}…${about}`)
   },
@@ -109,12 +112,16 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
   result = null
   $('save').disabled = true
   $('lens').disabled = true
+  stage.setActive(false)
   $('meaning').disabled = depthFile === null
   for (const group of document.querySelectorAll('[data-for]')) {
     group.hidden = !group.dataset.for.includes($('kind').value)
   }
   if (!photo || !depthFile) {
-    say(photo ? 'Now add the depth map of this photo.' : 'Now add the photo of this depth map.')
+    stage.endProgress()
+    stage.showDepth(null)
+    if (photo) stage.showSharp(photo)
+    say(photo ? NEEDS_DEPTH : 'Now add the photo of this depth map.')
     return
   }
   const { map } = depthFile
@@ -144,6 +151,7 @@ function arrange(point = { u: 0.5, v: 0.5 }) {
   }
   noteDepth(holes)
   $('lens').disabled = false
+  stage.setActive(true)
   renderer.setScene({ photo, depth: scene.depth, width: scene.width, height: scene.height })
   focusAt(point.u, point.v, true)
 }
@@ -281,7 +289,9 @@ function say(text) {
 function complain(message) {
   $('problem').hidden = message === null
   $('problem').textContent = message ?? ''
-  if (message !== null) say('')
+  if (message === null) return
+  say('')
+  $('problem').scrollIntoView({ block: 'nearest' })
 }
 
 /* Controls ----------------------------------------------------------------------------------------------------- */

@@ -3,7 +3,7 @@
 export class Renderer {
   /**
    * @param handlers.onSharp ({rgba, width, height}): the photograph at the size of the result.
-   * @param handlers.onBegin (expectedMs or null, isHalf): a picture has been begun.
+   * @param handlers.onBegin (expectedMs or null, isHalf, isReady): a picture has been begun, or waits until all is loaded.
    * @param handlers.onPicture ({rgba, width, height, half, ms}): it is there.
    * @param handlers.onFailed (message).
    */
@@ -11,22 +11,23 @@ export class Renderer {
     this.handlers = handlers
     this.msPerPixel = null
     this.loadMs = Infinity
+    this.sceneId = 0
     this.#start()
   }
 
   /** What is to be rendered from now on: {photo, depth, width, height}. */
   setScene(scene) {
-    this.scene = scene
+    this.scene = { ...scene, sceneId: ++this.sceneId }
     this.wanted = null
-    if (this.running) this.#start()
-    else this.worker.postMessage({ type: 'scene', ...scene })
+    if (this.#isWorthStartingAgain()) this.#start()
+    else this.worker.postMessage({ type: 'scene', ...this.scene })
   }
 
   /** Ask for a picture; one that was asked for and not begun is forgotten. */
   request(wanted) {
     this.wanted = wanted
     if (!this.running) this.#next()
-    else if (this.#remainingMs() > this.loadMs && !this.running.half) this.#start() // quicker than waiting
+    else if (!this.running.half && this.#isWorthStartingAgain()) this.#start()
   }
 
   #start() {
@@ -43,9 +44,9 @@ export class Renderer {
   }
 
   #next() {
-    this.running = { ...this.wanted, began: performance.now() }
+    this.running = { ...this.wanted, sceneId: this.sceneId, began: performance.now() }
     this.wanted = null
-    this.handlers.onBegin(this.isReady ? this.#expectedMs(this.running.half) : null, this.running.half)
+    this.handlers.onBegin(this.isReady ? this.#expectedMs(this.running.half) : null, this.running.half, this.isReady)
     this.worker.postMessage({ type: 'render', ...this.running })
   }
 
@@ -59,8 +60,9 @@ export class Renderer {
     } else if (data.type === 'picture') {
       const ms = performance.now() - this.running.began
       this.msPerPixel = ms / (data.width * data.height)
+      const isOfThisScene = this.running.sceneId === this.sceneId
       this.running = null
-      this.handlers.onPicture({ ...data, ms })
+      if (isOfThisScene) this.handlers.onPicture({ ...data, ms })
       if (this.wanted) this.#next()
     } else {
       this.#fail(data.message)
@@ -78,8 +80,9 @@ export class Renderer {
     return (this.msPerPixel * this.scene.width * this.scene.height) / (half ? 4 : 1)
   }
 
-  #remainingMs() {
-    const expected = this.#expectedMs(this.running.half)
-    return expected === null ? 0 : expected - (performance.now() - this.running.began)
+  /** A picture in progress cannot be stopped, but its worker can: if loading another is quicker than waiting. */
+  #isWorthStartingAgain() {
+    const expected = this.running && this.#expectedMs(this.running.half)
+    return expected !== null && expected - (performance.now() - this.running.began) > this.loadMs
   }
 }

@@ -42,6 +42,11 @@ export class Stage {
     context.drawImage(small, 0, 0, this.after.width, this.after.height)
   }
 
+  /** Whether there is anything to focus and to compare. */
+  setActive(isActive) {
+    this.frame.classList.toggle('idle', !isActive)
+  }
+
   /** Show a depth map's picture instead, or, given null, the photograph again. */
   showDepth(image) {
     this.depthView.hidden = image === null

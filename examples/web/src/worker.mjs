@@ -1,7 +1,7 @@
 // Renders away from the page, which stays quick meanwhile.
 //
-// Takes {type: 'scene', photo, depth, width, height}, then {type: 'render', id, half, focusM, fNumber}.
-// Gives {type: 'ready'}, {type: 'sharp', rgba, width, height}, {type: 'picture', id, half, rgba, width, height} or {type: 'failed', message}.
+// Takes {type: 'scene', photo, depth, width, height}, then {type: 'render', half, focusM, fNumber}.
+// Gives {type: 'ready'}, {type: 'sharp', rgba, width, height}, {type: 'picture', half, rgba, width, height} or {type: 'failed', message}.
 
 import * as ort from './ort.wasm.min.mjs'
 import { depthAtSize } from './depth.mjs'
@@ -11,14 +11,16 @@ import { linearLight, srgbBytes } from './light.mjs'
 ort.env.wasm.wasmPaths = new URL('./', import.meta.url).href
 ort.env.wasm.numThreads = self.crossOriginIsolated ? Math.min(8, navigator.hardwareConcurrency) : 1
 
-const loading = load()
+let loading = null // the runtime keeps this worker busy for seconds: the photograph is shown first
 let scene
 const sizes = new Map() // half or not -> light and depth at that size
 
 async function load() {
   const response = await fetch(new URL('dof.onnx', import.meta.url))
   if (!response.ok) throw new Error(`dof.onnx cannot be loaded (${response.status})`)
-  return DepthOfField.load(ort, new Uint8Array(await response.arrayBuffer()))
+  const dof = await DepthOfField.load(ort, new Uint8Array(await response.arrayBuffer()))
+  self.postMessage({ type: 'ready' })
+  return dof
 }
 
 function atSize(half) {
@@ -36,11 +38,11 @@ function atSize(half) {
   return sizes.get(half)
 }
 
-async function render({ id, half, focusM, fNumber }) {
+async function render({ half, focusM, fNumber }) {
   const dof = await loading
   const { light, depth, width, height } = atSize(half)
   const rgba = srgbBytes(await dof.render(light, depth, width, height, focusM, fNumber))
-  self.postMessage({ type: 'picture', id, half, rgba, width, height }, [rgba.buffer])
+  self.postMessage({ type: 'picture', half, rgba, width, height }, [rgba.buffer])
 }
 
 self.onmessage = async ({ data }) => {
@@ -51,6 +53,8 @@ self.onmessage = async ({ data }) => {
       const { light, width, height } = atSize(false)
       const rgba = srgbBytes(light)
       self.postMessage({ type: 'sharp', rgba, width, height }, [rgba.buffer])
+      loading ??= load()
+      await loading
     } else {
       await render(data)
     }
@@ -58,8 +62,3 @@ self.onmessage = async ({ data }) => {
     self.postMessage({ type: 'failed', message: String(error?.message ?? error) })
   }
 }
-
-loading.then(
-  () => self.postMessage({ type: 'ready' }),
-  (error) => self.postMessage({ type: 'failed', message: String(error?.message ?? error) }),
-)

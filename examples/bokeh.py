@@ -1,0 +1,95 @@
+"""Night lights through six lenses: what a point of light becomes out of focus.
+
+Usage: python examples/bokeh.py --out bokeh.png
+
+A street at night: lamps and windows up to 60 m away, a post in focus at 2 m, fairy lights hung in front of it. The same
+picture and depth go through a perfect lens, one of seven blades, a traced double Gauss, an anamorphic lens, one whose
+barrel cuts cat's eyes, and one with a heart in its opening.
+"""
+
+import argparse
+import math
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchdof import BlurTable, Camera, DepthOfField
+from torchdof.io.sheet import write_sheet
+from torchdof.optics.aperture import Aperture
+
+FOCUS_M, FAR_M = 2.0, 60.0
+LAMPS, WINDOWS, FAIRY_LIGHTS = 18, 26, 6
+COLOURS = torch.tensor([[1.0, 0.75, 0.4], [1.0, 0.55, 0.2], [0.7, 0.85, 1.0], [1.0, 0.2, 0.15], [0.4, 1.0, 0.5]])
+
+
+def main() -> None:
+    """Draw the sheet."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--out", type=Path, default=Path("bokeh.png"), help="picture to write")
+    parser.add_argument("--height", type=int, default=480, help="of each picture, in pixels")
+    arguments = parser.parse_args()
+    image, depth = street(arguments.height, arguments.height * 3 // 4)
+    camera = Camera(focal_length_mm=50.0, f_number=1.2, focus_m=FOCUS_M, sensor_width_mm=12.0)
+    panels = {}
+    for name, table in lenses().items():
+        with torch.no_grad():
+            panels[name] = DepthOfField(camera, table, depth_edges="as given")(image, depth).clamp(0.0, 1.0)
+    write_sheet(arguments.out, panels)
+    print(f"{arguments.out}: {', '.join(panels)}")
+
+
+def lenses() -> dict[str, BlurTable]:
+    """Six of them, by what they are called."""
+    traced = BlurTable.load("double_gauss_50mm_f2")
+    return {
+        "perfect": BlurTable.disc(),
+        "seven blades": BlurTable.polygon(7, rotation_deg=12.0, curvature=0.2),
+        "double Gauss": traced.with_aperture(Aperture(blades=9, curvature=0.6)),
+        "anamorphic": BlurTable.polygon(9, curvature=1.0, squeeze=2.0, rim=0.7),
+        "cat's eyes": BlurTable.disc().with_aperture(Aperture(vignetting=0.45)),
+        "heart": BlurTable.from_aperture(heart()),
+    }
+
+
+def heart(size: int = 64) -> Tensor:
+    """An opening in the shape of a heart, ``[size, size]``."""
+    place = torch.linspace(-1.25, 1.25, size)
+    x, y = place[None, :], -place[:, None] + 0.1
+    return ((x**2 + y**2 - 1.0) ** 3 - x**2 * y**3 <= 0.0).float()
+
+
+def street(height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Light ``[1, 3, height, width]`` and depth in metres ``[1, 1, height, width]`` of a street at night."""
+    dice = torch.Generator().manual_seed(7)
+    row = (torch.arange(height) + 0.5)[:, None].expand(height, width) / height
+    column = (torch.arange(width) + 0.5)[None, :].expand(height, width) / width
+    ground = row > 0.6
+    depth = torch.where(ground, 0.6 / (row - 0.6).clamp_min(0.6 / FAR_M), FAR_M)
+    light = torch.stack([0.02 + 0.03 * row, 0.02 + 0.03 * row, 0.045 + 0.02 * row])
+    light = torch.where(ground, light * (0.8 + 0.4 * torch.rand(height, width, generator=dice)), light)
+
+    def draw(inside: Tensor, colour: Tensor, metres: float) -> None:
+        nearer = inside & (metres < depth)
+        light[:, nearer] = colour[:, None]
+        depth[nearer] = metres
+
+    def dots(count: int, rows: tuple[float, float], metres: tuple[float, float], radius: float, power: float) -> None:
+        for _ in range(count):
+            y, x, near, shade = torch.rand(4, generator=dice).tolist()
+            centre = rows[0] + y * (rows[1] - rows[0]), x
+            away = torch.hypot((row - centre[0]) * height, (column - centre[1]) * width)
+            colour = COLOURS[int(shade * len(COLOURS))]
+            draw(away < radius, power * colour, math.exp(math.log(metres[0]) + near * math.log(metres[1] / metres[0])))
+
+    dots(WINDOWS, (0.05, 0.55), (30.0, FAR_M - 1.0), 1.2, 25.0)
+    dots(LAMPS, (0.1, 0.6), (6.0, 40.0), 1.5, 60.0)
+    post = (column - 0.42).abs() < 0.035
+    draw(post, torch.tensor([0.22, 0.16, 0.12]), FOCUS_M)
+    light[:, post] *= 0.6 + 0.8 * torch.rand(int(post.sum()), generator=dice)
+    dots(FAIRY_LIGHTS, (0.1, 0.9), (0.9, 1.2), 1.5, 80.0)
+    return light[None], depth[None, None].contiguous()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,296 @@
+"""The opening of a lens that is not round: blades, an image of it, an anamorphic squeeze. Exact areas, differentiable.
+
+A lens draws a point out of focus as its opening, drawn as large as the circle of confusion. Coordinates ``u`` of the
+opening are those of the picture: x to the right, y down, and the circle around the opening has radius 1. Behind the
+focus plane a point at ``p`` is drawn at ``p + coc u``, as somebody sees the opening who looks through the lens from
+behind the camera; in front of it, where the coc is negative, it is turned by half.
+
+A straight-edged opening's area in a square is exact: its outline is followed, and each edge adds what lies between it
+and the square's left side (Green's theorem). A curved blade is followed by 48 chords that enclose the arc's own area.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ..validation import real_tensor, show, whole
+
+__all__ = ["Aperture"]
+
+Number = float | Tensor
+
+_CHORDS = 48  # of a curved blade
+_MOST_BLADES = 64
+_MOST_SIDE = 128  # pixels of an image of an opening, which are averaged down to so many
+_SQUEEZE = (0.1, 10.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Aperture:
+    """What of a round lens lets light through, and how much narrower than high the lens draws it.
+
+    Args:
+        blades: Straight or curved blades that leave a regular polygon open, from 3; 0 leaves the lens round.
+        rotation_deg: Turns the opening counter-clockwise, as it shows behind the focus plane. At 0 a corner of a
+            polygon points up. A float, or a tensor ``[]`` that a gradient is taken to.
+        curvature: 0 for straight blades, 1 for blades that leave a circle, in between for arcs.
+        squeeze: Height of the blur over its width: 2 for an anamorphic lens of that squeeze. The circle of confusion
+            is the blur's height. A float, or a tensor ``[]`` that a gradient is taken to.
+        mask: Transmission ``[H, W]`` >= 0 of the square around the opening, in place of blades: the longer side spans
+            it. Images of more than 128 pixels are averaged down. It is turned by bilinear interpolation.
+        vignetting: How far towards the corners of the frame the lens's rim moves before the opening, and cuts a
+            cat's eye of it: in the corner by this share of the opening's diameter, from 0 to 1. With a second number,
+            the rim's radius over the opening's, from 1: the larger, the farther out it begins
+            (:mod:`torchdof.render.vignetting`).
+
+    Raises:
+        ValueError: If a number is out of its range, or the mask is dark or has blades as well.
+
+    Example:
+        >>> opening = Aperture(blades=6)
+        >>> unit = torch.tensor(0.1, dtype=torch.float64)
+        >>> round(float(opening.shares(10, unit, unit).sum()) * 0.1**2, 9) == round(3 * math.sin(math.pi / 3), 9)
+        True
+    """
+
+    blades: int = 0
+    rotation_deg: Number = 0.0
+    curvature: float = 0.0
+    squeeze: Number = 1.0
+    mask: Tensor | None = None
+    vignetting: float | tuple[float, float] = 0.0
+
+    def __post_init__(self) -> None:
+        if self.blades != 0 or isinstance(self.blades, bool):
+            whole("blades", self.blades, 3, _MOST_BLADES)
+        _check("rotation_deg", self.rotation_deg, -1e6, 1e6)
+        _check("squeeze", self.squeeze, *_SQUEEZE)
+        if isinstance(self.curvature, Tensor):
+            raise ValueError(f"curvature must be a number from 0 to 1, got {show(self.curvature)}")
+        _check("curvature", self.curvature, 0.0, 1.0)
+        if isinstance(self.vignetting, tuple | list):
+            if len(self.vignetting) != 2:
+                got = show(self.vignetting)
+                raise ValueError(f"vignetting must be a number from 0 to 1, or it and a rim's radius, got {got}")
+            object.__setattr__(self, "vignetting", tuple(self.vignetting))
+        _check("vignetting", self.rim[0], 0.0, 1.0)
+        _check("radius of the rim in vignetting", self.rim[1], 1.0, 10.0)
+        if self.mask is None:
+            if self.blades == 0 and self.curvature != 0.0:
+                raise ValueError(f"curvature is that of blades; give their number too, got {self.curvature:g}")
+            return
+        if self.blades != 0:
+            raise ValueError(f"an opening has blades or a mask, got {self.blades} blades and a mask")
+        object.__setattr__(self, "mask", _checked_mask(self.mask))
+
+    @property
+    def depends_on_place(self) -> bool:
+        """Whether kernels differ across the frame."""
+        return self.rim[0] > 0.0
+
+    @property
+    def rim(self) -> tuple[float, float]:
+        """How far the rim moves towards the corners, in diameters of the opening, and its radius over the opening's."""
+        return self.vignetting if isinstance(self.vignetting, tuple) else (self.vignetting, 1.0)
+
+    @property
+    def is_round(self) -> bool:
+        """Whether nothing but the squeeze tells the opening, in the middle of the frame, from a round one."""
+        return self.blades == 0 and self.mask is None
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether a gradient is to be taken to the rotation or to the squeeze."""
+        return any(isinstance(v, Tensor) and v.requires_grad for v in (self.rotation_deg, self.squeeze))
+
+    @property
+    def widest(self) -> float:
+        """Largest half axis of the blur over the circle of confusion."""
+        return max(1.0, 1.0 / _plain(self.squeeze))
+
+    @functools.cached_property
+    def finest(self) -> float:
+        """Share of the circle of confusion whose disc is about as fine as the blur: at most 1.
+
+        Of a mask it is told by its outline's length over its area, up to twice that of a disc.
+        """
+        finest = min(1.0, 1.0 / _plain(self.squeeze))
+        if self.mask is None:
+            return finest
+        around = functional.pad(self.mask, (1, 1, 1, 1))
+        outline = (around.diff(dim=0)[:, 1:].square() + around.diff(dim=1)[1:].square()).sqrt().sum()
+        pixel = 2.0 / max(self.mask.shape)
+        return finest * min(1.0, 4.0 * float(self.mask.sum() / outline) * pixel)
+
+    def shares(self, half: int, step_y: Tensor, step_x: Tensor) -> Tensor:
+        """How much of each cell of a grid is open, without the squeeze: ``[..., 2 half + 1, 2 half + 1]``, float64.
+
+        Args:
+            half: Cells on each side of the middle one, whose centre is the opening's.
+            step_y: Height of the cells ``[...]``; the circle around the opening has radius 1.
+            step_x: Their width ``[...]``.
+        """
+        batch = torch.broadcast_shapes(step_y.shape, step_x.shape)
+        high, wide = (step.to(torch.float64).expand(batch).reshape(-1) for step in (step_y, step_x))
+        count = 2 * half + 1
+        if self.mask is not None:
+            rows, columns = (
+                _overlaps(count, step, size, max(self.mask.shape))
+                for step, size in zip((high, wide), self.mask.shape, strict=True)
+            )
+            open_areas = rows @ self._turned(self.mask).to(high.device) @ columns.transpose(-2, -1)
+            return (open_areas / (high * wide)[:, None, None]).reshape(*batch, count, count)
+        x, y = self._outline(high.device)
+        middle = half + 0.5
+        shares = _polygon_shares(x / wide[:, None] + middle, y / high[:, None] + middle, count)
+        return shares.reshape(*batch, count, count)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The aperture as JSON-like data, the inverse of :meth:`from_dict`."""
+        fields: dict[str, Any] = {"rotation_deg": _plain(self.rotation_deg), "squeeze": _plain(self.squeeze)}
+        fields["vignetting"] = list(self.rim)
+        if self.mask is not None:
+            return {**fields, "mask": self.mask.tolist()}
+        return {"blades": self.blades, "curvature": float(self.curvature), **fields}
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "Aperture":
+        """Build an aperture from :meth:`to_dict`'s data.
+
+        Raises:
+            ValueError: If a field is unknown or of the wrong kind; the message names it.
+        """
+        known = [field.name for field in dataclasses.fields(cls)]
+        if not isinstance(data, Mapping):
+            raise ValueError(f"aperture must be an object with some of {', '.join(known)}, got {show(data)}")
+        unknown = sorted(str(name) for name in set(data) - set(known))
+        if unknown:
+            raise ValueError(f"{unknown[0]} is not a field of an aperture; known are {', '.join(known)}")
+        fields = dict(data)
+        if fields.get("mask") is not None:
+            try:
+                fields["mask"] = torch.tensor(fields["mask"], dtype=torch.float64)
+            except (TypeError, ValueError, RuntimeError, OverflowError):
+                raise ValueError(f"mask must be rows of numbers, got {show(fields['mask'])}") from None
+        return cls(**fields)
+
+    def __repr__(self) -> str:
+        parts = []
+        if self.mask is not None:
+            parts.append(f"mask {self.mask.shape[0]} x {self.mask.shape[1]}")
+        elif self.blades:
+            parts.append(f"{self.blades} blades" + (f", curvature {self.curvature:g}" if self.curvature else ""))
+        for name, value, usual in (("turned by", self.rotation_deg, 0.0), ("squeeze", self.squeeze, 1.0)):
+            if _plain(value) != usual:
+                parts.append(f"{name} {_plain(value):g}")
+        if self.depends_on_place:
+            parts.append(f"vignetting {self.rim[0]:g}")
+        return f"Aperture({', '.join(parts) or 'round'})"
+
+    def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Corners ``[V]`` of the outline, x and y, so that it goes round with the light on its left in y-up terms."""
+        half_angle = math.pi / self.blades
+        along, out = _blade(half_angle, self.curvature)  # of the blade whose outward normal is up
+        normal = torch.arange(self.blades, dtype=torch.float64, device=device)[:, None] * (2.0 * half_angle)
+        turn = torch.deg2rad(torch.as_tensor(self.rotation_deg, dtype=torch.float64, device=device))
+        normal = normal + half_angle + math.pi / 2 + turn
+        along, out = along.to(device), out.to(device)
+        x = out * torch.cos(normal) - along * torch.sin(normal)
+        y = out * torch.sin(normal) + along * torch.cos(normal)
+        return x.flatten(), -y.flatten()
+
+    def _turned(self, mask: Tensor) -> Tensor:
+        """A mask as it shows behind the focus plane."""
+        turn = self.rotation_deg
+        if not isinstance(turn, Tensor) and turn == 0.0:
+            return mask
+        angle = torch.deg2rad(torch.as_tensor(turn, dtype=torch.float64))
+        cosine, sine = torch.cos(angle), torch.sin(angle)
+        height, width = mask.shape
+        rows = torch.stack([cosine, -sine * height / width, sine * width / height, cosine])
+        grid = functional.affine_grid(
+            torch.cat([rows.reshape(2, 2), rows.new_zeros(2, 1)], 1)[None], [1, 1, height, width], align_corners=False
+        )
+        return functional.grid_sample(mask[None, None], grid, align_corners=False)[0, 0]
+
+
+def _blade(half_angle: float, curvature: float) -> tuple[Tensor, Tensor]:
+    """Points along one blade, the last left out: along it, counter-clockwise, and out from the centre, ``[chords]``."""
+    chord, apothem = math.sin(half_angle), math.cos(half_angle)
+    sagitta = curvature * (1.0 - apothem)
+    if sagitta < 1e-9:
+        return torch.tensor([-chord], dtype=torch.float64), torch.tensor([apothem], dtype=torch.float64)
+    radius = (chord**2 + sagitta**2) / (2.0 * sagitta)
+    half_arc = math.asin(min(1.0, chord / radius)) if sagitta <= radius else math.pi - math.asin(chord / radius)
+    angle = torch.linspace(-half_arc, half_arc, _CHORDS + 1, dtype=torch.float64)[:-1]
+    bulge = 2.0 * radius * torch.sin((half_arc + angle) / 2) * torch.sin((half_arc - angle) / 2)
+    missing = 1.0 / _CHORDS**2  # share of the arc's area that its chords leave out: of a flat arc, and of any other
+    if half_arc > 5e-3:
+        step = 2.0 * half_arc / _CHORDS
+        missing = _CHORDS * (step - math.sin(step)) / (2.0 * half_arc - math.sin(2.0 * half_arc))
+    return radius * torch.sin(angle), apothem + bulge / (1.0 - missing)
+
+
+def _polygon_shares(x: Tensor, y: Tensor, count: int) -> Tensor:
+    """Area of polygons with corners ``[m, V]`` in each of ``count x count`` unit squares from (0, 0) on: ``[m, ...]``.
+
+    The outline goes round counter-clockwise where y points up.
+    """
+    items, next_x, next_y = len(x), x.roll(-1, -1), y.roll(-1, -1)
+    row = torch.arange(count, dtype=torch.float64, device=x.device)[:, None]
+    start, end = ((corner[:, None, :] - row).clamp(0.0, 1.0) for corner in (y, next_y))  # [m, rows, V] in the row
+    item, line, edge = (start.detach() != end.detach()).nonzero().unbind(1)
+    start, end = start[item, line, edge], end[item, line, edge]
+    x, y, next_x, next_y = (corner[item, edge] for corner in (x, y, next_x, next_y))
+    slope = (next_x - x) / (next_y - y)
+    ends = torch.stack([x + slope * (part + line - y) for part in (start, end)])
+    left, right = ends.amin(0)[:, None], ends.amax(0)[:, None]
+    border = torch.arange(count + 1, dtype=torch.float64, device=x.device)
+    # mean over the edge of the smaller of its x and the border's
+    within = torch.minimum(torch.maximum(border, left), right) - left
+    mean = torch.minimum(border, left) + within - within.square() / (2.0 * (right - left) + 1e-12)
+    left_of = mean.new_zeros(items * count, count + 1)
+    left_of = left_of.index_add(0, item * count + line, (start - end)[:, None] * mean)
+    return left_of.diff(dim=-1).clamp_min(0.0).unflatten(0, (-1, count))
+
+
+def _overlaps(count: int, step: Tensor, size: int, longer: int) -> Tensor:
+    """Length that ``count`` cells of steps ``[m]`` share with each pixel of a mask: ``[m, count, size]``."""
+    cell = (torch.arange(count + 1, dtype=torch.float64, device=step.device) - count / 2) * step[:, None]
+    pixel = (torch.arange(size + 1, dtype=torch.float64, device=step.device) - size / 2) * (2.0 / longer)
+    low = torch.maximum(cell[:, :-1, None], pixel[:-1])
+    return (torch.minimum(cell[:, 1:, None], pixel[1:]) - low).clamp_min(0.0)
+
+
+def _checked_mask(mask: Any) -> Tensor:
+    """A mask as float64 on the CPU, not larger than it may be."""
+    values = real_tensor("mask", mask, "[H, W]").detach().to("cpu", torch.float64)
+    if values.ndim != 2 or not values.numel():
+        raise ValueError(f"mask must be the transmission [H, W] of an opening, got {list(values.shape)}")
+    if not bool(torch.isfinite(values).all()) or bool((values < 0).any()) or not bool((values > 0).any()):
+        raise ValueError("mask must hold finite transmissions >= 0, not all of them 0")
+    longer = max(values.shape)
+    if longer > _MOST_SIDE:
+        size = [max(1, round(n * _MOST_SIDE / longer)) for n in values.shape]
+        values = functional.adaptive_avg_pool2d(values[None, None], size)[0, 0]
+    return values / values.max()
+
+
+def _check(name: str, value: Any, low: float, high: float) -> None:
+    """Refuse a number that is none, or lies outside its range."""
+    if isinstance(value, Tensor):
+        good = value.ndim == 0 and value.is_floating_point()
+    else:
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+    if not good or not low <= _plain(value) <= high:
+        raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {show(value)}")
+
+
+def _plain(value: Number) -> float:
+    return float(value.detach()) if isinstance(value, Tensor) else float(value)
