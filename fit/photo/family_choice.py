@@ -18,7 +18,7 @@ COST = ("gaussian", "disc", "ring", "softm", "radial")
 
 _CONTRAST = 0.22  # standard deviation of a photograph's levels over its peak
 _WIDTH = 256
-_EVIDENCE = 6.0  # difference of BIC from which one speaks of strong evidence
+_EVIDENCE = 2.0  # difference of BIC below which one speaks of none
 _LOOK_BELOW = 20.0  # dB by which a highlight may differ more than a photograph
 _DARK, _DISPLAY = 0.02, 1 / 2.2
 
@@ -98,7 +98,7 @@ def choose(
 ) -> tuple[str, str, dict[str, float]]:
     """The cheapest family that a viewer could not tell from the likeliest one.
 
-    The simplest family within 6 of the lowest BIC stands for the truth. Another one will do if a photograph through it
+    The simplest family within 2 of the lowest BIC stands for the truth. Another one will do if a photograph through it
     is `accuracy_db` from the truth's, and a highlight, where shapes show, at most 20 dB less.
 
     Args:
