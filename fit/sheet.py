@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from torchdof.module import blur_by_coc
 from torchdof.optics.blur_table import BlurTable
 
 from .photo.photographs import Photograph, Photographs
@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 __all__ = ["sheet_of_photographs"]
 
 
-def sheet_of_photographs(photographs: Photographs, result: TableFit) -> Figure:
+def sheet_of_photographs(
+    photographs: Photographs, result: TableFit, render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor]
+) -> Figure:
     """Draw the sheet.
 
     A row a distance: the target that was found, the window around its dot, its pixels over the distance from the centre
@@ -31,6 +33,7 @@ def sheet_of_photographs(photographs: Photographs, result: TableFit) -> Figure:
     Args:
         photographs: from `read_photographs`.
         result: from `fit_captures` of their captures.
+        render: `render(image, coc_px, table)`, all as `torchdof.blur_by_coc` takes them.
     """
     captures = photographs.captures
     rows = len(captures)
@@ -54,7 +57,7 @@ def sheet_of_photographs(photographs: Photographs, result: TableFit) -> Figure:
         _show(kernel, shape.detach().numpy(), [], f"kernel at coc {coc:+.2f} px")
     for unused in axes[rows, 1:]:
         unused.remove()
-    lights = _lights(result.table, captures.width_px, min(0.0, *result.coc_px), max(0.0, *result.coc_px))
+    lights = _lights(render, result.table, captures.width_px, min(0.0, *result.coc_px), max(0.0, *result.coc_px))
     wide = figure.add_subplot(axes[rows, 0].get_gridspec()[rows, :])
     axes[rows, 0].remove()
     _show(
@@ -85,7 +88,13 @@ def _thumbnail(picture: Photograph) -> tuple[Array, list[tuple[float, float]]]:
     return small, [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in corners]
 
 
-def _lights(table: BlurTable, width_px: int, low: float, high: float) -> Array:
+def _lights(
+    render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor],
+    table: BlurTable,
+    width_px: int,
+    low: float,
+    high: float,
+) -> Array:
     """A row of small lights over stripes, the circle of confusion going from one measured end to the other."""
     width, height = 720, 90
     scene = 0.15 + 0.1 * (np.arange(width) // 12 % 2) * np.ones((height, 1))
@@ -94,7 +103,7 @@ def _lights(table: BlurTable, width_px: int, low: float, high: float) -> Array:
     # a table in mm of the sensor: seen through a part of the frame as wide as this picture
     scaled = coc * (width / width_px) if table.unit == "relative" else coc
     picture = torch.from_numpy(scene).float()[None, None]
-    shown = blur_by_coc(picture, scaled, table=_through(table, width / width_px))
+    shown = render(picture, scaled, _through(table, width / width_px))
     return np.clip(shown[0, 0].numpy().astype(np.float64), 0, 1)
 
 

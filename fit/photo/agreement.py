@@ -16,7 +16,7 @@ import numpy as np
 from torchdof.optics.camera import Camera
 
 from ..problems import CameraError, CameraWarning, warn
-from ..result import Array
+from ..result import Array, Mask
 from .manifest import Captures
 from .scale import signed_coc
 
@@ -117,7 +117,7 @@ def check_agreement(captures: Captures, radius_px: Sequence[float]) -> None:
     warn(CameraWarning(text, file=captures.pairs[worst].files[1], number=factor))
 
 
-def _readings(captures: Captures, expected: Array, measured: Array, telling: Array, known: bool) -> list[_Reading]:
+def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask, known: bool) -> list[_Reading]:
     """What one mistake could each explain: a wrong scale, a wrong distance, two exchanged, another focus."""
     distance = np.array([p.distance_m for p in captures])
     defocus = 1 / captures.focus_m - 1 / distance
@@ -133,7 +133,7 @@ def _readings(captures: Captures, expected: Array, measured: Array, telling: Arr
         text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
         readings.append(_Reading(text, _misfit(exchanged, measured, telling)))
     if count >= 3:
-        for i in np.flatnonzero(telling):
+        for i in map(int, np.flatnonzero(telling)):
             others = telling.copy()
             others[i] = False
             vergence = 1 / captures.focus_m - math.copysign(measured[i] / per_dioptre, defocus[i])
@@ -190,7 +190,7 @@ def _common_factor(expected: Array, measured: Array) -> float:
     return float((measured / expected)[order][np.searchsorted(weight, 0.5 * weight[-1])])
 
 
-def _misfit(expected: Array, measured: Array, telling: Array) -> float:
+def _misfit(expected: Array, measured: Array, telling: Mask) -> float:
     """Largest |log(measured / expected)|, without what a pixel of aberrations explains."""
     apart = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
     factor = np.log1p(apart / np.maximum(np.minimum(measured, expected), 1e-9))

@@ -270,9 +270,8 @@ class Forward:
         """Deviation of each used pixel's noise `[pixels used]`, and how neighbours' go together, from a residual."""
         from scipy.ndimage import gaussian_filter
 
-        full = np.zeros(self.flat.size)
-        full[self.flat] = residual
-        full = full.reshape(self.data.shape)
+        full = np.zeros(self.data.shape)
+        full[self.flat.reshape(self.data.shape)] = residual
         share = np.maximum(gaussian_filter(self.used.astype(np.float64), 2.0), 1e-6)
         deviation = np.sqrt(factor * np.maximum(gaussian_filter(full**2, 2.0) / share, 0.0))
         near = self.used & (self.distance <= self.data_dot.reach + 2)

@@ -133,7 +133,7 @@ def _steepness(still: Array, dot: Dot, edge: Edge) -> tuple[float, float]:
 
     An S-curve spreads the levels of half-covered pixels apart. No blur does: it brings them together.
     """
-    rows, columns = np.indices(still.shape).astype(np.float64)
+    rows, columns = (axis.astype(np.float64) for axis in np.indices(still.shape))
     coverage = draw_edge(rows, columns, edge.x, edge.y, edge.radius, edge.softness)
     residual = (still - dot.background) / edge.level - coverage
     low, high = (coverage > 0.02) & (coverage < 0.4), (coverage > 0.6) & (coverage < 0.98)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from torchdof import BlurTable
+from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.arguments import AsJson
 from torchdof.cli.printed import json_line
 from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
@@ -213,7 +213,9 @@ def _draw_sheet(photographs: Photographs, result: TableFit, target: Path, consol
     try:
         from torchdof.fit.sheet import sheet_of_photographs
 
-        sheet_of_photographs(photographs, result).savefig(target)
+        sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2])).savefig(
+            target
+        )
     except ModuleNotFoundError as error:
         console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
         return
