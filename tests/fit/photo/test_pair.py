@@ -321,7 +321,7 @@ def test_round_blur_is_never_said_to_be_uneven(simulator):
     chances = []
     for seed in range(24):
         still, data = blurred_by(eye(0.0), simulator, seed, dot_radius=6.0, size=45)
-        pair, _ = prepared_pair(still, data, "auto", 1.0, None, (None, None))
+        pair, _, _ = prepared_pair(still, data, "auto", 1.0, None, (None, None))
         pair.fit_moves = ("dx", "dy")
         chances.append(asymmetry_of(pair, pair.solve("disc"))[1])
     assert min(chances) > 1e-3 and 0.25 < np.mean(chances) < 0.75
