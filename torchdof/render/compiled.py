@@ -103,9 +103,9 @@ def _across_the_frame(table: BlurTable, blurs: Sequence[Blur]) -> dict[str, Any]
     aperture = table.aperture
     if aperture is None or not aperture.depends_on_place:
         return {}
-    strength, radius = aperture.rim
+    front, rear = aperture.rims
     radii = [0.0 if blur.cats_eye is None else blur.cats_eye.coc_px for blur in blurs]
-    return {"radii": radii, "rim": (2.0 * strength, radius, float(aperture.squeeze))}
+    return {"radii": radii, "rims": (2.0 * front, 2.0 * rear), "squeeze": float(aperture.squeeze)}
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:
