@@ -17,6 +17,7 @@ from torchdof import DepthOfField
 from torchdof.io.atomic import whole_file
 
 from .graph import INPUTS, OUTPUT, Portable, trace
+from .interface import broadcast
 from .metadata import label
 from .slimming import slim
 from .verification import Verification, verify
@@ -39,15 +40,16 @@ def to_onnx(
 
     The graph takes ``image [B, C, H, W]`` (linear light), ``depth [B, 1, H, W]`` (metres), ``focus_m [B]`` and
     ``f_number [B]``, or ``image`` and ``coc_px [B, 1, H, W]``, all float32, and gives ``out [B, C, H, W]``. B, H and W
-    are free, from 1 upwards. A pixel whose depth is NaN, zero or negative passes through sharp and touches nothing
-    else.
+    are free, from 1 upwards; all but the image may have one item for the whole batch. A pixel whose depth is NaN, zero
+    or negative passes through sharp and touches nothing else. A camera that cannot be (focus within the focal length,
+    f-number or focus not positive, NaN) gives a picture of NaN.
 
     The graph takes the depth as it is given, whatever ``dof.depth_edges`` says: repairing edges looks at the whole
     frame first, several times over. Call :func:`torchdof.depth.repair_edges` before it where the map is not exact.
 
     The graph has the layers of every radius up to ``dof.max_coc_px``. It renders tile by tile in an ONNX ``Loop`` and
-    skips, by ``If``, layers that no pixel in or near a tile falls into: a frame in focus takes a fraction of the time
-    of a blurred one (numbers in docs/embedding.md).
+    skips, by ``If``, tiles that are in focus and layers that no pixel in or near a tile falls into (numbers in
+    docs/embedding.md). Highlights are blurred as other light is, not ray by ray as in eager renderings.
 
     Args:
         dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they
@@ -83,7 +85,7 @@ def to_onnx(
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
     portable = Portable(dof, inputs, width)
-    model = onnx_ir.to_proto(slim(_translate(portable, channels, opset)))
+    model = onnx_ir.to_proto(broadcast(slim(_translate(portable, channels, opset)), portable.inputs))
     label(model, dof, portable, channels, opset)
     with whole_file(path) as part:
         onnx.save_model(model, part, format="protobuf")

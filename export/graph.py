@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.optics.camera import Camera
+from torchdof.render.exporting import where_needed
 from torchdof.render.plan import Blur, Plan
 
 from .tiling import in_tiles
@@ -24,7 +25,7 @@ OUTPUT = "out"
 class Portable(nn.Module):
     """The module as its ONNX file computes it: all layers up to ``max_coc_px``, bad values passed through sharp.
 
-    It takes the depth as it is given.
+    It takes the depth as it is given; what its camera cannot be gives NaN.
 
     Called outside an export it renders the same thing with eager PyTorch, and that is what a file is verified against.
 
@@ -52,14 +53,28 @@ class Portable(nn.Module):
         self.dof = copy.copy(dof)
         table = pinned(dof.options.table, width)
         self.dof.options = dataclasses.replace(dof.options, table=table, check=False, depth_edges="as given")
+        self.called = copy.copy(dof)
+        self.called.options = dataclasses.replace(dof.options, table=table, check=False)
         self.eval()
 
     def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
         """Render ``[B, C, H, W]`` with depth and ``(focus_m, f_number)``, or with a map of the coc."""
         plan = None if torch.compiler.is_exporting() else self.plan
-        if self.inputs == "depth":
-            return self.dof(image, map_, *lens, plan=plan)
-        return blur_by_coc(image, map_, plan=plan, **self.dof.options.arguments())
+        if self.inputs == "coc_px":
+            return blur_by_coc(image, map_, plan=plan, **self.dof.options.arguments())
+        out = self.dof(image, map_, *lens, plan=plan)
+        focus_m, f_number = lens
+        camera = self.dof.camera
+        least_m = float(camera.focal_length_mm) / 1000.0 if camera.focus_breathing else 0.0
+        possible = (focus_m > least_m) & (f_number > 0) & (f_number < torch.inf)
+        undefined = torch.where(possible[:, None, None, None], out, torch.nan)
+        return where_needed(lambda: ~possible.all(), undefined, out)
+
+    def as_called(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
+        """Render as those do who call the module: layers for the scene, highlights ray by ray, edges mended."""
+        if self.inputs == "coc_px":
+            return blur_by_coc(image, map_, **self.called.options.arguments())
+        return self.called(image, map_, *lens)
 
     @property
     def plan(self) -> Plan:

@@ -3,37 +3,54 @@
 import itertools
 from collections.abc import Collection, Iterator
 
+import numpy as np
 import onnx_ir
 from onnx_ir.passes import common as passes
+from onnx_ir.tape import Tape
+from onnxscript.optimizer import fold_constants
+
+from .structure import structure
 
 __all__ = ["slim"]
 
+_LARGEST_EQUAL = 64  # numbers of a constant that are written one by one though they are the same
+
 
 def slim(model: onnx_ir.Model) -> onnx_ir.Model:
-    """One flat graph without repeated constants, stack traces and names of source files; its loop is a ``Loop``."""
-    before: tuple[onnx_ir.passes.PassBase, ...] = (
+    """One flat graph without repeated constants, stack traces and names of source files; with loops and branches."""
+    flat: tuple[onnx_ir.passes.PassBase, ...] = (
         passes.InlinePass(),
         passes.RemoveUnusedFunctionsPass(),
-        passes.LiftSubgraphInitializersToMainGraphPass(),
         passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         passes.DeduplicateInitializersPass(size_limit=2**24),
-    )
-    after: tuple[onnx_ir.passes.PassBase, ...] = (
         passes.ShapeInferencePass(),
         _Casts(),
+    )
+    tidy: tuple[onnx_ir.passes.PassBase, ...] = (
+        passes.IdentityEliminationPass(),
+        passes.CommonSubexpressionEliminationPass(),
+        passes.RemoveUnusedNodesPass(),
+    )
+    structured: tuple[onnx_ir.passes.PassBase, ...] = (
+        passes.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
         passes.DeduplicateInitializersPass(size_limit=2**24),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
         passes.RemoveUnusedOpsetsPass(),
         passes.ClearMetadataAndDocStringPass(),
     )
-    for step in before:
+    for step in flat:
         step(model)
-    for node in list(model.graph):
-        if node.op_type == "Scan":
-            _loop(model.graph, node)
-    for step in after:
+    fold_constants(model, input_size_limit=2**24, output_size_limit=2**24)
+    for step in tidy:
         step(model)
+    structure(model)
+    for step in structured:
+        step(model)
+    _place_weights(model)
+    passes.RemoveUnusedNodesPass()(model)
+    for graph in (model.graph, *model.graph.subgraphs()):
+        _as_nodes(graph)
     kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
     names = (f"v{i}" for i in itertools.count())
     for graph in (model.graph, *model.graph.subgraphs()):
@@ -46,41 +63,52 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
     return model
 
 
-def _loop(graph: onnx_ir.Graph, scan: onnx_ir.Node) -> None:
-    """A ``Scan`` over the first axis as a ``Loop``: OpenVINO reads only this one where the body uses outer values."""
-    body = scan.attributes["body"].as_graph()
-    states = len(scan.inputs) - scan.attributes["num_scan_inputs"].as_int()
-    initial, scanned = scan.inputs[:states], scan.inputs[states:]
-    step = onnx_ir.Value(name="loop_step", shape=onnx_ir.Shape([]), type=onnx_ir.TensorType(onnx_ir.DataType.INT64))
-    going = onnx_ir.Value(name="loop_going", shape=onnx_ir.Shape([]), type=onnx_ir.TensorType(onnx_ir.DataType.BOOL))
-    each = list(body.inputs)[states:]
-    gathers = [onnx_ir.node("Gather", [whole, step], {"axis": 0}) for whole in scanned]
-    for i, (value, gather) in enumerate(zip(each, gathers, strict=True)):
-        tile = gather.outputs[0]
-        tile.name, tile.type, tile.shape = f"loop_tile_{i}", value.type, value.shape
-        value.replace_all_uses_with(tile)
-    for value in each:
-        body.inputs.remove(value)
-    body.inputs.insert(0, going)
-    body.inputs.insert(0, step)
-    body.insert_before(next(iter(body)), gathers)
-    on = onnx_ir.node("Identity", [going])
-    on.outputs[0].name, on.outputs[0].type, on.outputs[0].shape = "loop_goes_on", going.type, onnx_ir.Shape([])
-    body.append(on)
-    body.outputs.insert(0, on.outputs[0])
-    counts = onnx_ir.node("Shape", [scanned[0]], {"start": 0, "end": 1})
-    first = onnx_ir.node("Squeeze", [counts.outputs[0]])
-    always = onnx_ir.node("Constant", [], {"value": onnx_ir.tensor(True)})
-    for name, node in {"loop_counts": counts, "loop_count": first, "loop_always": always}.items():
-        node.outputs[0].name = name
-    inputs = [first.outputs[0], always.outputs[0], *initial]
-    loop = onnx_ir.Node("", "Loop", inputs, [onnx_ir.AttrGraph("body", body)], num_outputs=len(scan.outputs))
-    scan.attributes.pop("body")
-    graph.insert_before(scan, [counts, first, always, loop])
-    for old, new in zip(scan.outputs, loop.outputs, strict=True):
-        new.name, new.type, new.shape = old.name, old.type, old.shape
-        old.replace_all_uses_with(new)
-    graph.remove(scan, safe=True)
+def _place_weights(model: onnx_ir.Model) -> None:
+    """Weights of convolutions in the graph that convolves: only then runtimes arrange them for their fast kernels."""
+    for graph in (model.graph, *model.graph.subgraphs()):
+        for node in [node for node in graph if node.op_type == "Conv"]:
+            weight = node.inputs[1]
+            if weight is None or weight.const_value is None:
+                continue
+            bias = node.inputs[2] if len(node.inputs) > 2 else None
+            if bias is not None and bias.const_value is not None and not bias.const_value.numpy().any():
+                node.resize_inputs(2)
+            rows, index = np.unique(weight.const_value.numpy(), axis=0, return_inverse=True)
+            own = _initializer(graph, rows, f"{weight.name}_of_{node.name}")
+            if len(rows) < len(index):
+                which = _initializer(graph, index.astype(np.int64), f"{own.name}_channels")
+                gather = onnx_ir.node("Gather", [own, which], {"axis": 0})
+                graph.insert_before(node, [gather])
+                own = gather.outputs[0]
+            node.replace_input_with(1, own)
+
+
+def _as_nodes(graph: onnx_ir.Graph) -> None:
+    """Initializers as ``Constant`` nodes: ``onnx.compose`` renames these where a branch takes them from outside."""
+    first = next(iter(graph), None)
+    for value in list(graph.initializers.values()):
+        tape, array = Tape(), value.const_value.numpy()
+        if array.size > _LARGEST_EQUAL and (array == array.flat[0]).all():
+            shape = tape.op("Constant", [], {"value_ints": list(array.shape)})
+            tape.op("ConstantOfShape", [shape], {"value": onnx_ir.tensor(array.flat[:1])})
+            shape.name = f"{value.name}_shape"
+        else:
+            tape.op("Constant", [], {"value": value.const_value})
+        made = tape.nodes[-1].outputs[0]
+        made.name = value.name
+        del graph.initializers[value.name]
+        value.replace_all_uses_with(made)
+        if first is not None:
+            graph.insert_before(first, list(tape.nodes))
+
+
+def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.Value:
+    tensor = onnx_ir.tensor(array, name=name)
+    value = onnx_ir.Value(
+        name=name, shape=onnx_ir.Shape(array.shape), type=onnx_ir.TensorType(tensor.dtype), const_value=tensor
+    )
+    graph.register_initializer(value)
+    return value
 
 
 class _Casts(onnx_ir.passes.InPlacePass):
@@ -115,12 +143,7 @@ def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.Dat
     """A constant in another type, as an initializer of the graph."""
     if value.const_value is None:
         raise ValueError(f"{value.name} is no constant")
-    tensor = onnx_ir.tensor(value.const_value.numpy().astype(kind.numpy()), name=f"cast_{number}")
-    constant = onnx_ir.Value(
-        name=tensor.name, shape=onnx_ir.Shape(tensor.numpy().shape), type=onnx_ir.TensorType(kind), const_value=tensor
-    )
-    graph.register_initializer(constant)
-    return constant
+    return _initializer(graph, value.const_value.numpy().astype(kind.numpy()), f"cast_{number}")
 
 
 def _shorten(value: onnx_ir.Value, kept: Collection[str | None], names: Iterator[str]) -> None:

@@ -1,7 +1,10 @@
 """The frame tile by tile, in a loop: how an exported graph does only the work that a scene needs.
 
 A graph cannot choose its work before it runs. In a loop over tiles each step sees a small window, and the branches
-inside skip every layer that the window does not hold.
+inside skip every layer that the window does not hold, and everything where it is in focus.
+
+What is traced is flat: an operator of our own cuts a window, another collects the tiles, a third chooses between two
+results. :mod:`torchdof.export.structure` makes a loop and branches of these.
 """
 
 import contextlib
@@ -11,11 +14,17 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof.render.pipeline import Tiling, tiling
+from torchdof.render.exporting import Graph, graph_context, where_needed
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Frame, Placed
 
-__all__ = ["in_tiles", "side", "tile_by_tile"]
+__all__ = ["CHOICE", "COLLECT", "DOMAIN", "WINDOW", "choose", "in_tiles", "side", "tile_by_tile"]
+
+DOMAIN = "torchdof"
+"""Of the operators that stand for structure in a flat graph; none is left in a file."""
+
+CHOICE, WINDOW, COLLECT = "Choice", "Window", "Collect"
+"""``Choice(needed, result, given)``; ``Window(frame)``, one for each tile; ``Collect(tile)``, all of them."""
 
 _SIDE = 128
 
@@ -23,6 +32,11 @@ _SIDE = 128
 def side(margin: int) -> int:
     """Pixels of a tile along each axis, given those that the widest kernel reaches beyond it."""
     return _SIDE if margin <= _SIDE // 2 else 2 * _SIDE
+
+
+def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
+    """A result if it is needed, a bool ``[]``, else what is given: a branch of the graph."""
+    return _operator(CHOICE, [needed, result, given], result.shape)
 
 
 def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, Sequence[Blur]], Tensor]) -> Tensor:
@@ -36,47 +50,41 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     Returns:
         ``[B, C, H, W]``.
     """
-    from torch._higher_order_ops.scan import scan  # the graph's loop
-
     length, margin = side(frame.margin), frame.margin
-    window = length + 2 * margin
-    rows, columns = (n // length for n in frame.area)
     parts = [t for s in frame.surfaces for t in s if t is not None]
-    batch, colours = parts[0].shape[0], int(parts[0].shape[1])
     if frame.behind is not None:
         parts.append(functional.pad(frame.behind, (margin,) * 4))
     channels = [int(t.shape[1]) for t in parts]
-    weighted, backed = frame.surfaces[0].weight is not None, frame.behind is not None
-    across = torch.arange(window)
-    tiles = torch.cat(parts, 1)
-    tiles = tiles[:, :, (torch.arange(rows) * length)[:, None] + across]  # [B, P, rows, window, W]
-    tiles = tiles[..., (torch.arange(columns) * length)[:, None] + across]  # [B, P, rows, window, columns, window]
-    tiles = tiles.permute(0, 2, 4, 1, 3, 5).reshape(-1, sum(channels), window, window)
-
-    # a loop takes no two views of one tensor, and inside it sizes are unknown until they are stated
-    bank = [(blur.kernel.clone(), tuple(blur.kernel.shape), blur.scale) for blur in blurs]
-
-    def step(count: Tensor, tile: Tensor) -> tuple[Tensor, Tensor]:
-        fields = [t.clone() for t in tile.reshape(1, sum(channels), window, window).split(channels, 1)]
-        inner = slice(margin, margin + length)
-        behind = fields.pop()[..., inner, inner] if backed else None
-        each = 3 if weighted else 2
-        surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
-        whole = (length, length)
-        piece = Frame(surfaces, frame.nodes, behind, margin, whole, whole, frame.occlusion)
-        tile = render(piece, [Blur(kernel.reshape(shape), scale) for kernel, shape, scale in bank])
-        return count + 1, tile.reshape(colours, length, length)
-
-    _, pieces = scan(step, torch.zeros(1), tiles)
+    window = (1, sum(channels), length + 2 * margin, length + 2 * margin)
+    fields = list(_operator(WINDOW, [torch.cat(parts, 1)], window, side=length, margin=margin).split(channels, 1))
+    inner = (..., slice(margin, margin + length), slice(margin, margin + length))
+    behind = None if frame.behind is None else fields.pop()[inner]
+    each = 2 if frame.surfaces[0].weight is None else 3
+    surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
+    piece = Frame(surfaces, frame.nodes, behind, margin, (length, length), (length, length), frame.occlusion)
+    tile = where_needed(
+        lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0,
+        render(piece, blurs),
+        surfaces[0].light[inner],
+    )
+    rows, columns = (n // length for n in frame.area)
+    batch, colours = parts[0].shape[0], frame.colours
+    pieces = _operator(COLLECT, [tile], (batch * rows * columns, colours, length, length))
     image = pieces.reshape(batch, rows, columns, colours, length, length).permute(0, 3, 1, 4, 2, 5)
     return image.reshape(batch, colours, *frame.area)[..., : frame.size[0], : frame.size[1]]
 
 
 @contextlib.contextmanager
 def in_tiles() -> Iterator[None]:
-    """Within this context graphs that are exported render their frames tile by tile."""
-    token = tiling.set(Tiling(side, tile_by_tile))
+    """Within this context graphs that are exported render their frames tile by tile, and choose their work."""
+    token = graph_context.set(Graph(side, tile_by_tile, choose))
     try:
         yield
     finally:
-        tiling.reset(token)
+        graph_context.reset(token)
+
+
+def _operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], **attributes: int) -> Tensor:
+    return torch.onnx.ops.symbolic(
+        f"{DOMAIN}::{name}", inputs, attributes, dtype=inputs[-1].dtype, shape=list(shape), version=1
+    )

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,11 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import DepthOfField
+from torchdof.reference import metrics
 
 from .cases import Case, cases
 from .graph import INPUTS, OUTPUT, Portable
+from .interface import ITEMS
 from .metadata import facts_of, load, table_hash
 
 __all__ = ["TOLERANCE", "CaseComparison", "Verification", "check_format", "session", "verify"]
@@ -33,6 +36,8 @@ class CaseComparison:
         shape: Of the image, ``[B, C, H, W]``.
         max_error: Largest difference, relative to the local range.
         mean_error: Mean difference.
+        called_db: PSNR in dB of the file against the module as users call it, with layers for the scene, highlights ray
+            by ray and edges mended; display-encoded, infinite where both are the same.
         torch_s: Seconds in eager PyTorch.
         onnxruntime_s: Seconds in onnxruntime.
     """
@@ -41,6 +46,7 @@ class CaseComparison:
     shape: tuple[int, ...]
     max_error: float
     mean_error: float
+    called_db: float
     torch_s: float
     onnxruntime_s: float
 
@@ -73,12 +79,13 @@ class Verification:
         lines = [
             f"{self.title}: {self.bytes / 1000:.0f} kB, "
             f"{'verified' if self.passed else 'DIFFERS'} (largest error {self.max_error:.1e} of the local range)",
-            f"{'case':27} {'B x C x H x W':>17} {'max error':>9} {'mean':>9} {'torch ms':>8} {'onnx ms':>8}",
+            f"{'case':27} {'B x C x H x W':>17} {'max error':>9} {'mean':>9} {'as called dB':>12} "
+            f"{'torch ms':>8} {'onnx ms':>8}",
         ]
         for row in self.cases:
             shape = " x ".join(map(str, row.shape))
             lines.append(
-                f"{row.name:27} {shape:>17} {row.max_error:9.1e} {row.mean_error:9.1e} "
+                f"{row.name:27} {shape:>17} {row.max_error:9.1e} {row.mean_error:9.1e} {row.called_db:12.1f} "
                 f"{1000 * row.torch_s:8.1f} {1000 * row.onnxruntime_s:8.1f}"
             )
         return "\n".join(lines)
@@ -91,7 +98,7 @@ def verify(path: str | os.PathLike[str], dof: DepthOfField, *, large: bool = Fal
     weights; its inputs and output have the names, types and free sizes that :func:`to_onnx` promises; and onnxruntime
     renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the
     largest light within the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced
-    ones.
+    ones. How far it is from the module as users call it is told beside that.
 
     Args:
         path: The file.
@@ -154,9 +161,11 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     unit = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
     error = (torch.from_numpy(got) - expected).abs() / unit.clamp_min(torch.finfo(torch.float32).tiny)
     error = torch.where(torch.isfinite(error), error, torch.inf)
-    return CaseComparison(
-        case.name, tuple(got.shape), float(error.max()), float(error.mean()), middle - start, end - middle
-    )
+    with torch.no_grad():
+        called = metrics.display(portable.as_called(*case.tensors).nan_to_num(0.0))
+    called_db = metrics.psnr(metrics.display(torch.from_numpy(got).nan_to_num(0.0)), called)
+    errors = float(error.max()), float(error.mean()), called_db
+    return CaseComparison(case.name, tuple(got.shape), *errors, middle - start, end - middle)
 
 
 def check_format(model: onnx.ModelProto, path: str) -> None:
@@ -166,7 +175,7 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
         ValueError: Saying which.
     """
     whole = onnx.load(path, load_external_data=False)  # a loaded model no longer says where its weights were
-    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in whole.graph.initializer):
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(whole.graph)):
         raise ValueError(f"{path} keeps weights in another file")
     try:
         onnx.checker.check_model(path, full_check=True)
@@ -176,6 +185,16 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
     domains = sorted({entry.domain for entry in model.opset_import} - {"", "ai.onnx"})
     if domains:
         raise ValueError(f"{path} needs operators of {', '.join(domains)}; only standard ones are portable")
+
+
+def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
+    """All that a graph and its branches hold."""
+    yield from graph.initializer
+    for attribute in (attribute for node in graph.node for attribute in node.attribute):
+        if attribute.HasField("t"):
+            yield attribute.t
+        if attribute.HasField("g"):
+            yield from _tensors(attribute.g)
 
 
 def _check_origin(facts: dict, dof: DepthOfField) -> None:
@@ -194,8 +213,8 @@ def _check_origin(facts: dict, dof: DepthOfField) -> None:
 def _check_interface(model: onnx.ModelProto, inputs: str) -> int:
     """Names, types and free sizes; returns the channels."""
     channels = model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
-    single, colours = ("B", 1, "H", "W"), ("B", channels, "H", "W")
-    lens = (("B",), ("B",)) if inputs == "depth" else ()
+    single, colours = (ITEMS, 1, "H", "W"), ("B", channels, "H", "W")
+    lens = ((ITEMS,), (ITEMS,)) if inputs == "depth" else ()
     expected = [*zip(INPUTS[inputs], (colours, single, *lens), strict=True), (OUTPUT, colours)]
     got = []
     for value in (*model.graph.input, *model.graph.output):

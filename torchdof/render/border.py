@@ -73,17 +73,16 @@ def _beyond(line: Tensor, weight: Tensor, reach: int, farthest: int) -> Tensor:
     # means for distances that are powers of two; between them linear
     at = torch.arange(line.shape[-1], device=line.device)
     sums = functional.pad(torch.cat([line * weight, weight], 1).double().cumsum(-1), (1, 0))  # of what comes before
-    means = []
-    for level in range(farthest.bit_length() + 1):
-        half = _WIDTH * 2**level
-        start, stop = (at - half).clamp_min(0), (at + (half + 1)).clamp_max(line.shape[-1])
-        window = sums.index_select(-1, stop) - sums.index_select(-1, start)
-        total = window[:, -1:]
-        means.append((window[:, :-1] / torch.where(total > 0, total, 1.0)).to(line.dtype))
+    levels = farthest.bit_length() + 1
+    half = torch.tensor([_WIDTH * 2**level for level in range(levels)], device=line.device)[:, None]
+    start, stop = (at - half).clamp_min(0), (at + (half + 1)).clamp_max(line.shape[-1])  # [levels, n]
+    window = sums.index_select(-1, stop.flatten()) - sums.index_select(-1, start.flatten())
+    window = window.unflatten(-1, (levels, -1))  # [B, C + 1, levels, n]
+    total = window[:, -1:]
+    means = (window[:, :-1] / torch.where(total > 0, total, 1.0)).to(line.dtype)
     distance = torch.arange(1, reach + 1, device=line.device)
-    powers = torch.tensor([2**level for level in range(1, len(means))], device=line.device)
+    powers = torch.tensor([2**level for level in range(1, levels)], device=line.device)
     octave = (distance[:, None] >= powers).sum(1)
-    stack = torch.stack(means, 2)  # [B, C, levels, n]
     part = (distance / 2**octave - 1.0).to(line.dtype)[:, None]
-    mean = torch.lerp(stack.index_select(2, octave), stack.index_select(2, octave + 1), part)
+    mean = torch.lerp(means.index_select(2, octave), means.index_select(2, octave + 1), part)
     return torch.lerp(line[:, :, None], mean, 0.5)

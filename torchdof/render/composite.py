@@ -1,5 +1,6 @@
 """Layers, far to near, to one image: each is scattered with its kernel and composited with what is behind it."""
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 
 import torch
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
+from .exporting import where_needed
 from .plan import Blur
 from .scatter import fold
 from .surfaces import Frame
@@ -39,25 +41,26 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
-    colours, each = frame.colours, blurs[0].kernel.shape[0]
+    colours, backed = frame.colours, frame.behind is not None
 
+    # Beside light goes the share 1 - a that is left of what is behind, in sums of what is positive: behind bright light
+    # the rounding of a difference would show. Where nothing is behind, a itself: what is divided by it in the end.
     def normalised(layer: Tensor) -> Tensor:
-        """Colour and coverage, from scattered ``m_k I``, ``m_k`` and ``M_k``."""
-        light_and_weight, visible = layer.tensor_split((colours + each,), 1)
-        lacking = (_KNOWN - visible).clamp_min(0.0)
-        known = visible + lacking * lacking * (0.5 / _KNOWN)
-        return light_and_weight / (known if each == 1 else known.repeat(1, 2, 1, 1))
+        light, weight, beyond = layer.tensor_split((colours, (colours + layer.shape[1]) // 2), 1)
+        lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
+        beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
+        known = weight + beyond
+        return torch.cat([light / known, (beyond if backed else weight) / known], 1)
 
     def composited(front: Tensor, behind: Tensor) -> Tensor:
-        left = (1.0 - front[:, colours:]).clamp_min(0.0)
-        return torch.addcmul(front, left if each == 1 else left.repeat(1, 2, 1, 1), behind)
+        (light, share), (light_behind, share_behind) = (t.tensor_split((colours,), 1) for t in (front, behind))
+        left = share if backed else (1.0 - share).clamp_min(0.0)
+        share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
+        return torch.cat([torch.addcmul(light, left, light_behind), share], 1)
 
-    light_and_coverage = _composite_layers(frame, blurs, scatter, composited, normalised)
-    if frame.behind is None:
-        out = _mean(light_and_coverage, colours)
-    else:
-        light, coverage = light_and_coverage.tensor_split((colours,), 1)
-        out = torch.addcmul(light, (1.0 - coverage).clamp_min(0.0), frame.behind)
+    picture = _composite_layers(frame, blurs, scatter, composited, 1.0 if backed else 0.0, normalised)
+    light, left = picture.tensor_split((colours,), 1)
+    out = _mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
 
 
@@ -104,21 +107,31 @@ def _composite_layers(
     blurs: Sequence[Blur],
     scatter: Scatter,
     composited: Callable[[Tensor, Tensor], Tensor],
+    empty: float = 0.0,
     normalised: Callable[[Tensor], Tensor] | None = None,
 ) -> Tensor:
-    """All layers, far to near, over what is behind them: light ``[B, C, h, w]`` and, after it, its coverage.
+    """All layers, far to near: light ``[B, C, h, w]`` and, after it, what it is to be weighed with.
 
-    Coverage has one channel, or C where each colour has a kernel of its own. ``composited`` puts what is in front and
-    what is behind it together; ``normalised`` makes light and coverage of a layer's scattered terms, which without it
-    are just that.
+    The weights have one channel, or C where each colour has a kernel of its own, and are ``empty`` where there is no
+    layer. ``composited`` puts what is in front and what is behind it together; ``normalised`` makes light and weights
+    of a layer's scattered terms, which without it are just that.
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
     light = frame.surfaces[0].light
-    picture = light.new_zeros(light.shape[0], frame.colours + blurs[0].kernel.shape[0], *frame.area)
+    each = blurs[0].kernel.shape[0]
+
+    def blank(height: int, width: int) -> Tensor:
+        light_and_weight = light.new_zeros, functools.partial(light.new_full, fill_value=empty)
+        channels = frame.colours, each
+        parts = [new((light.shape[0], n, height, width)) for new, n in zip(light_and_weight, channels, strict=True)]
+        return torch.cat(parts, 1)
+
+    picture = blank(*frame.area)
 
     # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
     # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
-    most = CHANNELS // (frame.colours + 3) if blurs[0].kernel.shape[0] == 1 and blurs[0].cats_eye is None else 1
+    uniform = each == 1 and blurs[0].cats_eye is None
+    most = CHANNELS // (frame.colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
         groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and frame.nodes[k] < 0), [[]])
@@ -129,22 +142,17 @@ def _composite_layers(
     for (scale, _), groups in runs.items():
         part = picture
         if scale > 1:  # one pixel more on each side, to interpolate from
-            part = picture.new_zeros(*picture.shape[:2], *(n // scale + 2 for n in frame.area))
+            part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
-
-            def with_group(behind: Tensor, group: list[int] = group) -> Tensor:
-                for layer in _scattered(frame, blurs, scatter, group, normalised is not None):
-                    behind = composited(layer if normalised is None else normalised(layer), behind)
-                return behind
-
-            part = _where_needed(with_group, part, frame, blurs, group)
-
-        def with_run(behind: Tensor, part: Tensor = part, scale: int = scale) -> Tensor:
-            fine = upsampled(part, scale)
-            return composited(fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale], behind)
-
+            behind = part
+            for layer in _scattered(frame, blurs, scatter, group, normalised is not None):
+                part = composited(layer if normalised is None else normalised(layer), part)
+            part = where_needed(_needed(frame, blurs, group), part, behind)
         if scale > 1:
-            part = _where_needed(with_run, picture, frame, blurs, [k for group in groups for k in group])
+            fine = upsampled(part, scale)
+            fine = fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
+            needed = _needed(frame, blurs, [k for group in groups for k in group])
+            part = where_needed(needed, composited(fine, picture), picture)
         picture = part
     return picture
 
@@ -168,19 +176,11 @@ def _scattered(
     yield from scatter(terms, kernels, half).split(channels, 1)
 
 
-def _where_needed(
-    step: Callable[[Tensor], Tensor], picture: Tensor, frame: Frame, blurs: Sequence[Blur], layers: list[int]
-) -> Tensor:
-    """One step on a picture. A graph cannot choose its work beforehand: in one it is a branch, taken where needed."""
-    if not torch.compiler.is_exporting():
-        return step(picture)
-    ends = (-torch.inf, *frame.nodes, torch.inf)
-    needed = frame.any_between(ends[min(layers)], ends[max(layers) + 2], max(blurs[k].halo for k in layers))
-
-    def dense(picture: Tensor) -> Tensor:  # both branches must lie in memory the same way
-        return step(picture).clone(memory_format=torch.contiguous_format)
-
-    return torch.cond(needed, dense, torch.clone, (picture,))
+def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[[], Tensor]:
+    """Asks whether anything within reach of the frame's area lies in layers that follow each other."""
+    ends = (frame.nodes[0] - 1.0, *frame.nodes, frame.nodes[-1] + 1.0)
+    halo = max(blurs[k].halo for k in layers)
+    return functools.partial(frame.any_between, ends[min(layers)], ends[max(layers) + 2], halo)
 
 
 def _mean(summed: Tensor, colours: int) -> Tensor:

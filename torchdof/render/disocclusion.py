@@ -37,26 +37,26 @@ class _Level:
     def __init__(self, values: Tensor, size: tuple[int, int], step: int, vote: float | None, least_px: float) -> None:
         self.height, self.width = values.shape[-2:]
         self.size = size  # of the image
-        self.flat, self.light = values.transpose(0, 1).flatten(1), values[:, :-2]
+        self.flat, self.light = values.movedim(1, -1).flatten(0, 2), values[:, :-2]  # a place's numbers lie together
         self.step, self.vote, self.least_px = step, vote, least_px
 
     def behind(self, item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor]:
-        """Light and coc ``[C + 1, P]`` behind places ``[P]`` of the image, and their weight, 0 where nothing is.
+        """Light and coc ``[P, C + 1]`` behind places ``[P]`` of the image, and their weight, 0 where nothing is.
 
         Interpolated linearly among those of the four samples around that lie behind; plain interpolation would mix in
         the foreground's own colour.
         """
         row = _place(row, self.size[0], self.height, self.step)
         column = _place(column, self.size[1], self.width, self.step)
-        summed = total = torch.zeros_like(coc_px)
+        summed, total = torch.zeros_like(coc_px)[:, None], torch.zeros_like(coc_px)
         corners, down, right = pixels.corners(item, row, column, self.height, self.width)
         corner_weights = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
         for corner, corner_weight in zip(corners, corner_weights, strict=True):
-            sample = self.flat.index_select(1, corner)
-            weight = corner_weight * sample[-1] * _is_behind(sample[-2] - coc_px)
-            summed, total = summed + sample[:-1] * weight, total + weight
+            sample = self.flat.index_select(0, corner)
+            weight = corner_weight * sample[:, -1] * _is_behind(sample[:, -2] - coc_px)
+            summed, total = summed + sample[:, :-1] * weight[:, None], total + weight
         total = torch.where(total > 1e-4, total, 0.0)
-        return summed / total.clamp_min(1e-4), total
+        return summed / total.clamp_min(1e-4)[:, None], total
 
 
 def _is_behind(distance_px: Tensor) -> Tensor:
@@ -177,18 +177,18 @@ def fill_hidden(
     cell_places = (item, row, column, pixels.pick(nearest, cells)[0])
     total, seen = _search(searched, *cell_places, farthest=True)
     shown = pixels.indices(total > 0)
-    behind = pixels.put(searched[_FINE_LEVELS - 1].light, cells[shown], seen[:-1].index_select(1, shown))
+    behind = pixels.put(searched[_FINE_LEVELS - 1].light, cells[shown], seen[:, :-1].index_select(0, shown).t())
     if levels > _FINE_LEVELS:
         total, seen = _search(searched[_FINE_LEVELS:], *cell_places)
-        values = nearest.new_zeros(nearest.shape[0], len(seen) + 1, *nearest.shape[-2:])
-        values = pixels.put(values, cells, torch.cat([seen, total[None]]))
+        values = nearest.new_zeros(nearest.shape[0], seen.shape[1] + 1, *nearest.shape[-2:])
+        values = pixels.put(values, cells, torch.cat([seen, total[:, None]], 1).t())
         searched = [*searched[:_FINE_LEVELS], _Level(values, size, BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)]
 
     # each pixel behind which these levels show something gets it as its second sample
     hiding = pixels.indices(may_hide & wanted)
     total, seen = _search(searched, *pixels.places(hiding, height, width), pixels.pick(coc_px, hiding)[0])
     shown = pixels.indices(total > 0)
-    hiding, seen = hiding[shown], seen.index_select(1, shown)
+    hiding, seen = hiding[shown], seen.index_select(0, shown).t()
     return (
         pixels.put(other_light, hiding, seen[:-1]),
         pixels.put(other_coc_px, hiding, seen[-1]),
@@ -245,22 +245,22 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
 def _search(
     levels: list[_Level], item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[C + 1, P]``.
+    """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[P, C + 1]``.
 
     With ``farthest``, of two surfaces only the farther one counts.
     """
     total = torch.zeros_like(coc_px)
-    seen = coc_px.new_zeros(levels[0].flat.shape[0] - 1, 1)
+    seen = coc_px.new_zeros(1, levels[0].flat.shape[1] - 1)
     for level in levels:
         behind, weight = level.behind(item, row, column, coc_px)
         looked = (coc_px.abs() / level.least_px - 1.0).clamp(0.0, 1.0)
         vote = looked * (weight if level.vote is None else level.vote * (weight / _SURE).clamp(max=1.0))
         if farthest:
-            apart = behind[-1] - seen[-1]
+            apart = behind[:, -1] - seen[:, -1]
             vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
             total = total * (1.0 - (looked * weight / _CERTAIN).clamp(max=1.0) * _is_behind(apart))
         total = total + vote
-        seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
+        seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))[:, None]
     return total, seen
 
 

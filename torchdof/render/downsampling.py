@@ -31,14 +31,8 @@ _factors = KernelCache(2**20)
 
 
 def downsampled(values: Tensor, scale: int) -> Tensor:
-    """Mean of each ``scale x scale`` values, a power of two: ``[..., H, W] -> [..., H / scale, W / scale]``.
-
-    By halves, for a sum could overflow.
-    """
-    for _ in range(scale.bit_length() - 1):
-        rows = torch.lerp(values[..., 0::2, :], values[..., 1::2, :], 0.5)
-        values = torch.lerp(rows[..., 0::2], rows[..., 1::2], 0.5)
-    return values
+    """Mean of each ``scale x scale`` values: ``[B, C, H, W] -> [B, C, H / scale, W / scale]``."""
+    return values if scale == 1 else functional.avg_pool2d(values, scale)
 
 
 def upsampled(values: Tensor, scale: int) -> Tensor:

@@ -3,9 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
-from contextvars import ContextVar
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -16,29 +14,17 @@ from ..validation import is_traced
 from . import compiled, composite, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
+from .exporting import exported_graph, where_needed
+from .layer_weights import blur_axis
 from .matting import matte
 from .plan import Blur, Plan, tolerance_within
 from .scatter import fold
 from .surfaces import Frame, Surface, framed, surfaces_of_image
 
-__all__ = ["Tiling", "blur", "blur_attended", "blur_stack", "tiling"]
+__all__ = ["blur", "blur_attended", "blur_stack"]
 
 _REACH = 4.0  # blur radii within which what lies around a pixel can change it: its light, and what is filled in behind
 _SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
-
-
-class Tiling(NamedTuple):
-    """How an exported graph goes over a frame: ``render`` takes it, its kernels and what renders one piece of it.
-
-    ``align`` tells what the frame must be a multiple of, given the pixels that the widest kernel reaches.
-    """
-
-    align: Callable[[int], int]
-    render: Callable[[Frame, Sequence[Blur], Callable[[Frame, Sequence[Blur]], Tensor]], Tensor]
-
-
-tiling: ContextVar[Tiling | None] = ContextVar("tiling", default=None)
-"""Set by whoever exports a graph; frames are rendered whole else."""
 
 
 def blur(
@@ -188,7 +174,8 @@ def _render_item(
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
     out = out if has_room else out / scale
-    return out if valid is None else torch.where(valid, out, image)
+    out = out if valid is None else torch.where(valid, out, image)
+    return where_needed(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
 
 def _before_background(
@@ -222,9 +209,9 @@ def _composite(
 ) -> Tensor:
     """Surfaces, and the light of highlights, to a picture."""
     light = surfaces[0].light
-    layered, tiles = options.method == "layered", tiling.get() if torch.compiler.is_exporting() else None
+    layered, graph = options.method == "layered", exported_graph()
     blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
-    align = None if tiles is None else tiles.align
+    align = None if graph is None else graph.align
     lit = options.occlusion or options.normalize
     frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
@@ -239,4 +226,4 @@ def _composite(
             return composite.accumulate_once(frame, blurs, options.normalize)
         return composite.accumulate(frame, blurs, scatter, options.normalize, splats)
 
-    return picture(frame, blurs) if tiles is None else tiles.render(frame, blurs, picture)
+    return picture(frame, blurs) if graph is None else graph.render(frame, blurs, picture)

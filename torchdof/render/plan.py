@@ -21,6 +21,7 @@ __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "tolerance_within"]
 
 KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
+_LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
 _SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
 _kernels = KernelCache(256 * 2**20)
 
@@ -168,17 +169,19 @@ class Plan:
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
         finest = 1.0 if table.aperture is None else table.aperture.finest
         scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
-        if torch.compiler.is_compiling():  # no names of this process's, such as a cache's keys, in what is compiled
+        lens = table.fingerprint()
+        if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
             parts = flat.split([math.prod(shape) for shape in shapes])
-            longest = [(torch.sym_max(*size) + s - 1) // s for s in scales]
-            bank = [_masked(k.reshape(shape), n) for k, shape, n in zip(parts, shapes, longest, strict=True)]
+            bank = [_masked(k.reshape(shape), size, s) for k, shape, s in zip(parts, shapes, scales, strict=True)]
+        elif is_traced():
+            whole = [_kernel(table, lens, c, width, s, None) for c, s in zip(self.coc_px, scales, strict=True)]
+            bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
-            lens = table.fingerprint()
             bank = []
             for coc, scale in zip(self.coc_px, scales, strict=True):
-                longest_px = -(-max(size) // scale)
+                longest_px = max(-(-max(size) // scale), _LEAST_CUT)
                 reach = functools.partial(table.reach_px, coc / scale, width / scale)
                 reach_px = _kernels.get((lens, coc, width, scale), reach)
                 window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
@@ -260,8 +263,11 @@ for _constant in (_constant_shapes, _constant_kernels):  # one result each, for 
     _constant._dynamo_marked_constant = True  # type: ignore[union-attr]
 
 
-def _masked(kernel: Tensor, longest: int) -> Tensor:
-    """A kernel of traced code, which keeps its size: taps that reach beyond a frame ``longest`` pixels long are 0."""
+def _masked(kernel: Tensor, size: tuple[int, int], scale: int) -> Tensor:
+    """A kernel of traced code, which keeps its size: taps that reach beyond a frame of a size are 0."""
     half = kernel.shape[-1] // 2
+    if half < _LEAST_CUT:
+        return kernel
+    longest = torch.sym_max((torch.sym_max(*size) + scale - 1) // scale, _LEAST_CUT)
     within = (torch.arange(-half, half + 1, device=kernel.device).abs() < longest).to(kernel.dtype)
     return kernel * within * within[:, None]

@@ -88,25 +88,25 @@ class Frame:
         return [any(counts[max(2 * k - 1, 0) : 2 * k + 2]) for k in range(count)]
 
     def any_between(self, low: float, high: float, halo: int) -> Tensor:
-        """Whether anything, up to so far beyond the area, lies between two places on the blur axis: a bool tensor."""
-        places = [self.cut(s.x, halo) for s in self.surfaces]
-        return torch.stack([((x > low) & (x < high)).any() for x in places]).any()
+        """Whether anything, up to so far beyond the area, lies between two places on the blur axis: a bool ``[]``."""
+        middle, half = (low + high) / 2.0, (high - low) / 2.0
+        return torch.stack([(self.cut(s.x, halo) - middle).abs().min() for s in self.surfaces]).min() < half
 
     def layer(self, k: int, halo: int, visibility: bool) -> list[Tensor]:
         """What layer k scatters, with so many pixels beyond the area: light ``m_k I`` and its weight ``m_k``.
 
-        With visibility ``M_k`` as well, the weight at or behind the layer.
+        With visibility ``M_k - m_k`` as well, the weight behind the layer.
         """
         surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
         ramps = [[weight_at_or_behind(s.x, self.nodes, i) for i in (k, k + 1)] for s in surfaces]
         if self.occlusion:
             ramps = [[eased(ramp) for ramp in pair] for pair in ramps]
-        light, weight, behind = (_stacked if self.stacked else _mixed)(surfaces, ramps)
-        return [light, weight, behind] if visibility else [light, weight]
+        light, weight, beyond = (_stacked if self.stacked else _mixed)(surfaces, ramps)
+        return [light, weight, beyond] if visibility else [light, weight]
 
 
 def _mixed(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-    """``m_k I``, ``m_k`` and ``M_k`` of surfaces that share their pixels: each is a sum over them.
+    """``m_k I``, ``m_k`` and ``M_k - m_k`` of surfaces that share their pixels: each is a sum over them.
 
     Ramps are how much of each surface lies at or behind layer k, and behind it.
     """
@@ -114,8 +114,8 @@ def _mixed(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> tup
     for (light, _, cover), (behind, beyond) in zip(surfaces, ramps, strict=True):
         own = behind - beyond
         if cover is not None:
-            behind, own = behind * cover, own * cover
-        terms = [light * own, own, behind]
+            beyond, own = beyond * cover, own * cover
+        terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms
     return sums[0], sums[1], sums[2]
 
@@ -138,7 +138,8 @@ def _stacked(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> t
         arriving, visible = arriving * (1.0 - stops), visible * passes
         unknown = unknown * (1.0 - here)
     light = torch.stack([s.light * (visible * part) for s, part in zip(surfaces, stopped, strict=True)]).sum(0)
-    return light, visible * torch.stack(stopped).sum(0), visible * (1.0 - unknown)
+    own = visible * torch.stack(stopped).sum(0)
+    return light, own, visible * (1.0 - unknown) - own
 
 
 def framed(

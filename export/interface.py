@@ -1,0 +1,39 @@
+"""What a graph takes: one item for a whole batch where that makes sense, and names in the errors of runtimes."""
+
+import onnx_ir
+from onnx_ir.tape import Tape
+
+from .graph import INPUTS
+
+__all__ = ["ITEMS", "broadcast"]
+
+ITEMS = "B_or_1"
+"""Name of the batch axis of every input but the image."""
+
+
+def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
+    """Let every input but the image have one item for the whole batch, in place.
+
+    A runtime that meets a wrong shape names the node that cannot expand it.
+    """
+    graph = model.graph
+    image, *others = graph.inputs
+    tape = Tape()
+    shape = tape.op("Shape", [image])
+    batch, channels, stop = (tape.op("Constant", [], {"value_ints": [n]}) for n in (0, 1, 4))
+    two = tape.op("Constant", [], {"value_ints": [2]})
+    items, size = tape.op("Slice", [shape, batch, channels]), tape.op("Slice", [shape, two, stop])
+    whole = tape.op("Concat", [items, channels, size], {"axis": 0})
+    for value in others:
+        is_map = value.name == INPUTS[inputs][1]
+        what = "one_item_or_as_many_as_image" + ("_and_its_height_and_width" if is_map else "")
+        uses = list(value.uses())
+        expanded = tape.op("Expand", [value, whole if is_map else items], name=f"{value.name}_must_have_{what}")
+        for use in uses:
+            use.node.replace_input_with(use.idx, expanded)
+        value.shape = onnx_ir.Shape([ITEMS, *value.shape[1:]])
+    graph.outputs[0].shape = onnx_ir.Shape(image.shape)
+    graph.insert_before(next(iter(graph)), list(tape.nodes))
+    for number, node in enumerate(tape.nodes):
+        node.outputs[0].name = f"batch_{number}"
+    return model

@@ -1,0 +1,154 @@
+"""The structure of a graph, made of the operators that stand for it in what was traced (:mod:`.tiling`).
+
+What depends on a window becomes the body of a ``Loop`` over tiles. What only one side of a choice needs becomes that
+side's branch of an ``If``, so it is computed only when it is taken.
+"""
+
+import onnx_ir
+from onnx_ir.tape import Tape
+
+from .tiling import CHOICE, COLLECT, DOMAIN, WINDOW
+
+__all__ = ["structure"]
+
+_Owners = dict[onnx_ir.Graph, onnx_ir.Node]  # the node that a subgraph belongs to
+
+
+def structure(model: onnx_ir.Model) -> None:
+    """Make loops and branches of a flat graph, in place."""
+    owners: _Owners = {}
+    for node in _ours(model.graph, COLLECT):
+        _loop(model.graph, node, owners)
+    _branches(model.graph, owners)
+
+
+def _ours(graph: onnx_ir.Graph, name: str) -> list[onnx_ir.Node]:
+    return [node for node in graph if node.domain == DOMAIN and node.op_type == name]
+
+
+def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
+    """What lies between a window and its tiles, as the body of a loop that slices its window from the frame."""
+    window = next(node for node in _ours(graph, WINDOW))
+    dependent, body_nodes = {window}, []
+    for node in graph:
+        if node is not collect and any(v is not None and v.producer() in dependent for v in node.inputs):
+            dependent.add(node)
+            body_nodes.append(node)
+        if node is collect:
+            break
+    frame, tile = window.inputs[0], collect.inputs[0]
+    side, margin = (window.attributes[name].as_int() for name in ("side", "margin"))
+
+    before = Tape()
+    shape = before.op("Shape", [frame])
+    sizes = before.op("Slice", [shape, _ints(before, 2), _ints(before, 4)])
+    counts = before.op("Div", [before.op("Sub", [sizes, _ints(before, 2 * margin)]), _ints(before, side)])
+    batch = before.op("Slice", [shape, _ints(before, 0), _ints(before, 1)])
+    grid = before.op("Concat", [batch, counts], {"axis": 0})  # items, rows, columns
+    total = before.op("ReduceProd", [grid], {"keepdims": 0})
+    rows = before.op("Slice", [grid, _ints(before, 1), _ints(before, 2)])
+    columns = before.op("Slice", [grid, _ints(before, 2), _ints(before, 3)])
+    always = before.op("Constant", [], {"value": onnx_ir.tensor(True)})
+
+    step = _value("step", onnx_ir.DataType.INT64, [])
+    going = _value("going", onnx_ir.DataType.BOOL, [])
+    inside = Tape()
+    line = inside.op("Div", [step, columns])
+    place = [inside.op("Div", [line, rows]), inside.op("Mod", [line, rows]), inside.op("Mod", [step, columns])]
+    start = inside.op("Mul", [inside.op("Concat", place, {"axis": 0}), _ints(inside, 1, side, side)])
+    stop = inside.op("Add", [start, _ints(inside, 1, side + 2 * margin, side + 2 * margin)])
+    sliced = inside.op("Slice", [frame, start, stop, _ints(inside, 0, 2, 3)])
+    # runtimes cannot tell the size of a slice, and take their fast convolutions only for sizes that they know
+    cut = inside.op("Reshape", [sliced, _ints(inside, *window.outputs[0].shape.numpy())])
+    window.outputs[0].replace_all_uses_with(cut)
+    for node in body_nodes:
+        graph.remove(node)
+    goes_on = inside.op("Identity", [going])
+    after = Tape()
+    squeezed = after.op("Squeeze", [tile, _ints(after, 0)])
+    nodes = [*inside.nodes, *body_nodes, *after.nodes]
+    _type(goes_on, onnx_ir.DataType.BOOL, [])
+    _type(squeezed, tile.dtype, tile.shape[1:])
+    body = onnx_ir.Graph([step, going], [goes_on, squeezed], nodes=nodes, name="tile")
+    loop = onnx_ir.node("Loop", [total, always], {"body": body})
+    graph.insert_before(collect, [*before.nodes, loop])
+    owners[body] = loop
+    _replace(graph, collect, loop)
+    graph.remove(window, safe=True)
+
+
+def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
+    """Choices of a graph, outermost first, and of what they enclose."""
+    inside: list[onnx_ir.Graph] = []
+    while choices := _ours(graph, CHOICE):
+        choice = choices[-1]
+        branches = [_branch(graph, choice, index, owners) for index in (1, 2)]
+        taken = onnx_ir.node("If", [choice.inputs[0]], {"then_branch": branches[0], "else_branch": branches[1]})
+        for branch in branches:
+            owners[branch] = taken
+        graph.insert_before(choice, [taken])
+        _replace(graph, choice, taken)
+        inside += branches
+    inside += [a.as_graph() for n in graph if n.op_type == "Loop" for a in n.attributes.values()]
+    for subgraph in inside:
+        _branches(subgraph, owners)
+
+
+def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Owners) -> onnx_ir.Graph:
+    """The branch that gives an input of a choice; it takes over all nodes that nothing else needs."""
+    result = choice.inputs[index]
+    last = onnx_ir.node("Identity", [result])  # a branch gives what it makes itself
+    graph.insert_before(choice, [last])
+    choice.replace_input_with(index, last.outputs[0])
+    moved, open_nodes = {last}, [last]
+    while open_nodes:
+        for value in _taken(open_nodes.pop()):
+            node = value.producer()
+            if node is None or node.graph is not graph or node in moved:
+                continue
+            users = {_in(graph, use.node, owners) for output in node.outputs for use in output.uses()}
+            if users <= moved and not any(output.is_graph_output() for output in node.outputs):
+                moved.add(node)
+                open_nodes.append(node)
+    nodes = [node for node in graph if node in moved]
+    for node in nodes:
+        graph.remove(node)
+    _type(last.outputs[0], result.dtype, result.shape)
+    branch = onnx_ir.Graph([], last.outputs, nodes=nodes, name="branch")
+    owners[branch] = choice
+    return branch
+
+
+def _taken(node: onnx_ir.Node) -> list[onnx_ir.Value]:
+    """What a node and its subgraphs take."""
+    values = [value for value in node.inputs if value is not None]
+    for attribute in node.attributes.values():
+        if attribute.type == onnx_ir.AttributeType.GRAPH:
+            values += [value for inner in attribute.as_graph() for value in _taken(inner)]
+    return values
+
+
+def _in(graph: onnx_ir.Graph, node: onnx_ir.Node, owners: _Owners) -> onnx_ir.Node:
+    """The node of a graph that is, or holds, another node."""
+    while node.graph is not graph:
+        node = owners[node.graph]
+    return node
+
+
+def _replace(graph: onnx_ir.Graph, old: onnx_ir.Node, new: onnx_ir.Node) -> None:
+    output, other = new.outputs[0], old.outputs[0]
+    output.type, output.shape, output.name = other.type, other.shape, other.name
+    other.replace_all_uses_with(output, replace_graph_outputs=True)
+    graph.remove(old, safe=True)
+
+
+def _ints(tape: Tape, *values: int) -> onnx_ir.Value:
+    return tape.op("Constant", [], {"value_ints": values})
+
+
+def _value(name: str, kind: onnx_ir.DataType, shape: list[int]) -> onnx_ir.Value:
+    return onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
+
+
+def _type(value: onnx_ir.Value, kind: onnx_ir.DataType, shape: object) -> None:
+    value.type, value.shape = onnx_ir.TensorType(kind), onnx_ir.Shape(shape)

@@ -1,0 +1,61 @@
+"""What a file takes and how it says no: one item for a whole batch, cameras that cannot be, wrong sizes."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+
+LENS = torch.tensor([1.0]), torch.tensor([0.3])
+
+
+def test_one_depth_and_one_lens_serve_a_whole_batch(plain: Any) -> None:
+    images, depth = torch.rand(3, 3, 20, 31), 1.0 + 4.0 * torch.rand(1, 1, 20, 31)
+    apart = torch.cat([plain.render(image[None], depth, *LENS) for image in images])
+    assert float((apart - images).abs().max()) > 0.1
+    assert torch.equal(plain.render(images, depth, *LENS), apart)
+
+
+@pytest.mark.parametrize(
+    ("focus_m", "f_number"),
+    [(0.0, 2.0), (-1.0, 2.0), (math.nan, 2.0), (1.0, 0.0), (1.0, -2.0), (1.0, math.nan), (1.0, math.inf)],
+)
+def test_a_camera_that_cannot_be_gives_nan_everywhere_and_only_for_its_item(
+    plain: Any, focus_m: float, f_number: float
+) -> None:
+    images, depth = torch.rand(2, 3, 12, 17), 1.0 + 4.0 * torch.rand(2, 1, 12, 17)
+    out = plain.render(images, depth, torch.tensor([focus_m, 1.0]), torch.tensor([f_number, 0.3]))
+    assert torch.isnan(out[0]).all() and torch.isfinite(out[1]).all()
+    # a plane in focus is no exception
+    assert torch.isnan(plain.render(images[:1], torch.ones(1, 1, 12, 17), *out.new_tensor([[focus_m], [f_number]])))[
+        0
+    ].all()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("depth", (2, 1, 20, 30)), ("depth", (3, 1, 20, 31)), ("focus_m", (3,)), ("f_number", (3,))]
+)
+def test_a_wrong_shape_is_named(plain: Any, name: str, shape: tuple[int, ...]) -> None:
+    runner = onnxruntime.InferenceSession(plain.path, providers=["CPUExecutionProvider"])
+    feed = {"image": np.ones((2, 3, 20, 31)), "depth": np.ones((1, 1, 20, 31)), "focus_m": [1.0], "f_number": [2.0]}
+    feed[name] = np.ones(shape)
+    with pytest.raises(Exception, match=f"{name}_must_have_one_item_or_as_many_as_image"):
+        runner.run(None, {key: np.asarray(value, np.float32) for key, value in feed.items()})
+
+
+def test_loading_says_nothing(layered: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    onnxruntime.InferenceSession(layered.path, providers=["CPUExecutionProvider"])
+    assert not capfd.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["ONNXModule", "ONNXSequential"])
+def test_kornia_runs_a_file(plain: Any, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # where it keeps files of its own
+    onnx_classes = pytest.importorskip("kornia.onnx")
+    tensors = torch.rand(1, 3, 20, 31), 1.0 + 4.0 * torch.rand(1, 1, 20, 31), *LENS
+    runner = getattr(onnx_classes, kind)(str(plain.path))
+    got = runner(*(tensor.numpy() for tensor in tensors))[0]
+    torch.testing.assert_close(torch.from_numpy(got), plain.eager(*tensors), atol=1e-5, rtol=0)

@@ -1,0 +1,43 @@
+"""What whoever exports a graph puts in: a graph cannot look at numbers and then choose its work, as eager code does."""
+
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .plan import Blur
+from .surfaces import Frame
+
+__all__ = ["Graph", "exported_graph", "graph_context", "where_needed"]
+
+
+class Graph(NamedTuple):
+    """How an exported graph goes over a frame.
+
+    Args:
+        align: What the frame must be a multiple of, given the pixels that the widest kernel reaches.
+        render: The picture of a frame, from it, its kernels and what renders one piece of it.
+        choose: ``(needed, result, given)`` to the result where it is needed, else what is given. What only the result
+            needs is computed only then.
+    """
+
+    align: Callable[[int], int]
+    render: Callable[[Frame, Sequence[Blur], Callable[[Frame, Sequence[Blur]], Tensor]], Tensor]
+    choose: Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+graph_context: ContextVar[Graph | None] = ContextVar("graph_context", default=None)
+"""Set by whoever exports a graph."""
+
+
+def exported_graph() -> Graph | None:
+    """The graph that this code is being traced for; None: it is run, or compiled."""
+    return graph_context.get() if torch.compiler.is_exporting() else None
+
+
+def where_needed(needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
+    """A result that a graph computes only if it is needed, a bool ``[]``; what is given is the same where it is not."""
+    graph = exported_graph()
+    return result if graph is None else graph.choose(needed(), result, given)
