@@ -147,9 +147,9 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
-    radii: Sequence[float] = (),
-    rims: tuple[float, float] = (0.0, 0.0),
-    squeeze: float = 1.0,
+    radii: Sequence[float],
+    rims: tuple[float, float],
+    squeeze: float,
 ) -> Tensor:
     """Depth of field of one item, on as many threads as PyTorch uses.
 
@@ -164,7 +164,7 @@ def render(
         masked: Values may be NaN or infinite; such pixels pass through.
         highlights: Highlights are splatted ray by ray where layers would not do.
         crisp_px: Blur from which on layers soften highlights.
-        radii: Signed coc of each layer in its own pixels, where kernels depend on the place.
+        radii: Signed coc of each layer in its own pixels; 0 where kernels do not depend on the place.
         rims: How far the lens's front and rear rim move before the opening in the corners of the frame, in its radii.
         squeeze: Height of the blur over its width.
 

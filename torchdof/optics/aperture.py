@@ -280,8 +280,8 @@ def _checked_mask(mask: Any) -> Tensor:
         raise ValueError("mask must hold finite transmissions >= 0, not all of them 0")
     longer = max(values.shape)
     if longer > _MOST_SIDE:
-        size = [max(1, round(n * _MOST_SIDE / longer)) for n in values.shape]
-        values = functional.adaptive_avg_pool2d(values[None, None], size)[0, 0]
+        height, width = (max(1, round(n * _MOST_SIDE / longer)) for n in values.shape)
+        values = functional.adaptive_avg_pool2d(values[None, None], (height, width))[0, 0]
     return values / values.max()
 
 
