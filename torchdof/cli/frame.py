@@ -106,7 +106,8 @@ class Rendered:
         settings, names = self.settings, ("focus_m", "f_number", "focal_length_mm", "sensor_width_mm")
         camera: dict[str, Any] | None = None
         if self.camera is not None:
-            camera, ends = {name: float(getattr(self.camera, name)) for name in names}, self.camera.focus_range_m
+            camera = {name: float(getattr(self.camera, name)) for name in names}
+            ends = self.camera.focus_range_m
             camera |= {"focus_range_m": None if ends is None else [float(end) for end in ends]}
             camera |= {"tilt_deg": float(self.camera.tilt_deg), "swing_deg": float(self.camera.swing_deg)}
         facts: dict[str, Any] = {"out": self.out, "camera": camera, "assumed": self.remarks}
