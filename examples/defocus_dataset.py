@@ -22,7 +22,9 @@ def main() -> None:
     parser.add_argument("--images", type=Path, required=True, help="folder of all-in-focus images")
     parser.add_argument("--depths", type=Path, help="folder of their depth maps; left out: the images' own Z channels")
     parser.add_argument("--out", type=Path, required=True, help="folder of the data set")
-    parser.add_argument("--depth-kind", default="z", help="z, distance, disparity, inverse")
+    parser.add_argument("--depth-kind", default="z", help="z, disparity, inverse, or relative, as estimators give it")
+    parser.add_argument("--near-m", type=float, help="distance of the nearest value of relative depth")
+    parser.add_argument("--far-m", type=float, help="distance of the farthest value of relative depth")
     parser.add_argument("--depth-scale", type=float, help="factor of the depth values, such as 0.001 for millimetres")
     parser.add_argument("--depth-offset", type=float, default=0.0, help="added to the depth values first")
     parser.add_argument("--fill-depth", help="nearest or far: where pixels without depth take theirs from")
@@ -46,6 +48,9 @@ def main() -> None:
         p=1.0,
         tolerance=arguments.tolerance,
     )
+    numbers = {"scale": arguments.depth_scale, "offset": arguments.depth_offset}
+    if arguments.depth_kind == "relative":
+        numbers = {"near_m": arguments.near_m, "far_m": arguments.far_m}
     make_dataset(
         pairs_in(arguments.images, arguments.depths),
         arguments.out,
@@ -55,12 +60,7 @@ def main() -> None:
         copies=arguments.copies,
         format=arguments.format,
         seed=arguments.seed,
-        depth={
-            "kind": arguments.depth_kind,
-            "scale": arguments.depth_scale,
-            "offset": arguments.depth_offset,
-            "fill": arguments.fill_depth,
-        },
+        depth={"kind": arguments.depth_kind, "fill": arguments.fill_depth, **numbers},
     )
 
 

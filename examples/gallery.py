@@ -6,6 +6,8 @@ Usage: python examples/gallery.py --out docs/pictures
 """
 
 import argparse
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,7 +26,7 @@ from torchdof.reference.scenes import read_scenes
 ROOT = Path(__file__).parents[1]
 MOTORCYCLE, SCENES = ROOT / "examples/data/motorcycle", ROOT / "tests/data/scenes"
 FOV_X_DEG, APERTURE_RADIUS_M = 40.85, 0.04  # wider than lenses are made, so that a picture of 741 pixels shows it
-TABLES = ("disc", "gaussian", "sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4")
+TABLES = ("sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4")
 
 
 def motorcycle() -> tuple[Tensor, Tensor]:
@@ -99,7 +101,26 @@ def draw_inspect(path: Path) -> None:
 
 
 def draw_lenses(path: Path) -> None:
-    """Small lights, from 14 px in front of the focus to 14 px behind it, through five lenses."""
+    """Small lights through five lenses."""
+    tables = {"disc": torchdof.BlurTable.disc(), "gaussian": torchdof.BlurTable.gaussian()}
+    tables |= {name: torchdof.BlurTable.load(name) for name in TABLES}
+    draw_lights(path, tables)
+
+
+def draw_shapes(path: Path) -> None:
+    """Small lights through openings that are not round."""
+    polygon = torchdof.BlurTable.polygon
+    tables = {"5 blades": polygon(5), "7, rounded": polygon(7, curvature=0.4), "9, turned": polygon(9, rotation_deg=20)}
+    draw_lights(path, tables | {"anamorphic": polygon(8, squeeze=2.0), "bright rim": polygon(6, rim=2.0)})
+
+
+def draw_bokeh(path: Path) -> None:
+    """A street at night through six lenses, as ``examples/bokeh.py`` draws it."""
+    subprocess.run([sys.executable, ROOT / "examples/bokeh.py", "--out", path, "--height", "320"], check=True)
+
+
+def draw_lights(path: Path, tables: dict[str, torchdof.BlurTable]) -> None:
+    """Small lights, from 14 px in front of the focus to 14 px behind it."""
     height, width, cocs = 150, 220, (-14.0, -7.0, 0.0, 7.0, 14.0)
     image, coc_px = torch.full((1, 3, height, width), 0.01), torch.zeros(1, 1, height, width)
     for column, coc in enumerate(cocs):
@@ -107,9 +128,7 @@ def draw_lenses(path: Path) -> None:
         coc_px[..., left : left + 44] = coc
         for row, colour in ((40, (1.0, 0.75, 0.4)), (110, (0.5, 0.7, 1.0))):
             image[0, :, row, left + 22] = 0.8 * 3.1416 * max(abs(coc), 0.6) ** 2 * torch.tensor(colour)
-    tables = {name: torchdof.BlurTable.disc() for name in TABLES[:1]}
-    tables |= {"gaussian": torchdof.BlurTable.gaussian()} | {n: torchdof.BlurTable.load(n) for n in TABLES[2:]}
-    write_sheet(path, {n: torchdof.blur_by_coc(image, coc_px, table=table) for n, table in tables.items()})
+    write_sheet(path, {name: torchdof.blur_by_coc(image, coc_px, table=table) for name, table in tables.items()})
 
 
 def draw_layers(path: Path) -> None:
@@ -162,6 +181,8 @@ GALLERY: dict[str, Callable[[Path], None]] = {
     "show_focus.jpg": draw_show_focus,
     "inspect.jpg": draw_inspect,
     "lenses.jpg": draw_lenses,
+    "shapes.jpg": draw_shapes,
+    "bokeh.jpg": draw_bokeh,
     "layers.jpg": draw_layers,
     "truth_lamps.jpg": draw_truth,
     "truth_bars.jpg": draw_truth,

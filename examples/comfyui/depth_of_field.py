@@ -11,11 +11,13 @@ from torchdof.cli.frame import tint_focus
 from torchdof.depth import from_relative
 from torchdof.depth.size import at_size_of
 from torchdof.io.transfer import decode, encode
+from torchdof.optics.aperture import Aperture
 
 __all__ = ["NODE_CLASS_MAPPINGS", "NODE_DISPLAY_NAME_MAPPINGS", "DepthOfFieldNode"]
 
 _NEAR_IS_WHITE, _FAR_IS_WHITE, _METRES = "white is near", "white is far", "metres"
 _POINT, _DISTANCE = "point", "metres"
+_SHAPES = {"as the lens": None, **{f"{count} blades": count for count in range(5, 10)}}
 
 
 def _lenses() -> list[str]:
@@ -61,6 +63,9 @@ class DepthOfFieldNode:
                 "focal_length_mm": _number(50.0, 1.0, 2000.0, 1.0, "Focal length; longer blurs more."),
                 "sensor_width_mm": _number(36.0, 1.0, 200.0, 0.1, "Width of the sensor that the image fills."),
                 "lens": (_lenses(), {"tooltip": "How the lens blurs: ideal, or measured from a real one."}),
+                "shape": ([*_SHAPES], {"tooltip": "Shape of points out of focus: the lens's own, or a polygon."}),
+                "rotation_deg": _number(0.0, -180.0, 180.0, 1.0, "Turns the polygon counter-clockwise."),
+                "squeeze": _number(1.0, 0.5, 2.0, 0.05, "Height of the blur over its width: 2 for an anamorphic lens."),
                 "quality": (["final", "preview", "draft"], {"tooltip": "Accepted error: 1, 4 or 8 of 255."}),
             }
         }
@@ -80,6 +85,9 @@ class DepthOfFieldNode:
         focal_length_mm: float,
         sensor_width_mm: float,
         lens: str,
+        shape: str,
+        rotation_deg: float,
+        squeeze: float,
         quality: Any,
     ) -> tuple[Tensor, Tensor]:
         """Render.
@@ -99,6 +107,9 @@ class DepthOfFieldNode:
             focal_length_mm: Its focal length.
             sensor_width_mm: Width of the sensor.
             lens: Name of a blur table.
+            shape: Shape of points out of focus.
+            rotation_deg: Turns it.
+            squeeze: Height of the blur over its width.
             quality: Tolerance by name.
 
         Returns:
@@ -121,6 +132,8 @@ class DepthOfFieldNode:
             camera = camera.focus_at(metres, min(focus_x * width, width - 0.5), min(focus_y * height, height - 0.5))
         ideal = {"disc": BlurTable.disc, "gaussian": BlurTable.gaussian}
         table = ideal[lens]() if lens in ideal else BlurTable.load(lens)
+        if _SHAPES[shape] or squeeze != 1.0:
+            table = table.with_aperture(Aperture(_SHAPES[shape] or 0, rotation_deg, squeeze=squeeze))
         with torch.no_grad():
             out = depth_of_field(light, metres, camera, table=table, tolerance=quality)
         tinted = tint_focus(light, camera.coc_px(metres, width).expand(len(light), -1, -1, -1), has_alpha)[:, :3]

@@ -73,8 +73,8 @@ class Lens:
         stop: Number of the surface that is the aperture stop.
         name: Short name.
         source: Where the numbers are from.
-        partial: Partial dispersion P_gF of the medium behind each surface ``[S]``, as in glass catalogues; NaN, and None
-            for all, takes that of a normal glass with its Abbe number.
+        partial: Partial dispersion P_gF of the medium behind each surface ``[S]``, as in glass catalogues; NaN, and
+            None for all, takes that of a normal glass with its Abbe number.
 
     Raises:
         ValueError: If a number is outside its range.

@@ -10,8 +10,8 @@
 Millimetres. ``thickness`` is the distance to the next surface, ``index`` the refractive index behind the surface and
 ``diameter`` the clear diameter. Radius 0 is the aperture stop (its index 0: unchanged), ``inf`` a flat surface.
 ``1.67/47.1`` is an index at 587.56 nm (the d line) with its Abbe number V, and ``1.67/47.1/0.557`` has its partial
-dispersion P_gF too, as glass catalogues list them; without any the glass has the same index at any wavelength. ``#`` starts
-a comment; ``# source:`` is kept.
+dispersion P_gF too, as glass catalogues list them; without any the glass has the same index at any wavelength. ``#``
+starts a comment; ``# source:`` is kept.
 """
 
 from __future__ import annotations

@@ -85,8 +85,11 @@ def noise_near(pair: Forward, solution: Solution, near: Mask) -> float:
     rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
     mixed_differences = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
     inside = near[1:-1, 1:-1]
-    noise = float(np.sqrt(np.mean(mixed_differences[inside] ** 2))) if inside.any() else 0.0
-    return max(noise, noise_of(pair.data)) / np.sqrt(fine_share(pair.noise_correlation))
+    seen = float(np.mean(mixed_differences[inside] ** 2)) if inside.any() else 0.0
+    light = float(np.mean(np.maximum(pair.data[near] - solution.background, 0.0))) if near.any() else 0.0
+    known = noise_of(pair.data) ** 2 + pair.shot_noise * light
+    # what is more is not noise of the camera's kind, and need not go together in neighbours
+    return float(np.sqrt(known / fine_share(pair.noise_correlation) + max(seen - known, 0.0)))
 
 
 def check_fit(
@@ -190,7 +193,9 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None, stacklevel
     height, peak = float(remaining[y, x]), pair.data_dot.peak
     # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of noise that goes together in neighbours
     smooth = fine_share(pair.noise_correlation) * independent_share(pair.noise_correlation)
-    if height > max(_SPOT * 0.14 * noise_of(pair.data) / np.sqrt(smooth), _SPOT_MATTERS * peak):
+    around = remaining[beyond]
+    usual = 1.4826 * float(np.median(np.abs(around - np.median(around))))  # of a JPEG's blocks, too
+    if height > max(_SPOT * max(0.14 * noise_of(pair.data) / np.sqrt(smooth), usual), _SPOT_MATTERS * peak):
         text = (
             f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), "
             f"{distance[y, x]:.0f} px from the dot and beyond its blur: is there another dot, dust or a reflection? "

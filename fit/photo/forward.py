@@ -58,6 +58,7 @@ class Forward:
         magnification: size of the blurred picture's dot over the sharp one's, as expected.
         fit_moves: which of displacement and magnification are fitted.
         held_magnification: the one to use where it is not fitted, and to start from; None takes the expected one.
+        shot_noise: how much the variance of a pixel's noise, as second differences see it, grows with its level.
         distance: of each pixel from the blurred dot's centre `[H, W]`, px.
         noise_correlation: how the noise of neighbouring pixels goes together, from the dark paper.
         start: kernel parameters to start from beside the moments, by family.
@@ -73,6 +74,7 @@ class Forward:
     held_magnification: float | None = None
     start: dict[str, dict[str, float]] = field(default_factory=dict)
     prior: dict[str, tuple[float, float]] = field(default_factory=dict)
+    shot_noise: float = 0.0
 
     def __post_init__(self) -> None:
         """Prepare the window the source is drawn in and the size of the Fourier grid."""

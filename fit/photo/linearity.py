@@ -8,10 +8,11 @@ import numpy as np
 
 from ..problems import NotInFocusWarning, NotLinearWarning, warn
 from ..result import Array
-from .dot import Dot, noise_inside
+from .dot import Dot, noise_inside, noise_of
 from .dot_model import Edge, draw_edge, soft_edge
+from .forward import Forward, Solution
 
-__all__ = ["EXPLAINED", "SENSOR_BLUR_PX", "check_focus", "check_linearity", "focused"]
+__all__ = ["EXPLAINED", "SENSOR_BLUR_PX", "check_focus", "check_linearity", "check_noise", "focused"]
 
 EXPLAINED = 1.15
 """Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
@@ -23,11 +24,12 @@ _ENCODED = 0.7
 _UNFOCUSED_PX = 1.0  # no camera leaves an edge softer than this in focus
 _FOCUSED_PX = 0.5  # what it leaves on average: between a perfect lens and a demosaiced picture
 _MATTERS = 0.02  # share of the kernel's size
+_MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
 _STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
 
-def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> None:
-    """Warn where a sharp picture shows that it is not in linear light: by its noise, or by its dot's edge."""
+def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> bool:
+    """Whether a sharp picture seems to be in linear light, by its noise and its dot's edge; warns where it does not."""
     inside = noise_inside(still, dot)
     # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
     if inside and dot.noise > (1 + 4 / np.sqrt(inside[1])) * inside[0] and dot.noise > 1e-4 * dot.peak:
@@ -37,7 +39,7 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stackl
             "encoded; is the image linear? Decode it first"
         )
         warn(NotLinearWarning(text, file=file, number=ratio), stacklevel)
-        return
+        return False
     steepness, error = _steepness(still, dot, edge)
     if steepness > max(_STEEP, _CERTAIN * error):
         text = (
@@ -45,9 +47,9 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stackl
             "S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without them"
         )
         warn(NotLinearWarning(text, file=file, number=steepness), stacklevel)
-        return
+        return False
     if edge.misfit < EXPLAINED:
-        return
+        return True
     bent = soft_edge(still, dot, fit_exponent=True)
     if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
         text = (
@@ -55,6 +57,40 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stackl
             "encoded (about 0.45); is the image linear? Decode it first"
         )
         warn(NotLinearWarning(text, file=file, number=bent.exponent), stacklevel)
+        return False
+    return True
+
+
+def check_noise(pair: Forward, solution: Solution, level: float, file: str | None, stacklevel: int = 4) -> None:
+    """Warn where the noise is largest at middling levels: light's grows along a line, and a tone curve bends that.
+
+    Args:
+        pair: the pictures.
+        solution: what was found.
+        level: of the sharp dot.
+        file: named in the warning.
+        stacklevel: where the warning points.
+    """
+    residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
+    rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
+    mixed_differences = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
+    share = ((np.nan_to_num(solution.model) - solution.background) / (solution.gain * level))[1:-1, 1:-1]
+    middling = (share > _MIDDLING[0]) & (share < _MIDDLING[1]) & pair.used[1:-1, 1:-1]
+    count = int(middling.sum())
+    if count < _FEWEST:
+        return
+    found = float(np.mean(mixed_differences[middling] ** 2))
+    light = solution.gain * level * float(share[middling].mean())
+    expected = noise_of(pair.data) ** 2 + pair.shot_noise * light
+    # second differences of neighbours go together: a third of them is independent
+    most = _LOUDER * (1 + 4 * np.sqrt(2 * 3 / count))
+    if found > most * expected and found > (1e-4 * level) ** 2:
+        text = (
+            f"the noise at middling levels is {np.sqrt(found / expected):.1f} times what paper and dot have: "
+            "a tone curve (an S-curve, a picture style), or compression. The kernel's size may be off by 15 %; develop "
+            "without them"
+        )
+        warn(NotLinearWarning(text, file=file, number=float(np.sqrt(found / expected))), stacklevel)
 
 
 def focused(edge: Edge) -> Edge:

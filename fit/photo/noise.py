@@ -54,6 +54,8 @@ def correlation_of(values: Array, used: Mask) -> Array:
     wide[:size, :size] = found
     spectrum_of_found = np.fft.rfft2(np.roll(wide, (-LAGS, -LAGS), (0, 1))).real
     found = np.roll(np.fft.irfft2(np.maximum(spectrum_of_found, 0.0), wide.shape), (LAGS, LAGS), (0, 1))[:size, :size]
+    if not found[LAGS, LAGS] > 0:
+        return white
     found = found / found[LAGS, LAGS]
     return np.asarray(np.where(np.abs(found) > 1e-9, found, 0.0))  # without the transform's rounding
 

@@ -17,11 +17,11 @@ from ..result import Array, BlurFit
 from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
 from .diagnostics import check_fit
-from .dot import find_dot
+from .dot import find_dot, noise_inside
 from .dot_model import Edge, soft_edge
 from .family_choice import COST, choose
 from .forward import ALL_MOVES, Forward, Solution
-from .linearity import EXPLAINED, check_focus, check_linearity, focused
+from .linearity import EXPLAINED, check_focus, check_linearity, check_noise, focused
 from .profile_fit import fit_profile
 from .radial import solve_radial, solve_round
 from .ratio import blur_strength
@@ -123,7 +123,7 @@ def fit_pair(
         r, strength, spokes = blur_strength(still, data)
         fit = fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes)
         return replace(fit, model="ratio")
-    pair, edge = prepared_pair(still, data, source, magnification, white, files)
+    pair, edge, linear = prepared_pair(still, data, source, magnification, white, files)
     if start is not None and start.family in FAMILIES:
         pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
     pair.prior = dict(prior or {})
@@ -142,6 +142,8 @@ def fit_pair(
     fit = describe(pair, solutions[family], why)
     # a family that was chosen for being cheap is not to blame for what the free profile explains
     check_fit(pair, solutions[family], fit, files, describe(pair, solutions["radial"], "") if why else fit)
+    if edge is not None and linear:
+        check_noise(pair, solutions[family], edge.level, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)
@@ -193,18 +195,22 @@ def prepared_pair(
     magnification: float,
     white: float | None,
     files: tuple[str | None, str | None],
-) -> tuple[Forward, Edge | None]:
-    """Find the dots, leave out what is clipped, and decide what stands for the sharp dot, whose edge comes with it."""
+) -> tuple[Forward, Edge | None, bool]:
+    """Find the dots, leave out what is clipped, and decide what stands for the sharp dot.
+
+    With it come the sharp dot's edge, and whether the sharp picture seems to be in linear light.
+    """
     data_dot = find_dot(data, file=files[1])
     used = used_pixels(data, data_dot, white, files[1], "blurred")
     if still is None:
-        return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None
+        return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None, False
     dot = find_dot(still, file=files[0])
     whole = used_pixels(still, dot, white, files[0], "sharp", refuse=False)
     clipped = int(np.sum(~whole))
     edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)
-    if not clipped:
-        check_linearity(still, dot, edge, files[0])
+    linear = clipped > 0 or check_linearity(still, dot, edge, files[0])
+    bright = noise_inside(still, dot)
+    shot_noise = 0.0 if bright is None else max(bright[0] ** 2 - dot.noise**2, 0.0) / edge.level
     if clipped:
         warn(
             SaturatedWarning(
@@ -218,9 +224,9 @@ def prepared_pair(
     # a spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified
     close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
     explained = close and edge.radius > 2 * edge.softness
-    if clipped or source == "dot" or (source == "auto" and explained):
-        return Forward(IdealDot.of(dot, focused(edge)), data, used, data_dot, magnification), edge
-    return Forward(PictureOfDot.of(still, dot), data, used, data_dot, magnification), edge
+    ideal = clipped or source == "dot" or (source == "auto" and explained)
+    stand_in = IdealDot.of(dot, focused(edge)) if ideal else PictureOfDot.of(still, dot)
+    return Forward(stand_in, data, used, data_dot, magnification, shot_noise=shot_noise), edge, linear
 
 
 def _with_magnification(pair: Forward) -> Forward:

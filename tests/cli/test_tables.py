@@ -1,5 +1,6 @@
 """``torchdof tables`` from the outside."""
 
+import json
 from pathlib import Path
 
 import pytest

@@ -14,6 +14,7 @@ from torch import Tensor
 import torchdof.distributed.shards
 from torchdof import BlurTable, Camera, depth_of_field
 from torchdof.augmentation import RandomDepthOfField
+from torchdof.depth import from_relative
 from torchdof.distributed import Pair, RenderShards, pairs_in, shard_rows, summary_of
 from torchdof.io.images import Picture, read_image, write_image
 
@@ -129,6 +130,13 @@ def test_cameras_may_be_given(pairs: list[Pair], tmp_path: Path) -> None:
     assert [*files][:2] == ["00000000.blurred.png", "00000000.json"]
 
 
+def test_depth_without_a_scale_lies_between_two_distances(pairs: list[Pair], tmp_path: Path) -> None:
+    made(tmp_path / "out", shard_rows(pairs), depth={"kind": "relative", "near_m": 1.0, "far_m": 8.0})
+    depth = np.load(io.BytesIO(members(tmp_path / "out" / "shard-000000.tar")["00000000.depth.npy"]))
+    values = torch.from_numpy(np.load(str(pairs[0].depth)))[None, None].float()
+    np.testing.assert_allclose(depth, from_relative(values, 1.0, 8.0)[0, 0].numpy(), rtol=1e-5)
+
+
 def test_a_lens_is_drawn_and_named(pairs: list[Pair], tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     blur = RandomDepthOfField(**{**BLUR, "table": [BlurTable.disc(), BlurTable.gaussian()]})
@@ -169,6 +177,8 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
         ({"keep": "blurred"}, "keep must be some of"),
         ({"picture": ".jpg"}, "picture must be"),
         ({"blur": "disc"}, "blur must be a RandomDepthOfField"),
+        ({"depth": {"scal": 2.0}}, "depth must be some of kind, scale, offset, .* got scal"),
+        ({"depth": {"kind": "relative"}}, "depth must be some of kind, near_m, .*, with near_m and far_m, got kind"),
         ({"seed": -1}, "seed must be a whole number"),
         ({"threads": 0}, "threads must be a whole number"),
     ],

@@ -122,6 +122,19 @@ def test_every_lens_of_the_list_can_be_had(node: Any, lens: str) -> None:
     render(node, image, depth, lens=lens, sensor_width_mm=4.0)
 
 
+def test_points_out_of_focus_have_the_shape(node: Any) -> None:
+    image, depth = torch.zeros(1, 41, 41, 3), torch.full((1, 41, 41, 3), 5.0)
+    image[:, 20, 20] = 1.0
+    changes = {"depth_kind": "metres", "focus": "metres", "focus_m": 1.5, "sensor_width_mm": 1.6}
+    spots = {}
+    for name, shape in {"round": {}, "blades": {"shape": "5 blades"}, "oval": {"squeeze": 2.0}}.items():
+        spots[name] = render(node, image, depth, **changes, **shape)[0][0, ..., 0]
+    high, wide = ((spots["oval"] > 0.02).any(dim).sum() for dim in (1, 0))
+    assert float(high / wide) > 1.5
+    torch.testing.assert_close(spots["round"], spots["round"].flip(0), rtol=0.0, atol=0.02)
+    assert float((spots["blades"] - spots["blades"].flip(0)).abs().max()) > 0.03
+
+
 def test_a_small_depth_one_depth_and_alpha_are_taken(node: Any) -> None:
     image = torch.rand(2, 18, 24, 4)
     out, focus = render(node, image, torch.rand(1, 9, 12, 3), sensor_width_mm=4.0)

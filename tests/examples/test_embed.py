@@ -1,6 +1,7 @@
 """The samples of `examples/embed` give the pixels of the file that they run."""
 
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
@@ -13,6 +14,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+
+from torchdof.depth import from_relative
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "examples" / "data" / "motorcycle"
@@ -58,6 +61,11 @@ def linear(encoded: np.ndarray) -> np.ndarray:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
+def area_means(old: int, new: int) -> np.ndarray:
+    """``[new, old]``: the share of each old pixel in the mean of a new one."""
+    return np.kron(np.eye(new), np.ones(old)).reshape(new, old, new).sum(2) / old
+
+
 def rendered(exported: Any, light: np.ndarray, depth_m: np.ndarray) -> np.ndarray:
     """What the file makes of ``[H, W, 3]`` light and ``[H, W, 1]`` metres in Python's onnxruntime."""
     image, depth = (torch.tensor(x.transpose(2, 0, 1)[None], dtype=torch.float32) for x in (light, depth_m))
@@ -86,24 +94,50 @@ def test_python_needs_no_torch(plain: Any, tmp_path: Path) -> None:
     not (NODE_FOLDER / "node_modules" / "onnxruntime-web").is_dir(),
     reason="onnxruntime-web is not installed: npm install --prefix build/node onnxruntime-web",
 )
-@pytest.mark.parametrize("kind", ["png", "npy"])
-def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path, kind: str) -> None:
+def test_javascript_gives_the_pixels_of_the_file(plain: Any, tmp_path: Path) -> None:
     shutil.copytree(EMBED / "javascript", tmp_path / "sample")
     (tmp_path / "sample" / "node_modules").symlink_to(NODE_FOLDER / "node_modules")
     photo, depth_mm = crop()
-    depth_file = tmp_path / f"depth.{kind}"
-    if kind == "png":
-        write(depth_file, depth_mm)
-    else:
-        np.save(depth_file, depth_mm[..., 0] / 1000)
     call = ["node", str(tmp_path / "sample" / "run_onnx.mjs"), str(plain.path)]
-    call += [str(write(tmp_path / "photo.png", photo)), str(depth_file), str(tmp_path / "out.png")]
-    call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER), "--scale", "0.001" if kind == "png" else "1"]
+    call += [
+        str(write(tmp_path / "photo.png", photo)),
+        str(write(tmp_path / "depth.png", depth_mm)),
+        str(tmp_path / "out.png"),
+    ]
+    call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER), "--scale", "0.001"]
     assert "128 x 96" in run(call)
     value = rendered(plain, linear(photo / 255), np.where(depth_mm > 0, depth_mm / 1000, np.nan)).clip(0, 1)
     codes = np.rint(255 * np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055))
     difference = np.abs(np.rint(255 * pixels(tmp_path / "out.png")[..., :3]) - codes)
     assert difference.max() <= 1 and (difference > 0).mean() < 1e-3
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")
+def test_javascript_decodes_resizes_and_scales_as_python_does(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    rgba = generator.integers(0, 256, (6, 10, 4), np.uint8)
+    values = generator.uniform(3, 9, (4, 5))
+    (tmp_path / "rgba.bin").write_bytes(rgba.tobytes())
+    np.save(tmp_path / "depth.npy", values)
+    got = json.loads(run(["node", str(ROOT / "tests" / "examples" / "modules.mjs"), str(tmp_path)]))
+
+    light = linear(rgba[..., :3] / 255).transpose(2, 0, 1)
+    np.testing.assert_allclose(np.reshape(got["light"], light.shape), light, atol=1e-6)
+    expected = area_means(6, 3) @ light @ area_means(10, 4).T
+    np.testing.assert_allclose(np.reshape(got["smaller"], expected.shape), expected, atol=1e-6)
+    assert got["codes"] == [255 if i % 4 == 3 else i // 4 for i in range(1024)]
+    assert got["beyond"] == [0, 255, 0, 255]
+    assert got["png"] == rgba.flatten().tolist()
+
+    assert got["size"] == [5, 4]
+    np.testing.assert_allclose(got["values"], values.flatten(), rtol=1e-6)
+    for kind in ("disparity", "depth"):
+        expected = from_relative(torch.from_numpy(values)[None, None], 1.0, 5.0, kind).flatten()
+        np.testing.assert_allclose(got[kind], expected, rtol=1e-5)
+    assert got["resized"] == [1, 1, 2, 2, 3, 3, 4, 4, 3, 3, 4, 4]
+    assert got["holes"] == [2, 5, 5, 2, 5, 5, 1, 1, 1, 1, 1, 1] and got["share"] == 9 / 12
+    assert "greater than the nearest, got 5 m to 1 m" in got["wrongWay"]
+    assert "PNG file or a NumPy array" in got["noFile"] and "damaged" in got["cut"]
 
 
 @pytest.mark.skipif(

@@ -156,8 +156,8 @@ try {
     const wide = await page.evaluate(() => document.documentElement.scrollWidth)
     results[`${name}_overflow`] = wide - width
   }
-} finally {
   writeFileSync(join(out, 'results.json'), JSON.stringify(results, null, 2))
+} finally {
   await browser.close()
   server.kill()
 }

@@ -15,10 +15,21 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, native
+from torchdof.optics.aperture import Aperture
 from torchdof.render.plan import Plan
 from torchdof.render.scatter import fold
 
 BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
+SHAPED = [
+    BlurTable.polygon(3, 20.0, squeeze=1.6),
+    BlurTable.polygon(5, 7.0, 0.4, rim=2.0),
+    BlurTable.from_aperture(torch.eye(9).cumsum(0)[:, :6]),
+]
+CATS_EYES = [
+    BlurTable.disc().with_aperture(Aperture(vignetting=0.4)),
+    BlurTable.polygon(5, 10.0, squeeze=1.5, vignetting=(0.6, 1.2)),
+    BY_COLOUR.with_aperture(Aperture(vignetting=0.5)),
+]
 TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15"), BY_COLOUR]
 
 
@@ -143,6 +154,26 @@ def test_engines_agree_on_highlights(occlusion: bool, table: BlurTable, by_both:
     image, coc = torch.rand(1, 3, 90, 110), random_map("smooth", (1, 90, 110), 15.0)
     image[..., 20:85:9, 15:100:13] *= 1000.0
     assert_same_picture(by_both(Scene(image, coc, {"table": table, "occlusion": occlusion}).blurred), image)
+
+
+@pytest.mark.parametrize("table", [*SHAPED[::2], *CATS_EYES], ids=str)
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_engines_agree_on_lopsided_kernels_with_highlights(occlusion: bool, table: BlurTable, by_both: Any) -> None:
+    for kind, radius in (("smooth", 13.0), ("planes", 5.0)):
+        image, coc = torch.rand(1, 3, 70, 90), random_map(kind, (1, 70, 90), radius)
+        image[..., 20:65:9, 15:80:13] *= 1000.0
+        assert_same_picture(by_both(Scene(image, coc, {"table": table, "occlusion": occlusion}).blurred), image)
+
+
+@pytest.mark.parametrize("table", SHAPED, ids=str)
+def test_engines_and_fold_agree_on_lopsided_kernels(table: BlurTable, by_both: Any) -> None:
+    image, coc = torch.rand(1, 3, 40, 50), random_map("planes", (1, 40, 50), 6.0)
+    for occlusion in (True, False):
+        options: dict[str, Any] = {"table": table, "occlusion": occlusion, "tolerance": 0}
+        plain, compiled = by_both(Scene(image, coc, options).blurred)
+        folded = blur_by_coc(image, coc, method="fold", **options)
+        assert_same_picture((plain, compiled), image)
+        assert_same_picture((folded, compiled), image)
 
 
 @pytest.mark.parametrize("occlusion", [True, False])

@@ -22,10 +22,12 @@ import torch
 from torch import Tensor
 
 from ..augmentation import RandomDepthOfField
+from ..depth.holes import resolve_holes
 from ..depth.reading import read_depth
+from ..depth.relative import from_relative
 from ..depth.size import at_size_of
 from ..io.atomic import whole_file
-from ..io.images import Picture, read_image, write_image
+from ..io.images import Picture, read_image, read_values, write_image
 from ..io.transfer import Transfer
 from ..validation import show, whole
 from .pairs import Pair
@@ -35,6 +37,8 @@ __all__ = ["Format", "RenderShards", "shard_name", "shard_rows"]
 Format = Literal["webdataset", "parquet"]
 
 _SUFFIXES: dict[str, str] = {"webdataset": ".tar", "parquet": ".parquet"}
+_METRIC = ("kind", "scale", "offset", "unknown", "fov_x_deg", "fill", "channel")
+_RELATIVE = ("kind", "near_m", "far_m", "relative_kind", "value_range", "unknown", "fill", "channel")
 _KEPT = ("blurred", "sharp", "depth")
 
 
@@ -91,7 +95,9 @@ class RenderShards:
     Args:
         out: Folder of the shards; it must be there.
         blur: Draws focus, f-number and lens, and renders; its ``p`` does not count, every sample is blurred.
-        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`.
+        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`; or, of depth
+            without a scale, ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}``, with ``relative_kind``,
+            ``value_range`` and ``unknown`` as in :func:`torchdof.depth.from_relative`, and ``fill`` and ``channel``.
         format: "webdataset" or "parquet" (which needs pyarrow).
         keep: What is written of each sample: of "blurred", "sharp" and "depth".
         seed: Of the draws; a sample's own draw depends on it and on its key alone.
@@ -140,6 +146,10 @@ class RenderShards:
         if not isinstance(self.blur, RandomDepthOfField):
             raise ValueError(f"blur must be a RandomDepthOfField, got {show(blur)}")
         self.depth = dict(depth or {})
+        known = _RELATIVE if self.depth.get("kind") == "relative" else _METRIC
+        if not set(self.depth) <= {*known} or (known is _RELATIVE and not {"near_m", "far_m"} <= set(self.depth)):
+            needed = ", with near_m and far_m" if known is _RELATIVE else ""
+            raise ValueError(f"depth must be some of {', '.join(known)}{needed}, got {', '.join(map(str, self.depth))}")
         self.format: Format = format
         self.keep = tuple(keep)
         self.seed = whole("seed", seed, 0, 2**62)
@@ -211,7 +221,7 @@ class RenderShards:
     def _sample(self, sample: Mapping[str, Any]) -> dict[str, Any]:
         """One sample by the names of its files, beside its parameters."""
         source = read_image(sample["image"], self.transfer)
-        depth = at_size_of(source.pixels, read_depth(sample["depth"] or sample["image"], **self.depth))
+        depth = at_size_of(source.pixels, self._metres(sample["depth"] or sample["image"]))
         drawn = self._drawn(sample, tuple(source.pixels.shape))
         with torch.no_grad():
             blurred = self.blur(source.pixels, depth, params=drawn, transfer="linear")
@@ -237,6 +247,8 @@ class RenderShards:
             "focus_breathing": camera.focus_breathing,
             "table": options.table.name or options.table.family,
             "table_fingerprint": options.table.fingerprint(),
+            "aperture": None if options.table.aperture is None else repr(options.table.aperture),
+            "camera": repr(camera),
             "tolerance": options.tolerance,
             "occlusion": options.occlusion,
             "method": options.method,
@@ -246,6 +258,15 @@ class RenderShards:
             "torchdof": importlib.metadata.version("torchdof"),
         }
         return record
+
+    def _metres(self, path: str) -> Tensor:
+        """Depth from a file, ``[1, 1, h, w]``, without holes."""
+        how = dict(self.depth)
+        if how.get("kind") != "relative":
+            return read_depth(path, **how)
+        fill, channel = how.pop("fill", None), how.pop("channel", None)
+        how["kind"] = how.pop("relative_kind", "disparity")
+        return resolve_holes(from_relative(read_values(path, channel), **how), path, fill)[0]
 
     def _drawn(self, sample: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Tensor]:
         """The parameters of a sample: its own draw, with what is given put in its place."""

@@ -1,4 +1,8 @@
-"""Transfer curves: what a file stores to linear light and back, with alpha straight or premultiplied."""
+"""Transfer curves: what a file stores to linear light and back, with alpha straight or premultiplied.
+
+``kornia.color.rgb_to_linear_rgb`` and its inverse give the same bits in [0, 1]. They are not used because they take
+nothing but three channels, do not mirror negative light, and take a second to import.
+"""
 
 from typing import Literal
 

@@ -372,29 +372,30 @@ def _cells(
 
     They are the middle of a PSF that reaches ``whole`` pixels. Cells are ``aspect`` times as wide as high.
     """
+    slices = 16 if whole <= 64 else 8
     if aperture is None or aperture.is_round:
-        return _round_cells(family, lengths, half, whole, aspect)
+        return _round_cells(family, lengths, half, slices, aspect)
     radius = opening_radius(family, lengths)
     if family == "disc":
         return aperture.shares(half, 1.0 / radius, aspect / radius)
     count = _PARTS if half <= _CACHED_HALF_WIDTH else 1
     fine = count * half + count // 2
     in_parts = {k: v * count if k in LENGTHS else v for k, v in lengths.items()}
-    light = _round_cells(family, in_parts, fine, whole, aspect)
-    lit = _round_cells("disc", {"radius": _reach(family, in_parts)}, fine, whole, aspect)  # where the profile has any
+    light = _round_cells(family, in_parts, fine, slices // count, aspect)
+    lit = _round_cells("disc", {"radius": _reach(family, in_parts)}, fine, slices, aspect)  # where the profile has any
     share = aperture.shares(fine, 1.0 / (count * radius), aspect / (count * radius))
     parts = torch.where(lit > 0, light / torch.where(lit > 0, lit, 1.0), 0.0) * share
     return parts.unflatten(-1, (-1, count)).unflatten(-3, (-1, count)).mean((-3, -1))
 
 
-def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, whole: int, aspect: Tensor | None) -> Tensor:
+def _round_cells(family: str, lengths: Mapping[str, Tensor], half: int, slices: int, aspect: Tensor | None) -> Tensor:
     """Integral of a profile over each cell, lengths in cells: ``[..., 2 half + 1, 2 half + 1]``."""
     if family == "gaussian":
         quadrant = _gaussian_quadrant(lengths["sigma"], half, aspect)
     elif family == "disc":
         quadrant = _disc_quadrant(lengths["radius"], half, aspect)
     else:
-        quadrant = _sliced_quadrant(family, lengths, half, 16 if whole <= 64 else 8, aspect)
+        quadrant = _sliced_quadrant(family, lengths, half, slices, aspect)
     cells = torch.cat([quadrant[..., 1:, :].flip(-2), quadrant], -2)
     return torch.cat([cells[..., 1:].flip(-1), cells], -1)
 

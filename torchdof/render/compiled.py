@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,7 +36,7 @@ def picture(
     engine's entry, ``torchdof.render.pipeline._render_item``.
     """
     aperture = options.table.aperture
-    if aperture is not None and (aperture.depends_on_place or (torch.is_grad_enabled() and aperture.requires_grad)):
+    if torch.is_grad_enabled() and aperture is not None and aperture.requires_grad:
         return None
     given = [t for t in (light, coc, behind_light, behind_coc, cover) if t is not None]
     if options.method != "layered" or is_traced() or not native.chosen() or not all(map(_is_plain, given)):
@@ -86,6 +87,7 @@ def _render(
         masked=kind != "stack" and not options.check,
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
+        **_across_the_frame(options.table, blurs),
     )
     if kind != "background":
         try:
@@ -94,6 +96,16 @@ def _render(
             pass
     scale = float(headroom.factor(*(light[None] for light, _, _ in surfaces[:2])))
     return render([(light * scale, coc, weight) for light, coc, weight in surfaces]) / scale
+
+
+def _across_the_frame(table: BlurTable, blurs: Sequence[Blur]) -> dict[str, Any]:
+    """What the compiled engine is told of kernels that depend on the place."""
+    aperture = table.aperture
+    if aperture is None or not aperture.depends_on_place:
+        return {}
+    strength, radius = aperture.rim
+    radii = [0.0 if blur.cats_eye is None else blur.cats_eye.coc_px for blur in blurs]
+    return {"radii": radii, "rim": (2.0 * strength, radius, float(aperture.squeeze))}
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:

@@ -46,7 +46,7 @@ def passed(kernel: Tensor, aperture: Aperture, coc_px: Tensor, y: Tensor, x: Ten
     shift = 2.0 * strength * coc
     down, across = step[:, None] + shift * y, step * aperture.squeeze + shift * x
     # a rim that is shifted by less than a pixel cuts off less: kernels of the middle stay as they are
-    slack = kernel.shape[-1] * (1.0 - shift.abs() * _length(y, x)).clamp_min(0.0)
+    slack = 4.0 * (coc.abs() + 1.0) * (1.0 - shift.abs() * _length(y, x)).clamp_min(0.0)
     share = (radius * coc.abs() + 0.5 + slack - _length(down, across)).clamp(0.0, 1.0).unsqueeze(-3)
     cut = kernel * share
     light, left = (k.sum((-2, -1), keepdim=True) for k in (kernel, cut))

@@ -69,7 +69,7 @@ function shares(length, count) {
 }
 
 /**
- * Linear light to opaque 8-bit sRGB, rounded to the nearest code; what is brighter than white becomes white.
+ * Linear light to opaque 8-bit sRGB, rounded to the nearest code; what is brighter than white becomes white, NaN black.
  *
  * @param {Float32Array} light [3, height, width]
  * @returns {Uint8ClampedArray} height * width * 4 bytes, as ImageData takes them.
@@ -80,7 +80,7 @@ export function srgbBytes(light) {
   for (let i = 0; i < plane; i++) {
     for (let c = 0; c < 3; c++) {
       const value = light[c * plane + i]
-      let code = value < 1 ? CODE_OF_CELL[Math.max(0, Math.floor(value * CELLS))] : 255
+      let code = value >= 1 ? 255 : (CODE_OF_CELL[Math.max(0, Math.floor(value * CELLS))] ?? 0)
       while (code < 255 && value >= NEXT_CODE_AT[code]) code++
       rgba[4 * i + c] = code
     }

@@ -44,6 +44,12 @@ typedef struct {
   const int32_t *halves;   // its kernel reaches so many of these to each side
   int32_t kernel_colours;  // 1, or channels: kernels for each colour
   const float *kernels;    // one layer after the other, [kernel_colours, 2 half + 1, 2 half + 1]
+  const float *radii;      // signed coc of each layer in its own pixels
+
+  // What the lens's rim cuts off kernels, as render/vignetting.py tells it.
+  float rim_shift;   // of the rim in the frame's corners, in radii of the opening; 0: kernels are alike everywhere
+  float rim_radius;  // in radii of the opening
+  float squeeze;     // height of the blur over its width
 
   int32_t threads;
   const volatile int32_t *cancelled;  // rendering stops soon after it becomes 1

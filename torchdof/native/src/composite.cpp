@@ -68,6 +68,7 @@ struct Scratch {
   std::vector<float *> mine;    // a row of each surface's share
   float *rest;                  // what lies wholly behind a coarse layer
   std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for 16 columns
+  std::vector<Kernel> cut;  // a layer's kernels as the lens's rim leaves them
   std::vector<const float *> pointers;
   std::vector<uint64_t> layers, block_layers;
   std::vector<WindowBlock> blocks;
@@ -327,7 +328,7 @@ class Composite {
       else
         block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, (size_t)spare * pitch_ + spare, b);
       if (!d) find_occupied(b, spare, rows + 2 * l.half, spare, columns + 2 * l.half);
-      lay(b, l, rows, columns, spare, spare);
+      lay(b, l, rows, columns, spare, spare, tile_y - 1, tile_x - 1);
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
@@ -732,8 +733,23 @@ class Composite {
     return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
   }
 
-  // Spreads the terms of a layer, which begin at a row and a column of the window, and lays them on the tile's canvas.
-  void lay(Scratch &b, const Layer &l, int rows, int columns, int first, int from) {
+  // A layer's kernels at a strip, whose row and column are counted in its pixels from the frame's corner.
+  const Kernel *kernels_at(Scratch &b, const Layer &l, int row, int column) const {
+    const torchdof_scene &scene = job_.scene;
+    if (scene.rim_shift == 0) return l.kernels.data();
+    const int before = l.scale > 1;  // a canvas of coarser resolution begins one pixel before the frame
+    const int block = (column + before) / Rim::COLUMNS * Rim::COLUMNS - before;
+    const float per = per_half_diagonal(scene);
+    const float y = ((row + 0.5f * STRIP_ROWS) * l.scale - 0.5f * H_) * per, x = ((block + 0.5f * Rim::COLUMNS) * l.scale - 0.5f * W_) * per;
+    const Rim rim(scene, l.coc, y, x);
+    b.cut.resize(E_);
+    for (int e = 0; e < E_; e++) cut_kernel(l.kernels[e], rim, b.cut[e]);
+    return b.cut.data();
+  }
+
+  // Spreads the terms of a layer, which begin at a row and a column of the window, and lays them on the tile's canvas,
+  // whose corner lies so many of the layer's pixels from the frame's.
+  void lay(Scratch &b, const Layer &l, int rows, int columns, int first, int from, int top, int left) {
     for (int y = rows; y < ceil_div(rows, STRIP_ROWS) * STRIP_ROWS; y++) {
       const int row = first + y + 2 * l.half;
       b.occupied[row] = b.open[row] = b.uneven[row] = 0;
@@ -750,10 +766,11 @@ class Composite {
         const uint32_t within = strip_inputs(from + x, l.half);
         if (!(occupied & within)) continue;
         const size_t at = (size_t)(first + y) * pitch_ + from + x;
+        const Kernel *kernels = kernels_at(b, l, top + y, left + x);
         if (over_)
-          lay_strip(b, l, at, first + y, within, open & within, uneven & within, y * TILE + x);
+          lay_strip(b, kernels, at, first + y, within, open & within, uneven & within, y * TILE + x);
         else
-          add_strip(b, l, at, first + y, within, y * TILE + x);
+          add_strip(b, kernels, at, first + y, within, y * TILE + x);
       }
     }
   }
@@ -763,10 +780,10 @@ class Composite {
     convolve_strip(b.term[term] + from, pitch_, rows, within, kernel, to);
   }
 
-  void add_strip(Scratch &b, const Layer &l, size_t from, int y, uint32_t within, int at) {
+  void add_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, int at) {
     float spread_of[STRIP];
     for (int v = 0; v < C_ + E_; v++) {
-      const Kernel &kernel = l.kernels[E_ == 1 ? 0 : v < C_ ? v : v - C_];
+      const Kernel &kernel = kernels[E_ == 1 ? 0 : v < C_ ? v : v - C_];
       spread(b, std::min(v, C_), from, &b.occupied[y], within, kernel, spread_of);
       for (int i = 0; i < STRIP; i += LANES) {
         float *to = b.canvas[v] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
@@ -775,10 +792,10 @@ class Composite {
     }
   }
 
-  void lay_strip(Scratch &b, const Layer &l, size_t from, int y, uint32_t within, bool open, bool uneven, int at) {
+  void lay_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, bool open, bool uneven, int at) {
     float share[STRIP], room[STRIP], gain[STRIP], left[STRIP], light[STRIP];
     for (int e = 0; e < E_; e++) {
-      const Kernel &kernel = l.kernels[e];
+      const Kernel &kernel = kernels[e];
       if (uneven)
         spread(b, C_ + 1, from, b.every.data(), ~0u, kernel, room);
       else
@@ -912,7 +929,7 @@ class Composite {
           stack_terms(l, first, reach_rows, from, reach_columns, b);
         else
           window_terms(reaching[next], first, reach_rows, from, reach_columns, b);
-        lay(b, l, rows, columns, first, from);
+        lay(b, l, rows, columns, first, from, y0, x0);
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);

@@ -50,9 +50,10 @@ void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns,
 
 }  // namespace
 
-Kernel make_kernel(const float *values, int half) {
+Kernel make_kernel(const float *values, int half, bool one_sided) {
   Kernel k;
   k.half = half;
+  k.symmetric = one_sided;
   const int side = 2 * half + 1, stride = stride_of(half);
   double sum = 0;
   for (int y = 0; y < side; y++)
@@ -71,6 +72,27 @@ Kernel make_kernel(const float *values, int half) {
         for (int o = 0; o < ROWS; o++) k.reach[y + o] = std::max(k.reach[y + o], std::abs(d));
     }
   return k;
+}
+
+void cut_kernel(const Kernel &whole, const Rim &rim, Kernel &cut) {
+  const int half = whole.half, side = 2 * half + 1, stride = stride_of(half);
+  cut.half = half;
+  cut.symmetric = false;
+  cut.sum = whole.sum;
+  cut.reach = whole.reach;
+  cut.taps = whole.taps;
+  float left = 0;
+  for (int d = -half; d <= half; d++) {
+    float *taps = cut.taps.data() + (size_t)(d + half) * stride + ROWS - 1;
+    for (int y = 0; y < side; y++) taps[y] *= rim.share((float)(half - y), (float)-d);
+    for (int y = 0; y < side; y++) left += taps[y];
+  }
+  if (!(left > Rim::LEAST * whole.sum)) {
+    cut.taps = whole.taps;
+    return;
+  }
+  const float gain = whole.sum / left;
+  for (float &tap : cut.taps) tap *= gain;
 }
 
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out) {

@@ -20,7 +20,8 @@ Job::Job(const torchdof_scene &scene)
     l.at = (float)l.node;
     l.per_after = k == scene.layers - 1 ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
     const int side = 2 * l.half + 1;
-    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half));
+    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, scene.rim_shift == 0));
+    if (scene.rim_shift != 0) l.coc = scene.radii[k];
     layers.push_back(std::move(l));
   }
 }
@@ -153,7 +154,7 @@ void Job::take_scene() {
 void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
-  const bool several = layers.size() > 1, background = scene.kind == TORCHDOF_BACKGROUND;
+  const bool several = layers.size() > 1 || scene.rim_shift != 0, background = scene.kind == TORCHDOF_BACKGROUND;
   const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
   // without occlusion highlights matter where coarse layers would soften them
   const bool limited = several && (scene.occlusion || (scene.highlights && scene.crisp_px < reach));
@@ -189,7 +190,7 @@ class JobOf : public AnyJob {
 namespace TORCHDOF_SIMD {
 static AnyJob *begin(const torchdof_scene &scene) { return new JobOf<Job>(scene); }
 static void convolve_all(const float *in, int height, int width, const float *values, int half, float *out) {
-  const Kernel kernel = make_kernel(values, half);
+  const Kernel kernel = make_kernel(values, half, true);
   const int rows = (height + 15) / 16 * 16, columns = (width + 15) / 16 * 16, pitch = columns + 2 * half + 16;
   std::vector<float> window((size_t)(rows + 2 * half) * pitch);
   float spread[STRIP];

@@ -131,6 +131,7 @@ struct Layer {
   double node = 0;
   float before = 0, per_before = 0, at = 0, per_after = 0;  // ramps to the layer and beyond it
   bool first = false;
+  float coc = 0;                // in its own pixels
   std::vector<Kernel> kernels;  // one, or one a colour
 };
 
@@ -332,7 +333,29 @@ class Downsampled {
 
 // What is spread at once: rows, and columns beside each other.
 constexpr int STRIP_ROWS = 4, STRIP_COLUMNS = 2 * LANES, STRIP = STRIP_ROWS * STRIP_COLUMNS;
-Kernel make_kernel(const float *values, int half);
+Kernel make_kernel(const float *values, int half, bool one_sided);
+
+// What the lens's rim lets through at a place in the frame: render/vignetting.py.
+struct Rim {
+  static constexpr int COLUMNS = 16;     // whose pixels share a kernel, STRIP_ROWS high
+  static constexpr float LEAST = 1e-6f;  // share of a kernel; where less passes it stays whole
+  float coc, down, across, reach, squeeze;
+  Rim(const torchdof_scene &scene, float coc, float y, float x)  // place in half diagonals from the frame's middle
+      : coc(coc), down(scene.rim_shift * coc * y), across(scene.rim_shift * coc * x), squeeze(scene.squeeze) {
+    const float shifted = std::fabs(scene.rim_shift * coc) * std::sqrt(y * y + x * x + 1e-12f);
+    const float slack = 4.0f * (std::fabs(coc) + 1.0f) * std::max(1.0f - shifted, 0.0f);
+    reach = scene.rim_radius * std::fabs(coc) + 0.5f + slack;
+  }
+  float share(float dy, float dx) const {
+    const float y = dy + down, x = dx * squeeze + across;
+    return clamp01(reach - std::sqrt(y * y + x * x + 1e-12f));
+  }
+};
+inline float per_half_diagonal(const torchdof_scene &scene) {
+  return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);
+}
+// A kernel, made not one-sided, with what does not pass left out and its light made whole again.
+void cut_kernel(const Kernel &whole, const Rim &rim, Kernel &cut);
 // Columns from which a strip at column x is spread, counted from its input's first: a bit for each 16 of them.
 inline uint32_t strip_inputs(int x, int half) {
   uint32_t columns = 0;

@@ -281,6 +281,27 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
     const int half = std::max(halves[ray.radius], halves[ray.radius + 1]);
+    // what the lens's rim lets through, and by how much that is made brighter
+    const bool is_cut = job.scene.rim_shift != 0;
+    const float per = per_half_diagonal(job.scene);
+    const Rim rim(job.scene, ray.coc, (ray.row + 0.5f - 0.5f * H) * per, (ray.column + 0.5f - 0.5f * W) * per);
+    std::vector<float> gain(E, 1.0f);
+    std::vector<uint8_t> whole(E, !is_cut);
+    for (int e = 0; e < E && is_cut; e++) {
+      double all_light = 0, left = 0;
+      for (int which = ray.radius; which <= ray.radius + 1; which++) {
+        const int h = halves[which], side = 2 * h + 1;
+        const float part = which == ray.radius ? 1.0f - ray.part : ray.part, *values = kernels[which] + (size_t)e * side * side;
+        for (int y = 0; y < side; y++)
+          for (int x = 0; x < side; x++) {
+            const float light_here = part * values[y * side + x];
+            all_light += light_here;
+            left += light_here * rim.share((float)(y - h), (float)(x - h));
+          }
+      }
+      whole[e] = !(left > Rim::LEAST * all_light);
+      gain[e] = whole[e] ? 1.0f : (float)(all_light / left);
+    }
     // adds a row of one of its two kernels
     auto add_taps = [&](int which, float part, int c, int y, int x, int n, float *taps) {
       const int h = halves[which], first = std::max(x, ray.column - h), last = std::min(x + n - 1, ray.column + h);
@@ -324,6 +345,9 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
               std::fill(taps, taps + nx, 0.0f);
               add_taps(ray.radius, 1.0f - ray.part, c, y, px, nx, taps);
               add_taps(ray.radius + 1, ray.part, c, y, px, nx, taps);
+              const int e = E > 1 ? c : 0;
+              if (!whole[e])
+                for (int x = 0; x < nx; x++) taps[x] *= gain[e] * rim.share((float)(y - ray.row), (float)(px + x - ray.column));
             }
             float *to = tile + (size_t)c * TILE * TILE + (y - y0) * TILE + (px - x0);
             for (int x = 0; x < nx; x++) to[x] += taps[x] * (1.0f - std::min(blocked[x], 1.0f)) * light[c];
