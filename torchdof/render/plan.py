@@ -162,8 +162,9 @@ class Plan:
     ) -> list[Blur]:
         """Kernel and resolution of each layer for a frame of ``size`` (height, width).
 
-        Kernels are cut to what reaches from one pixel of the frame to another. Traced code holds them as constants, so
-        a table that is tied to the width of the image ties it as well.
+        Kernels are cut to what reaches from one pixel of the frame to another; those of up to 23 pixels of their layer
+        to each side are left whole. Traced code holds them as constants, so a table that is tied to the width of the
+        image ties it as well.
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
