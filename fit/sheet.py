@@ -50,14 +50,19 @@ def sheet_of_photographs(photographs: Photographs, result: TableFit) -> Figure:
         residual.plot(fit.samples[0], fit.samples[1] - fit.curve[1], ".", color=DATA, markersize=1.5)
         residual.axhline(0, color=MODEL, linewidth=1)
         residual.set_title(f"residual {fit.residual_over_noise:.2f} x noise", fontsize=8)
-        texture = result.table.blur_texture(coc, captures.width_px).detach().numpy()[0]
-        _show(kernel, texture, [], f"kernel at coc {coc:+.2f} px")
+        shape = result.table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)[0, 0]
+        _show(kernel, shape.detach().numpy(), [], f"kernel at coc {coc:+.2f} px")
     for unused in axes[rows, 1:]:
         unused.remove()
-    lights = _lights(result.table, captures.width_px, min(result.coc_px), max(result.coc_px))
+    lights = _lights(result.table, captures.width_px, min(0.0, *result.coc_px), max(0.0, *result.coc_px))
     wide = figure.add_subplot(axes[rows, 0].get_gridspec()[rows, :])
     axes[rows, 0].remove()
-    _show(wide, lights, [], "lights and edges from one end of the measured distances to the other, with this table")
+    _show(
+        wide,
+        lights,
+        [],
+        "lights and edges from one end of the measured distances through the focus to the other, with this table",
+    )
     return figure
 
 

@@ -10,7 +10,7 @@ from ..result import Array, BlurFit
 from ..solve import information_criterion
 from .diagnostics import asymmetry_of, noise_near, signal_pixels, size_of_blur
 from .forward import Forward, Solution
-from .noise import fine_share, independent_share
+from .noise import independent_share
 
 __all__ = ["bic_of", "describe", "kernel_lists"]
 
@@ -39,7 +39,7 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
     size = float(np.sqrt(np.sum(light**2)))
     error = pair.data[near] - solution.model[near]
     kernel = pair.kernels(solution.family, kernel_lists(solution))[0]
-    through = (solution.gain * pair.source.noise) ** 2 / fine_share(pair.noise_correlation)
+    through = (solution.gain * pair.source.noise) ** 2 / pair.fine_share
     own = noise_near(pair, solution, near) ** 2 + through * float(np.sum(kernel**2))
     rms, rms_error = size_of_blur(pair, solution)
     spread = np.sqrt(np.diag(solution.covariance))

@@ -19,7 +19,7 @@ from ..problems import (
 from ..result import BlurFit, Mask
 from .dot import noise_of
 from .forward import Forward, Solution, without_level
-from .noise import fine_share, independent_share
+from .noise import independent_share
 
 __all__ = ["asymmetry_of", "check_fit", "noise_near", "signal_pixels", "size_of_blur"]
 
@@ -89,7 +89,7 @@ def noise_near(pair: Forward, solution: Solution, near: Mask) -> float:
     light = float(np.mean(np.maximum(pair.data[near] - solution.background, 0.0))) if near.any() else 0.0
     known = noise_of(pair.data) ** 2 + pair.shot_noise * light
     # what is more is not noise of the camera's kind, and need not go together in neighbours
-    return float(np.sqrt(known / fine_share(pair.noise_correlation) + max(seen - known, 0.0)))
+    return float(np.sqrt(known / pair.fine_share + max(seen - known, 0.0)))
 
 
 def check_fit(
@@ -192,7 +192,7 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None, stacklevel
     y, x = np.unravel_index(int(np.argmax(remaining)), remaining.shape)
     height, peak = float(remaining[y, x]), pair.data_dot.peak
     # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of noise that goes together in neighbours
-    smooth = fine_share(pair.noise_correlation) * independent_share(pair.noise_correlation)
+    smooth = pair.fine_share * independent_share(pair.noise_correlation)
     around = remaining[beyond]
     usual = 1.4826 * float(np.median(np.abs(around - np.median(around))))  # of a JPEG's blocks, too
     if height > max(_SPOT * max(0.14 * noise_of(pair.data) / np.sqrt(smooth), usual), _SPOT_MATTERS * peak):

@@ -18,6 +18,7 @@ COST = ("gaussian", "disc", "ring", "softm", "radial")
 
 _CONTRAST = 0.22  # standard deviation of a photograph's levels over its peak
 _WIDTH = 256
+_EVIDENCE = 2.0  # difference of BIC below which one speaks of none
 _LOOK_BELOW = 20.0  # dB by which a highlight may differ more than a photograph
 _DARK, _DISPLAY = 0.02, 1 / 2.2
 
@@ -97,8 +98,8 @@ def choose(
 ) -> tuple[str, str, dict[str, float]]:
     """The cheapest family that a viewer could not tell from the likeliest one.
 
-    The family of the lowest BIC stands for the truth. Another one will do if a photograph through it is `accuracy_db`
-    from the truth's, and a highlight, where shapes show, at most 20 dB less.
+    The simplest family within 2 of the lowest BIC stands for the truth. Another one will do if a photograph through it
+    is `accuracy_db` from the truth's, and a highlight, where shapes show, at most 20 dB less.
 
     Args:
         kernels: fitted kernel of each family `[k, k]`; "radial" among them.
@@ -110,20 +111,23 @@ def choose(
         against the free profile "radial".
     """
     by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))
-    likeliest, second = by_likelihood[0], by_likelihood[1]
+    lowest = bic[by_likelihood[0]]
+    likeliest = min((f for f in kernels if bic[f] <= lowest + _EVIDENCE), key=COST.index)
+    second = next(f for f in by_likelihood if f != likeliest)
     natural = {f: natural_psnr(kernels[f], kernels[likeliest]) for f in kernels}
     look = {f: highlight_psnr(kernels[f], kernels[likeliest]) for f in kernels}
     wanted_look = accuracy_db - _LOOK_BELOW
     enough = [f for f in kernels if natural[f] >= accuracy_db and look[f] >= wanted_look]
     family = min([*enough, likeliest], key=COST.index)
     others = ", ".join(
-        f"{f} {natural[f]:.1f} and {look[f]:.1f} dB, BIC +{bic[f] - bic[likeliest]:.0f}"
+        f"{f} {natural[f]:.1f} and {look[f]:.1f} dB, BIC {bic[f] - bic[likeliest]:+.0f}"
         for f in by_likelihood
         if f not in (family, likeliest)
     )
     if family == likeliest:
+        head = "the lowest BIC" if bic[family] == lowest else f"the simplest within {_EVIDENCE:g} of the lowest BIC"
         why = (
-            f"the lowest BIC ({second} second by {bic[second] - bic[likeliest]:.0f}), and no cheaper family has "
+            f"{head} ({second} second by {bic[second] - bic[likeliest]:.0f}), and no cheaper family has "
             f"{accuracy_db:g} dB on a natural image and {wanted_look:g} dB on a highlight"
         )
     else:

@@ -61,6 +61,7 @@ class Forward:
         shot_noise: how much the variance of a pixel's noise, as second differences see it, grows with its level.
         distance: of each pixel from the blurred dot's centre `[H, W]`, px.
         noise_correlation: how the noise of neighbouring pixels goes together, from the dark paper.
+        fine_share: share of the noise's variance that second differences see.
         start: kernel parameters to start from beside the moments, by family.
         prior: expected value and standard deviation of kernel parameters, as if measured elsewhere.
     """
@@ -94,7 +95,13 @@ class Forward:
         rows_, columns_ = np.indices(self.data.shape)
         self.distance = np.hypot(columns_ - self.data_dot.x, rows_ - self.data_dot.y)
         dark = self.used & (self.distance > self.data_dot.reach + 2)
-        self.noise_correlation = correlation_of(self.data - self.data_dot.background, dark)
+        beside = self.data - self.data_dot.background
+        self.noise_correlation = correlation_of(beside, dark)
+        self.fine_share = fine_share(self.noise_correlation)
+        if dark.any():  # a JPEG's blocks have no fine noise at all: then the paper's own spread is the measure
+            spread = 1.4826 * float(np.median(np.abs(beside[dark] - np.median(beside[dark]))))
+            fine = noise_of(self.data)
+            self.fine_share = max(self.fine_share, min((fine / spread) ** 2, 1.0)) if spread > 0 else self.fine_share
         # every level near 1, so that one tolerance serves all pictures
         self.unit = max(float(np.abs(self.values - self.data_dot.background).max()), np.finfo(float).tiny)
 
@@ -230,7 +237,7 @@ class Forward:
         known = np.isfinite(np.diag(bread))
         bread = np.where(np.outer(known, known), bread, 0.0)
         n, p = jacobian.shape
-        through = (gain * self.source.noise) ** 2 / fine_share(self.noise_correlation)
+        through = (gain * self.source.noise) ** 2 / self.fine_share
         deviation, correlation = self.residual_noise(residual, n / max(n - p - 2, 1))
         if through > 0:
             least = np.sqrt(0.1) * deviation

@@ -60,6 +60,36 @@ def test_a_lens_becomes_a_table(tmp_path: Path) -> None:
     assert "50.3582 mm, f/4, focus 2.0 m; 5 distances from" in told and "family: radial, residual" in told
 
 
+def test_the_target_is_written_and_nothing_else(tmp_path: Path) -> None:
+    result = run("--target", tmp_path / "target.pdf", "--paper", "letter")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "target.pdf").read_bytes().startswith(b"%PDF") and "print it at 100 %" in result.output
+    assert run("somewhere", "--target", tmp_path / "other.pdf").exit_code == 2
+    assert not (tmp_path / "other.pdf").exists()
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_photographs_of_the_target_become_a_table_and_a_sheet(simulator: ModuleType, tmp_path: Path) -> None:
+    simulator.write_photographs(tmp_path / "phone", 0.2, [0.4], width=560, tone=0.0, noise=0.004)
+    result = run(tmp_path / "phone", "-o", tmp_path / "phone.json", "--family", "disc")
+    assert result.exit_code == 0, result.output
+    told = " ".join(result.output.split())
+    assert "in focus" in told and "better: 1 distances out of focus: five to nine" in told
+    table = BlurTable.load(tmp_path / "phone.json")
+    assert table.unit == "mm" and table.provenance["sharp"] == "img_0000.jpg"
+    assert (tmp_path / "phone.png").stat().st_size > 20_000
+
+
+def test_field_and_wavelengths_of_a_lens(tmp_path: Path) -> None:
+    (tmp_path / "single.txt").write_text("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
+    options = ("--lens", tmp_path / "single.txt", "--f-number", "8", "--nodes", "5", "-o", tmp_path / "lens.json")
+    result = run(*options, "--wavelengths", "rgb")
+    assert result.exit_code == 0, result.output
+    assert BlurTable.load(tmp_path / "lens.json").channels == 3
+    assert "--wavelengths takes rgb, or micrometres" in run(*options, "--wavelengths", "red").output.replace("\n", " ")
+    assert "--field-deg must be 0 to 90" in run(*options, "--field-deg", "95").output.replace("\n", " ")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -46,10 +46,12 @@ def test_a_highlight_tells_a_ring_from_a_disc_where_a_photograph_hardly_does():
 def test_choice_is_the_cheapest_that_looks_like_the_likeliest():
     kernels = {"gaussian": gaussian(3.0), "disc": disc(6.0), "radial": disc(6.002)}
     arrays = {k: v.numpy() for k, v in kernels.items()}
-    family, why, psnr = choose(arrays, {"gaussian": 900.0, "disc": 5.0, "radial": 0.0}, 45)
+    family, why, psnr = choose(arrays, {"gaussian": 900.0, "disc": 50.0, "radial": 0.0}, 45)
     assert family == "disc" and "the cheapest with 45 dB" in why and "against radial, the likeliest" in why
     assert "gaussian" in why and "BIC +900" in why and psnr["radial"] == 200
-    assert choose(arrays, {"gaussian": 900.0, "disc": 5.0, "radial": 0.0}, 20)[0] == "gaussian"
+    assert choose(arrays, {"gaussian": 900.0, "disc": 50.0, "radial": 0.0}, 20)[0] == "gaussian"
     family, why, _ = choose(arrays, {"gaussian": 5.0, "disc": -5.0, "radial": 0.0}, 199)
     assert family == "disc" and "the lowest BIC (radial second by 5)" in why
-    assert choose(arrays, {"gaussian": 5.0, "disc": 5.0, "radial": 0.0}, 199)[0] == "radial"
+    assert choose(arrays, {"gaussian": 50.0, "disc": 50.0, "radial": 0.0}, 199)[0] == "radial"
+    family, why, _ = choose(arrays, {"gaussian": 50.0, "disc": 1.0, "radial": 0.0}, 199)
+    assert family == "disc" and "the simplest within 2 of the lowest BIC (radial second by -1)" in why
