@@ -25,7 +25,7 @@ _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|pytho
 _COMMAND = re.compile(r"(?:^|`)\s*((?:python -m )?torchdof (?:[a-z]+)(?: [^`\n\\]*(?:\\\n[^`\n\\]*)*)?)", re.M)
 _LINK = re.compile(r"""\]\((?P<link>[^)\s]+)\)|src="(?P<source>[^"]+)\"""")
 _PATH = re.compile(r"(?:`| )((?:examples|tests|docs|fit|export|torchdof|optics|render|depth)/[a-z_/]+(?:\.[a-z]+|/))")
-_ALIKE_DB = 33.0  # of a JPEG with what it was made from, and then some
+_ALIKE_DB = 40.0  # of a JPEG with what it was made from, and then some
 
 
 def _names(pages: list[Path]) -> list[str]:

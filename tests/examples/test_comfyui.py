@@ -127,7 +127,8 @@ def test_points_out_of_focus_have_the_shape(node: Any) -> None:
     image[:, 20, 20] = 1.0
     changes = {"depth_kind": "metres", "focus": "metres", "focus_m": 1.5, "sensor_width_mm": 1.6}
     spots = {}
-    for name, shape in {"round": {}, "blades": {"shape": "5 blades"}, "oval": {"squeeze": 2.0}}.items():
+    shapes: dict[str, dict[str, Any]] = {"round": {}, "blades": {"shape": "5 blades"}, "oval": {"squeeze": 2.0}}
+    for name, shape in shapes.items():
         spots[name] = render(node, image, depth, **changes, **shape)[0][0, ..., 0]
     high, wide = ((spots["oval"] > 0.02).any(dim).sum() for dim in (1, 0))
     assert float(high / wide) > 1.5

@@ -151,3 +151,21 @@ def test_a_file_that_differs_is_not_written(tmp_path: Path, monkeypatch: pytest.
         to_onnx(torchdof.DepthOfField(CAMERA, **SIMPLE), tmp_path / "dof.onnx")
     assert [file.name for file in tmp_path.iterdir()] == ["dof.onnx"]
     assert (tmp_path / "dof.onnx").read_text() == "older"
+
+
+@pytest.mark.sweep
+def test_a_file_holds_the_kernels_of_a_lopsided_opening(tmp_path: Path) -> None:
+    table = torchdof.BlurTable.polygon(3, 20.0, squeeze=1.6)
+    verification = to_onnx(torchdof.DepthOfField(CAMERA, table, **SIMPLE), tmp_path / "dof.onnx", inputs="coc_px")
+    assert 0 < verification.max_error < 1e-5
+
+
+def test_cats_eyes_and_a_range_in_focus_are_refused_by_name(tmp_path: Path) -> None:
+    table = torchdof.BlurTable.polygon(5, vignetting=0.4)
+    for dof, message in (
+        (torchdof.DepthOfField(CAMERA, table, **SIMPLE), "take a table without vignetting"),
+        (torchdof.DepthOfField(CAMERA.replace(focus_range_m=(1.0, 2.0)), **SIMPLE), "change focus_range_m"),
+    ):
+        with pytest.raises(Exception, match=message):
+            to_onnx(dof, tmp_path / "dof.onnx")
+        assert not list(tmp_path.iterdir())

@@ -31,9 +31,7 @@ def exported(shared_folder: Path) -> Any:
 
 
 ROUNDED = {  # where light in front is far brighter than what shows past it, float32 rounds what it leaves
-    "6.5e4 in 1e-4 on a slope, beyond its largest disc",
     "1e30 in 0.1, 3 x 3 pixels, beside a depth step (float16: 65504)",
-    "HDR: 1e-3 to 6e4 at random",
 }
 
 

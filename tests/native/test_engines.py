@@ -27,7 +27,7 @@ SHAPED = [
 ]
 CATS_EYES = [
     BlurTable.disc().with_aperture(Aperture(vignetting=0.4)),
-    BlurTable.polygon(5, 10.0, squeeze=1.5, vignetting=(0.6, 1.2)),
+    BlurTable.polygon(5, 10.0, squeeze=1.5, vignetting=(0.6, 0.2)),
     BY_COLOUR.with_aperture(Aperture(vignetting=0.5)),
 ]
 TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15"), BY_COLOUR]

@@ -17,6 +17,7 @@ LETTER = torch.zeros(12, 10)
 LETTER[1:11, 2:4] = 1.0  # an F: no turn and no mirror leaves it as it is
 LETTER[1:3, 2:9] = 0.5
 LETTER[5:7, 2:7] = 1.0
+SEVEN: dict[str, Any] = {"aperture": 7}
 LOPSIDED = [
     BlurTable.polygon(3, 20.0, squeeze=1.6),
     BlurTable.polygon(5, 7.0, 0.4, rim=2.0),
@@ -199,7 +200,7 @@ def test_a_file_of_the_first_version_is_a_round_lens() -> None:
         (lambda: BlurTable.from_aperture(torch.zeros(4, 4)), "not all of them 0"),
         (lambda: BlurTable.from_aperture(torch.ones(3, 4, 4)), r"transmission \[H, W\] of an opening, got \[3, 4, 4\]"),
         (lambda: BlurTable.polygon(5, rim=-2.0), "b must be >= -1, got -2"),
-        (lambda: BlurTable("disc", [1.0], {"radius": [1.0]}, aperture=7), "aperture must be an Aperture or None"),
+        (lambda: BlurTable("disc", [1.0], {"radius": [1.0]}, **SEVEN), "aperture must be an Aperture or None"),
         (lambda: Aperture.from_dict({"leaves": 7}), "leaves is not a field of an aperture"),
         (lambda: Aperture.from_dict({"mask": [[1.0], [2.0, 3.0]]}), "mask must be rows of numbers"),
     ],

@@ -290,8 +290,8 @@ def test_a_range_is_in_focus_from_end_to_end_and_blur_grows_from_its_ends() -> N
     assert coc[2:5].eq(0.0).all()
     assert camera.focus_m == pytest.approx(2 / (1 / 1.5 + 1 / 2.2), rel=1e-12)
     near, far = camera.sharp_limits_m(1.0, 1920)
-    assert float(camera.coc_px(depth_of(near), 1920)) == pytest.approx(-1.0, rel=1e-9)
-    assert float(camera.coc_px(depth_of(far), 1920)) == pytest.approx(1.0, rel=1e-9)
+    assert float(camera.coc_px(depth_of(float(near)), 1920)) == pytest.approx(-1.0, rel=1e-9)
+    assert float(camera.coc_px(depth_of(float(far)), 1920)) == pytest.approx(1.0, rel=1e-9)
 
 
 def test_a_range_of_no_length_is_one_distance_and_may_reach_to_infinity() -> None:

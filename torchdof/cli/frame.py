@@ -104,8 +104,9 @@ class Rendered:
     def facts(self) -> dict[str, Any]:
         """The same for programs, as JSON-like data."""
         settings, names = self.settings, ("focus_m", "f_number", "focal_length_mm", "sensor_width_mm")
-        camera = None if self.camera is None else {name: float(getattr(self.camera, name)) for name in names}
-        if self.camera is not None and camera is not None:
+        camera: dict[str, Any] | None = None
+        if self.camera is not None:
+            camera = {name: float(getattr(self.camera, name)) for name in names}
             ends = self.camera.focus_range_m
             camera |= {"focus_range_m": None if ends is None else [float(end) for end in ends]}
             camera |= {"tilt_deg": float(self.camera.tilt_deg), "swing_deg": float(self.camera.swing_deg)}

@@ -67,8 +67,8 @@ class _Scene(ctypes.Structure):
         ("kernel_colours", ctypes.c_int32),
         ("kernels", ctypes.c_void_p),
         ("radii", ctypes.POINTER(ctypes.c_float)),
-        ("rim_shift", ctypes.c_float),
-        ("rim_radius", ctypes.c_float),
+        ("front", ctypes.c_float),
+        ("rear", ctypes.c_float),
         ("squeeze", ctypes.c_float),
         ("threads", ctypes.c_int32),
         ("cancelled", ctypes.POINTER(ctypes.c_int32)),
@@ -147,8 +147,9 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
-    radii: Sequence[float] = (),
-    rim: tuple[float, float, float] = (0.0, 1.0, 1.0),
+    radii: Sequence[float],
+    rims: tuple[float, float],
+    squeeze: float,
 ) -> Tensor:
     """Depth of field of one item, on as many threads as PyTorch uses.
 
@@ -163,9 +164,9 @@ def render(
         masked: Values may be NaN or infinite; such pixels pass through.
         highlights: Highlights are splatted ray by ray where layers would not do.
         crisp_px: Blur from which on layers soften highlights.
-        radii: Signed coc of each layer in its own pixels, where kernels depend on the place.
-        rim: How far the lens's rim moves before the opening towards the corners of the frame, in the opening's radii,
-            the rim's radius in these, and the height of the blur over its width.
+        radii: Signed coc of each layer in its own pixels; 0 where kernels do not depend on the place.
+        rims: How far the lens's front and rear rim move before the opening in the corners of the frame, in its radii.
+        squeeze: Height of the blur over its width.
 
     Returns:
         ``[C, H, W]``, float32; the same bits for any number of threads.
@@ -203,7 +204,8 @@ def render(
         colours,
         bank.data_ptr(),
         (ctypes.c_float * len(nodes))(*radii),
-        *rim,
+        *rims,
+        squeeze,
         torch.get_num_threads(),
         ctypes.pointer(cancelled),
     )

@@ -44,9 +44,9 @@ class Aperture:
             is the blur's height. A float, or a tensor ``[]`` that a gradient is taken to.
         mask: Transmission ``[H, W]`` >= 0 of the square around the opening, in place of blades: the longer side spans
             it. Images of more than 128 pixels are averaged down. It is turned by bilinear interpolation.
-        vignetting: How far towards the corners of the frame the lens's rim moves before the opening, and cuts a
-            cat's eye of it: in the corner by this share of the opening's diameter, from 0 to 1. With a second number,
-            the rim's radius over the opening's, from 1: the larger, the farther out it begins
+        vignetting: How much of its width a cat's eye in the corner of the frame lacks in height, from 0 (none) to 1
+            (closed): the lens's rims, one in front of the opening and one behind it, move before it towards the corners
+            and cut off half of that each. Or the share of either, ``(front, rear)``
             (:mod:`torchdof.render.vignetting`).
 
     Raises:
@@ -76,11 +76,12 @@ class Aperture:
         _check("curvature", self.curvature, 0.0, 1.0)
         if isinstance(self.vignetting, tuple | list):
             if len(self.vignetting) != 2:
-                got = show(self.vignetting)
-                raise ValueError(f"vignetting must be a number from 0 to 1, or it and a rim's radius, got {got}")
+                raise ValueError(f"vignetting must be a number or (front, rear), got {show(self.vignetting)}")
+            for share in self.vignetting:
+                _check("each share of vignetting", share, 0.0, 1.0)
             object.__setattr__(self, "vignetting", tuple(self.vignetting))
-        _check("vignetting", self.rim[0], 0.0, 1.0)
-        _check("radius of the rim in vignetting", self.rim[1], 1.0, 10.0)
+        else:
+            _check("vignetting", self.vignetting, 0.0, 1.0)
         if self.mask is None:
             if self.blades == 0 and self.curvature != 0.0:
                 raise ValueError(f"curvature is that of blades; give their number too, got {self.curvature:g}")
@@ -92,12 +93,13 @@ class Aperture:
     @property
     def depends_on_place(self) -> bool:
         """Whether kernels differ across the frame."""
-        return self.rim[0] > 0.0
+        return max(self.rims) > 0.0
 
     @property
-    def rim(self) -> tuple[float, float]:
-        """How far the rim moves towards the corners, in diameters of the opening, and its radius over the opening's."""
-        return self.vignetting if isinstance(self.vignetting, tuple) else (self.vignetting, 1.0)
+    def rims(self) -> tuple[float, float]:
+        """How far the front and the rear rim move in the corner of the frame, in diameters of the opening."""
+        given = self.vignetting
+        return given if isinstance(given, tuple) else (given / 2, given / 2)
 
     @property
     def is_round(self) -> bool:
@@ -118,9 +120,10 @@ class Aperture:
     def finest(self) -> float:
         """Share of the circle of confusion whose disc is about as fine as the blur: at most 1.
 
-        Of a mask it is told by its outline's length over its area, up to twice that of a disc.
+        Of a mask it is told by its outline's length over its area, up to twice that of a disc; of a cat's eye by its
+        height halfway to the corner.
         """
-        finest = min(1.0, 1.0 / _plain(self.squeeze))
+        finest = min(1.0, 1.0 / _plain(self.squeeze)) * (1.0 - min(1.0, sum(self.rims)) / 2)
         if self.mask is None:
             return finest
         around = functional.pad(self.mask, (1, 1, 1, 1))
@@ -154,7 +157,7 @@ class Aperture:
     def to_dict(self) -> dict[str, Any]:
         """The aperture as JSON-like data, the inverse of :meth:`from_dict`."""
         fields: dict[str, Any] = {"rotation_deg": _plain(self.rotation_deg), "squeeze": _plain(self.squeeze)}
-        fields["vignetting"] = list(self.rim)
+        fields["vignetting"] = list(self.rims)
         if self.mask is not None:
             return {**fields, "mask": self.mask.tolist()}
         return {"blades": self.blades, "curvature": float(self.curvature), **fields}
@@ -190,7 +193,7 @@ class Aperture:
             if _plain(value) != usual:
                 parts.append(f"{name} {_plain(value):g}")
         if self.depends_on_place:
-            parts.append(f"vignetting {self.rim[0]:g}")
+            parts.append(f"vignetting {sum(self.rims):g}")
         return f"Aperture({', '.join(parts) or 'round'})"
 
     def _outline(self, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -277,8 +280,8 @@ def _checked_mask(mask: Any) -> Tensor:
         raise ValueError("mask must hold finite transmissions >= 0, not all of them 0")
     longer = max(values.shape)
     if longer > _MOST_SIDE:
-        size = [max(1, round(n * _MOST_SIDE / longer)) for n in values.shape]
-        values = functional.adaptive_avg_pool2d(values[None, None], size)[0, 0]
+        height, width = (max(1, round(n * _MOST_SIDE / longer)) for n in values.shape)
+        values = functional.adaptive_avg_pool2d(values[None, None], (height, width))[0, 0]
     return values / values.max()
 
 

@@ -160,8 +160,8 @@ class BlurTable:
                 height. A float, or a tensor ``[]`` that a gradient is taken to.
             rim: How much brighter the blur is at the circle around the opening than in its middle, as that of an
                 over-corrected lens is (spherical aberration); >= -1, and negative where it is darker.
-            vignetting: How much the lens cuts cat's eyes towards the corners of the frame, 0 to 1; with a second
-                number, the radius of its rim over that of the opening (:class:`torchdof.optics.aperture.Aperture`).
+            vignetting: How much of its width a cat's eye in the corner of the frame lacks in height, 0 to 1, or the
+                shares of the lens's front and rear rim (:class:`torchdof.optics.aperture.Aperture`).
 
         Raises:
             ValueError: If a number is out of its range.

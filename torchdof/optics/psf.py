@@ -376,14 +376,15 @@ def _cells(
     if aperture is None or aperture.is_round:
         return _round_cells(family, lengths, half, slices, aspect)
     radius = opening_radius(family, lengths)
+    wide = torch.ones_like(radius) if aspect is None else aspect
     if family == "disc":
-        return aperture.shares(half, 1.0 / radius, aspect / radius)
+        return aperture.shares(half, 1.0 / radius, wide / radius)
     count = _PARTS if half <= _CACHED_HALF_WIDTH else 1
     fine = count * half + count // 2
     in_parts = {k: v * count if k in LENGTHS else v for k, v in lengths.items()}
     light = _round_cells(family, in_parts, fine, slices // count, aspect)
     lit = _round_cells("disc", {"radius": _reach(family, in_parts)}, fine, slices, aspect)  # where the profile has any
-    share = aperture.shares(fine, 1.0 / (count * radius), aspect / (count * radius))
+    share = aperture.shares(fine, 1.0 / (count * radius), wide / (count * radius))
     parts = torch.where(lit > 0, light / torch.where(lit > 0, lit, 1.0), 0.0) * share
     return parts.unflatten(-1, (-1, count)).unflatten(-3, (-1, count)).mean((-3, -1))
 

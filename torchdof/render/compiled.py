@@ -2,12 +2,12 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from .. import native
+from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
 from ..options import Options
@@ -76,6 +76,8 @@ def _render(
 ) -> Tensor:
     """One item ``[C, H, W]``."""
     height, width = surfaces[0][0].shape[-2:]
+    aperture = options.table.aperture or Aperture()
+    front, rear = aperture.rims
     render = functools.partial(
         native.render,
         kind=kind,
@@ -87,7 +89,9 @@ def _render(
         masked=kind != "stack" and not options.check,
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
-        **_across_the_frame(options.table, blurs),
+        radii=[0.0 if blur.cats_eye is None else blur.cats_eye.coc_px for blur in blurs],
+        rims=(2.0 * front, 2.0 * rear),
+        squeeze=float(aperture.squeeze),
     )
     if kind != "background":
         try:
@@ -96,16 +100,6 @@ def _render(
             pass
     scale = float(headroom.factor(*(light[None] for light, _, _ in surfaces[:2])))
     return render([(light * scale, coc, weight) for light, coc, weight in surfaces]) / scale
-
-
-def _across_the_frame(table: BlurTable, blurs: Sequence[Blur]) -> dict[str, Any]:
-    """What the compiled engine is told of kernels that depend on the place."""
-    aperture = table.aperture
-    if aperture is None or not aperture.depends_on_place:
-        return {}
-    strength, radius = aperture.rim
-    radii = [0.0 if blur.cats_eye is None else blur.cats_eye.coc_px for blur in blurs]
-    return {"radii": radii, "rim": (2.0 * strength, radius, float(aperture.squeeze))}
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:

@@ -162,23 +162,25 @@ class Plan:
     ) -> list[Blur]:
         """Kernel and resolution of each layer for a frame of ``size`` (height, width).
 
-        Kernels are cut to what reaches from one pixel of the frame to another. Traced code holds them as constants, so
-        a table that is tied to the width of the image ties it as well.
+        Kernels are cut to what reaches from one pixel of the frame to another; those of up to 23 pixels of their layer
+        to each side are left whole. Traced code holds them as constants, so a table that is tied to the width of the
+        image ties it as well.
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
         finest = 1.0 if table.aperture is None else table.aperture.finest
         scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
-        lens = table.fingerprint()
         if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
             parts = flat.split([math.prod(shape) for shape in shapes])
             bank = [_masked(k.reshape(shape), size, s) for k, shape, s in zip(parts, shapes, scales, strict=True)]
         elif is_traced():
+            lens = table.fingerprint()
             whole = [_kernel(table, lens, c, width, s, None) for c, s in zip(self.coc_px, scales, strict=True)]
             bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
+            lens = table.fingerprint()
             bank = []
             for coc, scale in zip(self.coc_px, scales, strict=True):
                 longest_px = max(-(-max(size) // scale), _LEAST_CUT)

@@ -1,9 +1,10 @@
 """Cat's eyes: what a lens's own barrel cuts off its blur, the more the farther from the middle of the frame.
 
-Seen from off the axis, a lens opens through two circles that no longer lie behind each other: the aperture's and that
-of a rim in front of it. A ray through the point ``u`` of the aperture, to a place ``p`` in the frame (from its middle,
-in half diagonals), passes where ``|u + 2 strength p| <= radius``. So behind the focus plane the side away from the
-middle of the frame is cut off, in front of it the other one. The kernel of a place is the table's own with what does
+Seen from off the axis, a lens opens through circles that no longer lie behind each other: the aperture's, that of a rim
+in front of it and that of one behind it. A ray through the point ``u`` of the aperture, to a place ``p`` in the frame
+(from its middle, in half diagonals), passes where ``|u + 2 front p| <= 1`` and ``|u - 2 rear p| <= 1``. So behind the
+focus plane the front rim cuts off the side away from the middle of the frame, in front of it the other one, and the
+rear rim opposite. The kernel of a place is the table's own with what does
 not pass left out, and its light made whole again: how much darker corners are, the sharp image shows already.
 
 The border of what passes is a pixel wide. Kernels are those of where light lands, block by block; highlights take that
@@ -40,14 +41,16 @@ def passed(kernel: Tensor, aperture: Aperture, coc_px: Tensor, y: Tensor, x: Ten
     Returns:
         ``[..., C, k, k]``, each with as much light as before.
     """
-    strength, radius = aperture.rim
     step = torch.arange(kernel.shape[-1], dtype=kernel.dtype, device=kernel.device) - kernel.shape[-1] // 2
     coc, y, x = (t.to(kernel.dtype)[..., None, None] for t in (coc_px, y, x))
-    shift = 2.0 * strength * coc
-    down, across = step[:, None] + shift * y, step * aperture.squeeze + shift * x
-    # a rim that is shifted by less than a pixel cuts off less: kernels of the middle stay as they are
-    slack = 4.0 * (coc.abs() + 1.0) * (1.0 - shift.abs() * _length(y, x)).clamp_min(0.0)
-    share = (radius * coc.abs() + 0.5 + slack - _length(down, across)).clamp(0.0, 1.0).unsqueeze(-3)
+    front, rear = aperture.rims
+    inside = []  # pixels from each rim's edge
+    for shift in (2.0 * front * coc, -2.0 * rear * coc):
+        # a rim that is shifted by less than a pixel cuts off less: kernels of the middle stay as they are
+        slack = 4.0 * (coc.abs() + 1.0) * (1.0 - shift.abs() * _length(y, x)).clamp_min(0.0)
+        away = _length(step[:, None] + shift * y, step * aperture.squeeze + shift * x)
+        inside.append(coc.abs() + 0.5 + slack - away)
+    share = torch.minimum(*inside).clamp(0.0, 1.0).unsqueeze(-3)
     cut = kernel * share
     light, left = (k.sum((-2, -1), keepdim=True) for k in (kernel, cut))
     return torch.where(left > _LEAST * light, cut * (light / left.clamp_min(1e-30)), kernel)

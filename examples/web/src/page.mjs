@@ -317,8 +317,13 @@ function listen() {
   for (const name of ['focus', 'aperture']) $(name).addEventListener('change', () => scene && update(true))
   for (const name of ['kind', 'scale', 'near', 'far', 'size']) $(name).addEventListener('change', rearrange)
   for (const radio of document.querySelectorAll('[name=view]')) radio.addEventListener('change', showView)
-  $('photo-file').addEventListener('change', (event) => take(event.target.files, 'photo'))
-  $('depth-file').addEventListener('change', (event) => take(event.target.files, 'depth'))
+  for (const slot of ['photo', 'depth']) {
+    $(`${slot}-file`).addEventListener('change', ({ target }) => {
+      const files = [...target.files]
+      target.value = '' // so that the same file, mended, can be chosen again
+      take(files, slot)
+    })
+  }
   $('sample').addEventListener('click', takeSample)
   $('save').addEventListener('click', save)
   document.addEventListener('dragover', (event) => {

@@ -46,10 +46,9 @@ typedef struct {
   const float *kernels;    // one layer after the other, [kernel_colours, 2 half + 1, 2 half + 1]
   const float *radii;      // signed coc of each layer in its own pixels
 
-  // What the lens's rim cuts off kernels, as render/vignetting.py tells it.
-  float rim_shift;   // of the rim in the frame's corners, in radii of the opening; 0: kernels are alike everywhere
-  float rim_radius;  // in radii of the opening
-  float squeeze;     // height of the blur over its width
+  // What the lens's rims cut off kernels, as render/vignetting.py tells it.
+  float front, rear;  // shift of the rims in the frame's corners, in radii of the opening; 0: kernels are alike everywhere
+  float squeeze;      // height of the blur over its width
 
   int32_t threads;
   const volatile int32_t *cancelled;  // rendering stops soon after it becomes 1

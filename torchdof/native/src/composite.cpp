@@ -68,7 +68,7 @@ struct Scratch {
   std::vector<float *> mine;    // a row of each surface's share
   float *rest;                  // what lies wholly behind a coarse layer
   std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for 16 columns
-  std::vector<Kernel> cut;  // a layer's kernels as the lens's rim leaves them
+  std::vector<Kernel> cut;  // a layer's kernels as the lens's rims leave them
   std::vector<const float *> pointers;
   std::vector<uint64_t> layers, block_layers;
   std::vector<WindowBlock> blocks;
@@ -736,7 +736,7 @@ class Composite {
   // A layer's kernels at a strip, whose row and column are counted in its pixels from the frame's corner.
   const Kernel *kernels_at(Scratch &b, const Layer &l, int row, int column) const {
     const torchdof_scene &scene = job_.scene;
-    if (scene.rim_shift == 0) return l.kernels.data();
+    if (!Rim::cuts(scene)) return l.kernels.data();
     const int before = l.scale > 1;  // a canvas of coarser resolution begins one pixel before the frame
     const int block = (column + before) / Rim::COLUMNS * Rim::COLUMNS - before;
     const float per = per_half_diagonal(scene);

@@ -20,8 +20,8 @@ Job::Job(const torchdof_scene &scene)
     l.at = (float)l.node;
     l.per_after = k == scene.layers - 1 ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
     const int side = 2 * l.half + 1;
-    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, scene.rim_shift == 0));
-    if (scene.rim_shift != 0) l.coc = scene.radii[k];
+    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !Rim::cuts(scene)));
+    if (Rim::cuts(scene)) l.coc = scene.radii[k];
     layers.push_back(std::move(l));
   }
 }
@@ -154,7 +154,7 @@ void Job::take_scene() {
 void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
-  const bool several = layers.size() > 1 || scene.rim_shift != 0, background = scene.kind == TORCHDOF_BACKGROUND;
+  const bool several = layers.size() > 1 || Rim::cuts(scene), background = scene.kind == TORCHDOF_BACKGROUND;
   const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
   // without occlusion highlights matter where coarse layers would soften them
   const bool limited = several && (scene.occlusion || (scene.highlights && scene.crisp_px < reach));

@@ -335,21 +335,26 @@ class Downsampled {
 constexpr int STRIP_ROWS = 4, STRIP_COLUMNS = 2 * LANES, STRIP = STRIP_ROWS * STRIP_COLUMNS;
 Kernel make_kernel(const float *values, int half, bool one_sided);
 
-// What the lens's rim lets through at a place in the frame: render/vignetting.py.
+// What the lens's rims let through at a place in the frame: render/vignetting.py.
 struct Rim {
   static constexpr int COLUMNS = 16;     // whose pixels share a kernel, STRIP_ROWS high
   static constexpr float LEAST = 1e-6f;  // share of a kernel; where less passes it stays whole
-  float coc, down, across, reach, squeeze;
-  Rim(const torchdof_scene &scene, float coc, float y, float x)  // place in half diagonals from the frame's middle
-      : coc(coc), down(scene.rim_shift * coc * y), across(scene.rim_shift * coc * x), squeeze(scene.squeeze) {
-    const float shifted = std::fabs(scene.rim_shift * coc) * std::sqrt(y * y + x * x + 1e-12f);
-    const float slack = 4.0f * (std::fabs(coc) + 1.0f) * std::max(1.0f - shifted, 0.0f);
-    reach = scene.rim_radius * std::fabs(coc) + 0.5f + slack;
+  float down[2], across[2], reach[2], squeeze;  // of the front and the rear rim
+  Rim(const torchdof_scene &scene, float coc, float y, float x) : squeeze(scene.squeeze) {  // place in half diagonals
+    const float shifts[2] = {scene.front * coc, -scene.rear * coc}, far = std::sqrt(y * y + x * x + 1e-12f);
+    for (int i = 0; i < 2; i++) {
+      const float slack = 4.0f * (std::fabs(coc) + 1.0f) * std::max(1.0f - std::fabs(shifts[i]) * far, 0.0f);
+      down[i] = shifts[i] * y;
+      across[i] = shifts[i] * x;
+      reach[i] = std::fabs(coc) + 0.5f + slack;
+    }
   }
-  float share(float dy, float dx) const {
-    const float y = dy + down, x = dx * squeeze + across;
-    return clamp01(reach - std::sqrt(y * y + x * x + 1e-12f));
+  float inside(int i, float dy, float dx) const {
+    const float y = dy + down[i], x = dx * squeeze + across[i];
+    return reach[i] - std::sqrt(y * y + x * x + 1e-12f);
   }
+  float share(float dy, float dx) const { return clamp01(std::min(inside(0, dy, dx), inside(1, dy, dx))); }
+  static bool cuts(const torchdof_scene &scene) { return scene.front != 0 || scene.rear != 0; }
 };
 inline float per_half_diagonal(const torchdof_scene &scene) {
   return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);

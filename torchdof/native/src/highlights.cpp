@@ -281,8 +281,8 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
     const int half = std::max(halves[ray.radius], halves[ray.radius + 1]);
-    // what the lens's rim lets through, and by how much that is made brighter
-    const bool is_cut = job.scene.rim_shift != 0;
+    // what the lens's rims let through, and by how much that is made brighter
+    const bool is_cut = Rim::cuts(job.scene);
     const float per = per_half_diagonal(job.scene);
     const Rim rim(job.scene, ray.coc, (ray.row + 0.5f - 0.5f * H) * per, (ray.column + 0.5f - 0.5f * W) * per);
     std::vector<float> gain(E, 1.0f);
