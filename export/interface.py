@@ -1,5 +1,7 @@
 """What a graph takes: one item for a whole batch where that makes sense, and names in the errors of runtimes."""
 
+from typing import Any
+
 import onnx_ir
 from onnx_ir.tape import Tape
 
@@ -17,7 +19,8 @@ def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
     A runtime that meets a wrong shape names the node that cannot expand it.
     """
     graph = model.graph
-    image, *others = graph.inputs
+    inputs_in_order: list[Any] = list(graph.inputs)
+    image, *others = inputs_in_order
     tape = Tape()
     shape = tape.op("Shape", [image])
     batch, channels, stop = (tape.op("Constant", [], {"value_ints": [n]}) for n in (0, 1, 4))

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Collection, Iterator
+from typing import Any
 
 import numpy as np
 import onnx_ir
@@ -86,7 +87,8 @@ def _place_weights(model: onnx_ir.Model) -> None:
 def _as_nodes(graph: onnx_ir.Graph) -> None:
     """Initializers as ``Constant`` nodes: ``onnx.compose`` renames these where a branch takes them from outside."""
     first = next(iter(graph), None)
-    for value in list(graph.initializers.values()):
+    values: list[Any] = list(graph.initializers.values())
+    for value in values:
         tape, array = Tape(), value.const_value.numpy()
         if array.size > _LARGEST_EQUAL and (array == array.flat[0]).all():
             shape = tape.op("Constant", [], {"value_ints": list(array.shape)})

@@ -4,6 +4,8 @@ What depends on a window becomes the body of a ``Loop`` over tiles. What only on
 side's branch of an ``If``, so it is computed only when it is taken.
 """
 
+from typing import Any
+
 import onnx_ir
 from onnx_ir.tape import Tape
 
@@ -11,7 +13,7 @@ from .tiling import CHOICE, COLLECT, DOMAIN, WINDOW
 
 __all__ = ["structure"]
 
-_Owners = dict[onnx_ir.Graph, onnx_ir.Node]  # the node that a subgraph belongs to
+_Owners = dict[Any, onnx_ir.Node]  # the node that a subgraph belongs to
 
 
 def structure(model: onnx_ir.Model) -> None:
@@ -36,7 +38,8 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
             body_nodes.append(node)
         if node is collect:
             break
-    frame, tile = window.inputs[0], collect.inputs[0]
+    frame, size = window.inputs[0], window.outputs[0].shape
+    tile: Any = collect.inputs[0]
     side, margin = (window.attributes[name].as_int() for name in ("side", "margin"))
 
     before = Tape()
@@ -59,7 +62,7 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
     stop = inside.op("Add", [start, _ints(inside, 1, side + 2 * margin, side + 2 * margin)])
     sliced = inside.op("Slice", [frame, start, stop, _ints(inside, 0, 2, 3)])
     # runtimes cannot tell the size of a slice, and take their fast convolutions only for sizes that they know
-    cut = inside.op("Reshape", [sliced, _ints(inside, *window.outputs[0].shape.numpy())])
+    cut = inside.op("Reshape", [sliced, _ints(inside, *(size.numpy() if size else ()))])
     window.outputs[0].replace_all_uses_with(cut)
     for node in body_nodes:
         graph.remove(node)
@@ -96,7 +99,7 @@ def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
 
 def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Owners) -> onnx_ir.Graph:
     """The branch that gives an input of a choice; it takes over all nodes that nothing else needs."""
-    result = choice.inputs[index]
+    result: Any = choice.inputs[index]
     last = onnx_ir.node("Identity", [result])  # a branch gives what it makes itself
     graph.insert_before(choice, [last])
     choice.replace_input_with(index, last.outputs[0])
@@ -150,5 +153,5 @@ def _value(name: str, kind: onnx_ir.DataType, shape: list[int]) -> onnx_ir.Value
     return onnx_ir.Value(name=name, shape=onnx_ir.Shape(shape), type=onnx_ir.TensorType(kind))
 
 
-def _type(value: onnx_ir.Value, kind: onnx_ir.DataType, shape: object) -> None:
+def _type(value: onnx_ir.Value, kind: onnx_ir.DataType, shape: Any) -> None:
     value.type, value.shape = onnx_ir.TensorType(kind), onnx_ir.Shape(shape)

@@ -9,6 +9,7 @@ results. :mod:`torchdof.export.structure` makes a loop and branches of these.
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as functional
@@ -85,6 +86,7 @@ def in_tiles() -> Iterator[None]:
 
 
 def _operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], **attributes: int) -> Tensor:
+    stated: dict[str, Any] = {**attributes}
     return torch.onnx.ops.symbolic(
-        f"{DOMAIN}::{name}", inputs, attributes, dtype=inputs[-1].dtype, shape=list(shape), version=1
+        f"{DOMAIN}::{name}", inputs, stated, dtype=inputs[-1].dtype, shape=list(shape), version=1
     )

@@ -121,10 +121,8 @@ def _composite_layers(
     each = blurs[0].kernel.shape[0]
 
     def blank(height: int, width: int) -> Tensor:
-        light_and_weight = light.new_zeros, functools.partial(light.new_full, fill_value=empty)
-        channels = frame.colours, each
-        parts = [new((light.shape[0], n, height, width)) for new, n in zip(light_and_weight, channels, strict=True)]
-        return torch.cat(parts, 1)
+        none = light.new_zeros(light.shape[0], frame.colours, height, width)
+        return torch.cat([none, light.new_full((light.shape[0], each, height, width), empty)], 1)
 
     picture = blank(*frame.area)
 
