@@ -133,8 +133,8 @@ def _steepness(still: Array, dot: Dot, edge: Edge) -> tuple[float, float]:
 
     An S-curve spreads the levels of half-covered pixels apart. No blur does: it brings them together.
     """
-    rows, columns = (axis.astype(np.float64) for axis in np.indices(still.shape))
-    coverage = draw_edge(rows, columns, edge.x, edge.y, edge.radius, edge.softness)
+    pixels = np.indices(still.shape, np.float64)
+    coverage = draw_edge(pixels[0], pixels[1], edge.x, edge.y, edge.radius, edge.softness)
     residual = (still - dot.background) / edge.level - coverage
     low, high = (coverage > 0.02) & (coverage < 0.4), (coverage > 0.6) & (coverage < 0.98)
     if min(low.sum(), high.sum()) < 8:
