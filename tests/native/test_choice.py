@@ -12,6 +12,20 @@ def test_the_compiled_engine_is_chosen_where_it_is(monkeypatch: pytest.MonkeyPat
     assert native.describe().startswith("native (")
 
 
+def test_an_engine_of_another_version_is_not_used_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(native, "_REVISION", -1)
+    native._library.cache_clear()
+    try:
+        with pytest.warns(RuntimeWarning, match="of another version of torchdof, and is not used: install"):
+            assert not native.chosen()
+        assert native.describe() == "torch (the compiled engine is of another version of torchdof)"
+        monkeypatch.setenv("TORCHDOF_ENGINE", "native")
+        with pytest.raises(ValueError, match="is native, but the compiled engine is of another version"):
+            native.chosen()
+    finally:
+        native._library.cache_clear()
+
+
 def test_the_plain_engine_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     assert native.describe().startswith("torch (")

@@ -11,6 +11,7 @@ import importlib.resources
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -39,6 +40,7 @@ HALF_LARGEST = 64
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
+_REVISION = 1  # of ``src/api.h``
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 
@@ -328,6 +330,17 @@ def _engine() -> ctypes.CDLL:
     return library
 
 
+def _fits(library: ctypes.CDLL) -> bool:
+    """Whether a library takes what this file passes: an old one can lie beside new sources that were not installed."""
+    try:
+        interface = library.torchdof_interface
+    except AttributeError:
+        return False
+    interface.restype = ctypes.c_int64
+    expected: int = _REVISION << 32 | ctypes.sizeof(_Scene) << 16 | ctypes.sizeof(_Map)
+    return bool(interface() == expected)
+
+
 @functools.cache
 def _library() -> tuple[ctypes.CDLL | None, str]:
     """The compiled engine, or why there is none."""
@@ -339,6 +352,10 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
             library = ctypes.CDLL(str(path))
     except OSError as error:
         return None, f"the compiled engine cannot be loaded: {error}"
+    if not _fits(library):
+        stale = "the compiled engine is of another version of torchdof"
+        warnings.warn(f"{stale}, and is not used: install torchdof again", RuntimeWarning, stacklevel=2)
+        return None, stale
     pointer = ctypes.c_void_p
     library.torchdof_begin.argtypes = [ctypes.POINTER(_Scene), ctypes.POINTER(pointer)]
     library.torchdof_radii.argtypes = [pointer, ctypes.POINTER(ctypes.POINTER(ctypes.c_int32))]

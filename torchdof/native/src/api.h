@@ -87,6 +87,11 @@ TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map);
 TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half,
                                     float *out);
 
+// What a caller compares with its own idea of this file before it calls anything else: sizes of the two structures and,
+// in the upper half, a number that goes up with every other change of this file.
+#define TORCHDOF_REVISION 1
+TORCHDOF_API int64_t torchdof_interface(void);
+
 // "avx2" or "baseline".
 TORCHDOF_API const char *torchdof_instructions(void);
 // Chooses them, for tests; returns 0 if the processor lacks them.

@@ -80,6 +80,10 @@ void torchdof_convolve(const float *in, int32_t height, int32_t width, const flo
   torchdof::chosen().convolve(in, height, width, kernel, half, out);
 }
 
+int64_t torchdof_interface(void) {
+  return (int64_t)TORCHDOF_REVISION << 32 | (int64_t)sizeof(torchdof_scene) << 16 | (int64_t)sizeof(torchdof_map);
+}
+
 const char *torchdof_instructions(void) { return torchdof::use_avx2 ? "avx2" : "baseline"; }
 
 int32_t torchdof_use(const char *instructions) {
