@@ -27,7 +27,7 @@ from torchdof.io.sheet import write_sheet
 from torchdof.reference.metrics import display, psnr
 from torchdof.reference.scenes import Scene, read_scenes
 
-STAGES = ((4, 60, 0.08), (2, 40, 0.04), (1, 15, 0.02))  # coarser by, steps, rate: far from the truth, detail misleads
+STAGES = ((4, 60, 0.08), (2, 40, 0.04), (1, 25, 0.02))  # coarser by, steps, rate: far from the truth, detail misleads
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,6 +28,8 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
         _Casts(),
     )
     tidy: tuple[onnx_ir.passes.PassBase, ...] = (
+        passes.ShapeInferencePass(),
+        _Parts(),
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -139,6 +141,43 @@ class _Casts(onnx_ir.passes.InPlacePass):
                 node.outputs[0].replace_all_uses_with(new, replace_graph_outputs=True)
                 graph.remove(node, safe=True)
         return onnx_ir.passes.PassResult(model, modified=True)
+
+
+class _Parts(onnx_ir.passes.InPlacePass):
+    """Slices of what was put together, as the parts themselves; onnxruntime warns where it does so itself."""
+
+    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
+        """Replace in the graph; a flat one, as it is before it gets its branches."""
+        for node in list(model.graph):
+            if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
+                part = _part(node)
+                if part is not None:
+                    node.outputs[0].replace_all_uses_with(part)
+                    model.graph.remove(node, safe=True)
+        return onnx_ir.passes.PassResult(model, modified=True)
+
+
+def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
+    """The part that a slice cuts out, if it is exactly one of those that its input is made of."""
+    whole, *bounds = node.inputs
+    numbers = [None if v is None or v.const_value is None else v.const_value.numpy().tolist() for v in bounds]
+    source = None if whole is None else whole.producer()
+    if source is None or len(numbers) < 3 or any(n is None or len(n) != 1 for n in numbers):
+        return None
+    (start,), (end,), (axis,), (step,) = (*numbers, [1])[:4]
+    if (start, end) == (0, 2**63 - 1) and step == 1:
+        return whole
+    if source.op_type != "Concat" or step != 1 or source.attributes["axis"].as_int() != axis:
+        return None
+    first = 0
+    for value in source.inputs:
+        size = None if value is None or value.shape is None else value.shape[axis]
+        if not isinstance(size, int):
+            return None
+        if (first, first + size) == (start, end):
+            return value
+        first += size
+    return None
 
 
 def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.DataType, number: int) -> onnx_ir.Value:

@@ -41,7 +41,7 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
         >>> flattened((2, 5), "depth", torch.ones(2, 1, 1, 8, 12)).shape
         torch.Size([10, 1, 8, 12])
     """
-    if not isinstance(value, Tensor):
+    if not isinstance(value, Tensor) or value.layout != torch.strided:  # refused by whoever checks the batch
         return value
     _not_mapped(name, value)
     if len(axes) == 1:
@@ -77,7 +77,7 @@ def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
     if isinstance(value, Sequence) and not isinstance(value, str):
         try:
             value = torch.tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError):
+        except (TypeError, ValueError, RuntimeError, OverflowError):
             raise ValueError(f"{name} must be a number, a list of numbers or a tensor [B], got {show(value)}") from None
     if not isinstance(value, Tensor) or value.ndim == 0:
         return value

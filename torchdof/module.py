@@ -175,7 +175,9 @@ class DepthOfField(nn.Module):
         axes = leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
-        return restored(axes, _with_edges(image, self._coc_px(image, depth, *lens, "depth"), self.options))
+        coc = self._coc_px(image, depth, *lens, "depth")
+        validation.image_and_map(image, "coc_px", coc, "in pixels")  # as many items as the image, whatever the lens has
+        return restored(axes, _with_edges(image, coc, self.options))
 
     def _coc_px(
         self,

@@ -296,8 +296,8 @@ def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
     if not is_traced() and not bool(torch.isfinite(coc_px.sum())) and not bool(torch.isfinite(coc_px).all()):
         stated = ", ".join(f"{name} {_number(value)}" for name, value in lens.items())
         raise ValueError(
-            f"this lens ({stated}) blurs a depth of {float(depth.detach().min()):.3g} m beyond any number of pixels; "
-            "check both"
+            f"depth and lens must blur by some number of pixels, got a blur beyond any: this lens ({stated}) "
+            f"blurs a depth of {float(depth.detach().min()):.3g} m so much; check both"
         )
 
 

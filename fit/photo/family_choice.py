@@ -82,7 +82,7 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
         >>> import torch
         >>> from torchdof.optics import psf
         >>> round(highlight_psnr(psf.disc(6.0), psf.ring(2.0, 5.0)))  # nobody would mistake one for the other
-        13
+        7
     """
     first, second = _square("kernel", kernel), _square("other", other)
     half = max(first.shape[0], second.shape[0]) // 2

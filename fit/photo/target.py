@@ -60,7 +60,7 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_target(folder + "/target.pdf", "letter")
-        ...     open(folder + "/target.pdf", "rb").read(8)
+        ...     Path(folder, "target.pdf").read_bytes()[:8]
         b'%PDF-1.4'
     """
     target = Path(path)

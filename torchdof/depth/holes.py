@@ -37,9 +37,10 @@ def fill_holes(depth: Tensor, fill: Fill) -> Tensor:
     """
     number_map("depth", depth)
     if isinstance(fill, int | float) and not isinstance(fill, bool):
-        if not fill > 0 or torch.finfo(depth.dtype).max < fill < math.inf:
+        largest = torch.finfo(depth.dtype).max if depth.is_floating_point() else math.inf
+        if not fill > 0 or largest < fill < math.inf:
             raise ValueError(f"the depth to fill with must be positive metres (inf allowed), got {show(fill)}")
-        return torch.where(depth.isnan(), float(fill), depth)
+        return torch.where(depth.isnan(), float(fill), depth) if depth.is_floating_point() else depth
     if not isinstance(fill, str) or fill not in ("nearest", "far"):
         raise ValueError(f"fill must be 'nearest', 'far' or metres, got {show(fill)}")
     if depth.ndim != 4 or depth.shape[:2] != (1, 1):

@@ -46,7 +46,7 @@ def blur(
         plan = Plan.all(max_coc_px, tolerance)
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
         coc = torch.cat(maps[1::2])
-        plan = Plan.still(coc, tolerance_within(coc, options.tolerance))
+        plan = Plan.still(coc, tolerance_within(coc, options.tolerance, still=True))
     elif plan is not None and not is_traced():
         plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
@@ -99,7 +99,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
     moves = torch.is_grad_enabled() and coc.requires_grad
-    tolerance = tolerance_within(coc.flatten(0, 1), options.tolerance)
+    tolerance = tolerance_within(coc.flatten(0, 1), options.tolerance, still=moves)
     plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), tolerance)
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))

@@ -204,14 +204,16 @@ class Plan:
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
-def tolerance_within(coc_px: Tensor, tolerance: float) -> float:
+def tolerance_within(coc_px: Tensor, tolerance: float, still: bool = False) -> float:
     """What to plan a frame ``[B, 1, H, W]`` for, that its error be at most a tolerance.
 
     Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere.
+    A plan that is to be ``still`` is made for a whole power of 1/2 of the tolerance: layers must not move with a scene.
     """
     low, high = (from_blur_axis(end) for end in layer_cocs.ends(coc_px.detach()))
     widest = max(-low, high, 1.0)
-    return tolerance * min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * widest))
+    part = min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * widest))
+    return tolerance * (2.0 ** math.floor(math.log2(part)) if still else part)
 
 
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:
