@@ -160,9 +160,9 @@ class _Parts(onnx_ir.passes.InPlacePass):
 def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
     """The part that a slice cuts out, if it is exactly one of those that its input is made of."""
     whole, *bounds = node.inputs
-    numbers = [None if v is None or v.const_value is None else v.const_value.numpy().tolist() for v in bounds]
+    numbers = [v.const_value.numpy().tolist() for v in bounds if v is not None and v.const_value is not None]
     source = None if whole is None else whole.producer()
-    if source is None or len(numbers) < 3 or any(n is None or len(n) != 1 for n in numbers):
+    if source is None or len(numbers) < max(3, len(bounds)) or any(len(n) != 1 for n in numbers):
         return None
     (start,), (end,), (axis,), (step,) = (*numbers, [1])[:4]
     if (start, end) == (0, 2**63 - 1) and step == 1:
