@@ -17,7 +17,7 @@ from .optics.camera import CAMERA_NUMBERS, Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import pipeline
 from .render.attention import Attention
-from .render.plan import Plan, tolerance_within
+from .render.plan import Plan
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -225,7 +225,7 @@ class DepthOfField(nn.Module):
             ...
         """
         coc = flattened(leading_axes(image), "coc_px", self.coc_px(image, depth, focus_m, f_number))
-        return Plan.of_scene(coc, tolerance_within(coc, self.options.tolerance)).of_pixels(coc)
+        return Plan.of_frame(coc, self.options.tolerance).of_pixels(coc)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Camera, table and options: the whole configuration travels with ``state_dict``."""
@@ -409,8 +409,7 @@ def _check_attention(attention: Attention | None, plan: Plan | None, options: Op
         return
     if plan is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
-    aperture = options.table.aperture
-    if aperture is not None and aperture.depends_on_place:
+    if options.table.depends_on_place:
         raise ValueError("attention renders a part of the frame by itself; take a table without vignetting")
     if validation.is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")

@@ -85,8 +85,7 @@ class Options:
                 raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
         if not isinstance(self.method, str) or self.method not in ("layered", "fold"):
             raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
-        aperture = self.table.aperture
-        if self.method == "fold" and aperture is not None and aperture.depends_on_place:
+        if self.method == "fold" and self.table.depends_on_place:
             raise ValueError(
                 "method='fold' has one kernel a blur radius; take 'layered', or a table without vignetting"
             )

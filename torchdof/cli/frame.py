@@ -27,10 +27,7 @@ from .settings import RenderSettings
 __all__ = ["Frame", "Rendered", "read_frame", "read_metres", "render_frame", "tint_focus"]
 
 _NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
-_FAINT, _CLEAR = (
-    0.2,
-    0.6,
-)  # change of light from pixel to pixel, of the brighter one, that begins and that is an outline
+_FAINT, _CLEAR = 0.2, 0.6  # change of light to the next pixel, of the brighter one: begins to be an outline, and is one
 _DARKEST = 0.05  # of the mean light: what is darker has no outlines of its own
 
 

@@ -232,6 +232,16 @@ class BlurTable:
         return BlurTable(**{**kept, **{name: getattr(self, name) for name in names}, **changes})
 
     @property
+    def is_round(self) -> bool:
+        """Whether the opening is a circle, but for a squeeze: kernels are the same turned by half."""
+        return self.aperture is None or self.aperture.is_round
+
+    @property
+    def depends_on_place(self) -> bool:
+        """Whether kernels are others towards the corners of the frame."""
+        return self.aperture is not None and self.aperture.depends_on_place
+
+    @property
     def requires_grad(self) -> bool:
         """Whether a gradient is to be taken to the aperture's rotation or squeeze."""
         return self.aperture is not None and self.aperture.requires_grad
@@ -311,7 +321,7 @@ class BlurTable:
         if coc_px.ndim != 1 or not coc_px.numel():
             raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
         kernels = psf.pixel_kernels(self.family, params, size, window, self.aperture).transpose(0, 1)
-        if self.aperture is not None and not self.aperture.is_round:
+        if not self.is_round:
             behind = (coc_px.detach() >= 0).to(kernels.device)[:, None, None, None]
             kernels = torch.where(behind, kernels, kernels.flip(-2, -1))
         if all(psf.support(self.family, self._side_params(sign, torch.zeros(1))) == 0.0 for sign in (-1, 1)):

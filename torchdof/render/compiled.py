@@ -35,8 +35,7 @@ def picture(
     The compiled engine serves eager inference on the CPU in float32, with layers. Arguments are those of the plain
     engine's entry, ``torchdof.render.pipeline._render_item``.
     """
-    aperture = options.table.aperture
-    if torch.is_grad_enabled() and aperture is not None and aperture.requires_grad:
+    if torch.is_grad_enabled() and options.table.requires_grad:
         return None
     given = [t for t in (light, coc, behind_light, behind_coc, cover) if t is not None]
     if options.method != "layered" or is_traced() or not native.chosen() or not all(map(_is_plain, given)):

@@ -17,7 +17,7 @@ from .convolution import convolve
 from .exporting import exported_graph, where_needed
 from .layer_weights import blur_axis
 from .matting import matte
-from .plan import Blur, Plan, tolerance_within
+from .plan import Blur, Plan
 from .scatter import fold
 from .surfaces import Frame, Surface, framed, surfaces_of_image
 
@@ -34,8 +34,7 @@ def blur(
 
     Without a plan each item gets its own.
     """
-    aperture = options.table.aperture
-    if is_traced() and aperture is not None and aperture.depends_on_place:
+    if is_traced() and options.table.depends_on_place:
         raise ValueError("a compiled or exported graph has one kernel a layer; take a table without vignetting")
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
@@ -45,8 +44,7 @@ def blur(
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
         plan = Plan.all(max_coc_px, tolerance)
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
-        coc = torch.cat(maps[1::2])
-        plan = Plan.still(coc, tolerance_within(coc, options.tolerance, still=True))
+        plan = Plan.of_frame(torch.cat(maps[1::2]), options.tolerance, still=True)
     elif plan is not None and not is_traced():
         plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
@@ -54,9 +52,7 @@ def blur(
     # each item has its own layers, as it would have alone
     items = []
     for item in zip(*(t.split(1) for t in maps), strict=True):
-        coc = torch.cat(item[1::2])
-        own_plan = Plan.of_scene(coc, tolerance_within(coc, options.tolerance))
-        items.append(_render_item(own_plan, options, *item))
+        items.append(_render_item(Plan.of_frame(torch.cat(item[1::2]), options.tolerance), options, *item))
     return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
 
 
@@ -99,8 +95,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
     moves = torch.is_grad_enabled() and coc.requires_grad
-    tolerance = tolerance_within(coc.flatten(0, 1), options.tolerance, still=moves)
-    plan = (Plan.still if moves else Plan.of_scene)(coc.flatten(0, 1), tolerance)
+    plan = Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=moves)
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
     return (_render_item(plan, options, light, coc, cover=cover) / scale).to(rgba.dtype)
@@ -149,8 +144,7 @@ def _render_item(
     coarse = plan.rays and crisp_px < max(abs(c) for c in plan.coc_px)
     limit = highlights.threshold(light, weight) if options.occlusion or options.normalize or coarse else None
     # a plane's one kernel is exact, but for where blocks of the frame share it
-    aperture = options.table.aperture
-    several = len(plan.nodes) > 1 or (aperture is not None and aperture.depends_on_place)
+    several = len(plan.nodes) > 1 or options.table.depends_on_place
     splatted = several and (options.occlusion or coarse)
 
     # the surfaces of each pixel, and what is behind all of them
@@ -216,9 +210,7 @@ def _composite(
     frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
     def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
-        aperture = options.table.aperture
-        turned = aperture is not None and not aperture.is_round
-        scatter = functools.partial(convolve, turned=turned) if layered else fold
+        scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
         if options.occlusion:
             out = composite.over(frame, blurs, scatter)
             return out if splats is None else out + splats

@@ -17,7 +17,7 @@ from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
 from .vignetting import CatsEye
 
-__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "tolerance_within"]
+__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
 KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
@@ -78,6 +78,20 @@ class Plan:
         if isinstance(self.tolerance, str):  # names are for those who call a rendering
             raise ValueError(f"tolerance of a plan must be a number in [0, 1), such as 1/255, got {self.tolerance!r}")
         tolerance_of(self.tolerance)
+
+    @classmethod
+    def of_frame(cls, coc_px: Tensor, tolerance: float, still: bool = False) -> "Plan":
+        """Layers for a frame ``[B, 1, H, W]`` whose error is to be at most a tolerance: the plan of every rendering.
+
+        Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere:
+        such a frame is planned for less. For a plan that is to be ``still`` it is a whole power of 1/2 of the
+        tolerance, lest layers move with the scene.
+        """
+        low, high = (from_blur_axis(end) for end in layer_cocs.ends(coc_px.detach()))
+        part = min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * max(-low, high, 1.0)))
+        if still:
+            return cls.still(coc_px, tolerance * 2.0 ** math.floor(math.log2(part)))
+        return cls.of_scene(coc_px, tolerance * part)
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
@@ -202,18 +216,6 @@ class Plan:
         # rounded: whether a coc is in float32 or float64 does not decide
         reach = round(abs(coc_px) * math.sqrt(self.tolerance * 255.0), 4)
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
-
-
-def tolerance_within(coc_px: Tensor, tolerance: float, still: bool = False) -> float:
-    """What to plan a frame ``[B, 1, H, W]`` for, that its error be at most a tolerance.
-
-    Errors are largest beside edges and the border, and where blurs are as large as the frame these are everywhere.
-    A plan that is to be ``still`` is made for a whole power of 1/2 of the tolerance: layers must not move with a scene.
-    """
-    low, high = (from_blur_axis(end) for end in layer_cocs.ends(coc_px.detach()))
-    widest = max(-low, high, 1.0)
-    part = min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * widest))
-    return tolerance * (2.0 ** math.floor(math.log2(part)) if still else part)
 
 
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:

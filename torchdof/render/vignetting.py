@@ -4,8 +4,8 @@ Seen from off the axis, a lens opens through circles that no longer lie behind e
 in front of it and that of one behind it. A ray through the point ``u`` of the aperture, to a place ``p`` in the frame
 (from its middle, in half diagonals), passes where ``|u + 2 front p| <= 1`` and ``|u - 2 rear p| <= 1``. So behind the
 focus plane the front rim cuts off the side away from the middle of the frame, in front of it the other one, and the
-rear rim opposite. The kernel of a place is the table's own with what does
-not pass left out, and its light made whole again: how much darker corners are, the sharp image shows already.
+rear rim opposite. The kernel of a place is the table's own with what does not pass left out, and its light made whole
+again: how much darker corners are, the sharp image shows already.
 
 The border of what passes is a pixel wide. Kernels are those of where light lands, block by block; highlights take that
 of where they come from. Pixels of one block, 4 x 16 of its layer's resolution, share a kernel: beyond a few blocks it
@@ -86,12 +86,7 @@ class CatsEye:
             half: Pixels on each side that are not in the result ``[B, C, h - 2 half, w - 2 half]``.
         """
         high, wide = BLOCK
-        batch, channels, rows, columns = (
-            light.shape[0],
-            light.shape[1],
-            light.shape[2] - 2 * half,
-            light.shape[3] - 2 * half,
-        )
+        (batch, channels), (rows, columns) = light.shape[:2], (n - 2 * half for n in light.shape[2:])
         light = functional.pad(light, (0, -columns % wide, 0, -rows % high))
         weights = kernel.expand(channels, -1, -1) if len(kernel) > 1 else kernel
         x = self._places(columns, wide, self.size[1], light)
@@ -102,9 +97,7 @@ class CatsEye:
             window = light[:, :, band * high : (band + 1) * high + 2 * half]
             blocks = window.unfold(-1, wide + 2 * half, wide).permute(0, 3, 1, 2, 4)  # [B, blocks, C, rows, columns]
             kernels = kernels.expand(-1, channels, -1, -1).flatten(0, 1).flip(-2, -1).unsqueeze(1)
-            spread = functional.conv2d(
-                blocks.flatten(1, 2), kernels, groups=len(kernels)
-            )  # [B, blocks * C, high, wide]
+            spread = functional.conv2d(blocks.flatten(1, 2), kernels, groups=len(kernels))
             bands.append(spread.unflatten(1, (len(x), channels)).permute(0, 2, 3, 1, 4).flatten(3))
         return torch.cat(bands, 2)[:, :, :rows, :columns].reshape(batch, channels, rows, columns)
 
