@@ -40,6 +40,7 @@ class BlurFit:
         gain: the fitted exposure ratio between the pictures (forward model), else 1.
         background: the fitted level under the blurred dot (forward model), else 0.
         shift: the fitted displacement (x, y) of the blurred dot against the sharp one, px.
+        centre: (x, y) of the blurred dot in its picture, px from the middle of pixel (0, 0).
         magnification: the fitted size of the blurred picture's dot over the sharp one's.
         aperture: the lens's opening as it shows in the defocused picture (turned by half where that was nearer than the
             focus), None where the kernel is round.
@@ -64,6 +65,7 @@ class BlurFit:
     gain: float = 1.0
     background: float = 0.0
     shift: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)
     magnification: float = 1.0
     asymmetry: float = math.nan
     radius: float = math.nan

@@ -71,6 +71,7 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
             pair.data_dot.x + solution.moves["dx"] - pair.source.dot.x,
             pair.data_dot.y + solution.moves["dy"] - pair.source.dot.y,
         ),
+        centre=(pair.data_dot.x + solution.moves["dx"], pair.data_dot.y + solution.moves["dy"]),
         magnification=solution.moves["magnification"],
         asymmetry=asymmetry_of(pair, solution)[0],
         radius=float(np.sqrt(2) * rms),

@@ -185,9 +185,9 @@ def check_fit(
     _check_spots(pair, solution, file, stacklevel + 1)
     if fit.asymmetry > UNEVEN and asymmetry_of(pair, solution)[1] < CHANCE:
         text = (
-            f"{100 * fit.asymmetry:.0f} % of the blur depends on the angle in a way that family {fit.family!r} has "
-            "not; is the lens decentred, the dot off the axis, or the stop a polygon? Families 'auto' and 'image' take "
-            "any shape"
+            f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
+            f"{fit.family!r} has not; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
+            "'auto' and 'image' take any shape"
         )
         warn(AsymmetryWarning(text, file=file, number=fit.asymmetry), stacklevel)
     if solution.family != "radial":

@@ -18,7 +18,7 @@ from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
 from .diagnostics import check_fit
 from .dot import find_dot, noise_inside
-from .dot_model import Edge, soft_edge
+from .dot_model import Edge, soft_edge, with_softness
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
 from .linearity import EXPLAINED, check_focus, check_linearity, check_noise, focused
@@ -58,6 +58,7 @@ def fit_pair(
     knots: int | None = None,
     reach: float | None = None,
     aperture: Aperture | None = None,
+    softness: float | None = None,
     files: tuple[str | None, str | None] = (None, None),
 ) -> BlurFit:
     """The kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
@@ -92,6 +93,8 @@ def fit_pair(
         reach: where a "radial" profile ends, px; None finds it from a soft disc.
         aperture: the lens's opening as it shows in `blurred`, if it is known (from another distance), for the family
             "image": its size alone is then fitted.
+        softness: of the sharp dot's edge in focus (sigma, px), where that is known to be less than in `sharp`: of a
+            colour that is not the one in focus. An ideal dot then stands for the sharp one.
         files: names of the two pictures, for errors and warnings.
 
     Returns:
@@ -133,7 +136,9 @@ def fit_pair(
         r, strength, spokes = blur_strength(still, data)
         fit = fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes)
         return replace(fit, model="ratio")
-    pair, edge, linear = prepared_pair(still, data, source, magnification, white, files)
+    if softness is not None:
+        a_number("softness", softness, -1e-9, unit="pixels")
+    pair, edge, linear = prepared_pair(still, data, source, magnification, white, files, softness)
     if start is not None and start.family in SHAPES:
         pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
     pair.prior = dict(prior or {})
@@ -221,6 +226,7 @@ def prepared_pair(
     magnification: float,
     white: float | None,
     files: tuple[str | None, str | None],
+    softness: float | None = None,
 ) -> tuple[Forward, Edge | None, bool]:
     """Find the dots, leave out what is clipped, and decide what stands for the sharp dot.
 
@@ -234,7 +240,9 @@ def prepared_pair(
     whole = used_pixels(still, dot, white, files[0], "sharp", refuse=False)
     clipped = int(np.sum(~whole))
     edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)
-    linear = clipped > 0 or check_linearity(still, dot, edge, files[0])
+    if softness is not None and softness < edge.softness:
+        source, edge = "dot", with_softness(edge, softness)
+    linear = clipped > 0 or softness is not None or check_linearity(still, dot, edge, files[0])
     bright = noise_inside(still, dot)
     shot_noise = 0.0 if bright is None else max(bright[0] ** 2 - dot.noise**2, 0.0) / edge.level
     if clipped:

@@ -93,8 +93,7 @@ class IdealDot:
     def draw(self, rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
         """See `Source`. The softness is the sensor's, not the print's: it does not grow with the dot."""
         softness = self.edge.softness
-        # the light of a soft disc is pi (radius^2 + softness^2)
-        square = magnification**2 * (self.edge.radius**2 + softness**2) - softness**2
+        square = magnification**2 * (self.edge.radius**2 + softness**2) - softness**2  # as the light of a soft disc
         return self.edge.level * draw_edge(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
 
     def variants(self) -> tuple[list[Source], Array]:
