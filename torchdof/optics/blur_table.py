@@ -116,6 +116,8 @@ class BlurTable:
         self._sides = {sign: self._side(sign) for sign in (-1, 1)}
         for sign in (-1, 1):
             self._sides[sign] = self._sides[sign] or self._sides[-sign]
+        in_focus = [self._side_params(sign, torch.zeros(1)) for sign in (-1, 1)]
+        self._sharp_in_focus = not any(bool(p[name].any()) for p in in_focus for name in psf.LENGTHS & p.keys())
         self._try_kernels()
 
     @classmethod
@@ -324,7 +326,7 @@ class BlurTable:
         if not self.is_round:
             behind = (coc_px.detach() >= 0).to(kernels.device)[:, None, None, None]
             kernels = torch.where(behind, kernels, kernels.flip(-2, -1))
-        if all(psf.support(self.family, self._side_params(sign, torch.zeros(1))) == 0.0 for sign in (-1, 1)):
+        if self._sharp_in_focus:
             return kernels
         fade = coc_px.to(torch.float64).square().clamp(max=1.0)[:, None, None, None]
         centre = torch.zeros_like(kernels)
@@ -358,7 +360,7 @@ class BlurTable:
         """
         signed = torch.tensor(number("coc_px", coc_px, unit="pixels"), dtype=torch.float64)
         params = self.params(signed, width)
-        size = psf.width_of(self.family, params, size, self.aperture)
+        size = psf.width_of(size, psf.support(self.family, params, self.aperture))
         axis = torch.arange(size, dtype=torch.float64) - size // 2
         opening = self.aperture or Aperture()
         r = torch.hypot(axis[:, None], axis[None, :] * opening.squeeze)
