@@ -18,6 +18,7 @@ from torchdof.validation import show
 
 from ..result import Array
 from . import prescription
+from .surface import Shape
 
 __all__ = ["RGB_UM", "Lens", "Paraxial"]
 
@@ -62,10 +63,10 @@ class Paraxial:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Spherical surfaces on one axis with an aperture stop, in air.
+    """Surfaces on one axis, spheres or even aspheres, one of them the aperture stop, in air.
 
     Args:
-        radius: Radii of curvature ``[S]``, ``inf`` for a flat surface and for the stop.
+        radius: Radii of curvature at the vertex ``[S]``, ``inf`` for a flat surface.
         thickness: Distance from each surface to the next ``[S]``, >= 0; the last is not used.
         index: Refractive index behind each surface at the d line ``[S]``, >= 1; 1 behind the last.
         abbe: Abbe number V of the medium behind each surface ``[S]``, ``inf`` where there is no dispersion.
@@ -75,6 +76,9 @@ class Lens:
         source: Where the numbers are from.
         partial: Partial dispersion P_gF of the medium behind each surface ``[S]``, as in glass catalogues; NaN, and
             None for all, takes that of a normal glass with its Abbe number.
+        conic: Conic constant of each surface ``[S]``, see :mod:`torchdof.fit.lens.surface`; None is 0 for all: spheres.
+        polynomial: Coefficients ``A_2, A_4, ...`` of each surface ``[S, K]`` in powers of millimetres, see there; None
+            is none.
 
     Raises:
         ValueError: If a number is outside its range.
@@ -97,6 +101,8 @@ class Lens:
     name: str = ""
     source: str = ""
     partial: Array | None = None
+    conic: Array | None = None
+    polynomial: Array | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers, so that whatever is computed later is about a lens."""
@@ -116,6 +122,13 @@ class Lens:
         if partial.shape != self.radius.shape or not np.all(np.isnan(partial) | ((partial > 0) & (partial < 1))):
             raise ValueError(f"partial must hold one number a surface, 0 to 1 or NaN, got {show(self.partial)}")
         object.__setattr__(self, "partial", partial)
+        for name, given in (("conic", self.conic), ("polynomial", self.polynomial)):
+            shape = self.radius.shape if name == "conic" else (*self.radius.shape, 0)
+            array = np.zeros(shape) if given is None else np.asarray(given, np.float64)
+            if array.ndim != len(shape) or len(array) != len(self.radius) or not np.isfinite(array).all():
+                wanted = "one number" if name == "conic" else "as many numbers"
+                raise ValueError(f"{name} must hold {wanted} for each surface, all finite, got {show(given)}")
+            object.__setattr__(self, name, array)
         if isinstance(self.stop, bool) or not isinstance(self.stop, int) or not 0 <= self.stop < len(self.radius):
             raise ValueError(
                 f"stop must be the number of a surface (0 to {len(self.radius) - 1}), got {show(self.stop)}"
@@ -157,6 +170,11 @@ class Lens:
         """Position of each surface's vertex on the axis ``[S]``; the first is 0."""
         return np.concatenate([[0.0], np.cumsum(self.thickness[:-1])])
 
+    def shape(self, surface: int) -> Shape:
+        """What a surface, by its number, looks like."""
+        coefficients = tuple(float(a) for a in self.polynomial[surface])  # type: ignore[index]
+        return Shape(1.0 / float(self.radius[surface]), float(self.conic[surface]), coefficients)  # type: ignore[index]
+
     @property
     def dispersive(self) -> bool:
         """Whether any glass has an Abbe number."""
@@ -193,7 +211,8 @@ class Lens:
         for i in range(first, last):
             if i > first:
                 matrix = np.array([[1.0, self.thickness[i - 1]], [0.0, 1.0]]) @ matrix
-            power = (n[i + 1] - n[i]) / self.radius[i]
+            shape = self.shape(i)
+            power = (n[i + 1] - n[i]) * (shape.curvature + 2.0 * sum(shape.polynomial[:1]))
             matrix = np.array([[1.0, 0.0], [-power / n[i + 1], n[i] / n[i + 1]]]) @ matrix
         return matrix
 
@@ -254,14 +273,14 @@ class Lens:
         """The lens enlarged or shrunk as a whole to another focal length; its f-number stays."""
         _check_positive("focal_length_mm", focal_length_mm)
         factor = focal_length_mm / self.paraxial().focal_length
-        return dataclasses.replace(
-            self, radius=self.radius * factor, thickness=self.thickness * factor, diameter=self.diameter * factor
-        )
+        lengths = {name: getattr(self, name) * factor for name in ("radius", "thickness", "diameter")}
+        powers = 2.0 * np.arange(self.polynomial.shape[1]) + 1.0  # type: ignore[union-attr]
+        return dataclasses.replace(self, **lengths, polynomial=self.polynomial / factor**powers)
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
         columns = (self.radius, self.thickness, self.index, self.abbe, self.partial, self.diameter)
-        return prescription.lines(*columns, self.stop)  # type: ignore[arg-type]
+        return prescription.lines(*columns, self.conic, self.polynomial, self.stop)  # type: ignore[arg-type]
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -43,6 +43,18 @@ def test_thick_lens_agrees_with_the_lensmakers_equation(tmp_path: Path) -> None:
     assert (first.entrance_pupil, first.entrance_pupil_diameter) == pytest.approx((0.0, 18.0))
 
 
+def test_stop_may_be_a_curved_surface_of_glass(tmp_path: Path) -> None:
+    front = lens_from(tmp_path, "40 3 1.5 10 stop\n-40 2 1 20\n").paraxial()
+    assert (front.entrance_pupil, front.entrance_pupil_diameter) == (0.0, 10.0)
+    # on the rear surface it is seen through the front one: 1.5 / 3 - power = 1 / distance, power = 0.5 / 40
+    lens = lens_from(tmp_path, "40 3 1.5 20\n-40 2 1 10 stop\n")
+    rear, seen = lens.paraxial(), 1 / (1.5 / 3 - 0.5 / 40)
+    assert rear.entrance_pupil == pytest.approx(seen, rel=1e-12)
+    assert rear.entrance_pupil_diameter == pytest.approx(10.0 * seen * 1.5 / 3, rel=1e-12)
+    assert rear.exit_pupil == 0.0
+    assert lens.with_f_number(8.0).diameter.tolist() == [20.0, pytest.approx(10.0 * rear.f_number / 8.0)]
+
+
 def test_pupils_are_images_of_each_other() -> None:
     for name in FACTS:
         lens = Lens.read(name)
@@ -112,12 +124,32 @@ def test_crown_and_flint_bring_red_and_blue_together(tmp_path: Path) -> None:
 
 
 def test_lines_are_read_back_as_the_same_lens(tmp_path: Path) -> None:
-    for text in (SINGLET, "40 3 1.52/64/0.53 20\n-40 2 1 20\n0 0 0 10\n", "inf 3 1.5 20\n-40 2 1 20\n0 0 0 10\n"):
+    for text in (
+        SINGLET,
+        "40 3 1.52/64/0.53 20\n-40 2 1 20\n0 0 0 10\n",
+        "inf 3 1.5 20\n-40 2 1 20\n0 0 0 10\n",
+        "40 3 1.5 20 stop k=-0.6 A4=1.2e-06 A10=-3e-13\n-40 2 1 20 A2=0.001\n",
+        "40 3 1.5 20\ninf 3 1.5 12 stop\n-40 2 1 20\n",
+    ):
         lens = lens_from(tmp_path, text)
         again = lens_from(tmp_path, "\n".join(lens.lines()))
-        for name in ("radius", "thickness", "index", "abbe", "partial", "diameter"):
+        for name in ("radius", "thickness", "index", "abbe", "partial", "diameter", "conic", "polynomial"):
             np.testing.assert_array_equal(getattr(again, name), getattr(lens, name))
         assert again.stop == lens.stop
+
+
+def test_scaling_an_asphere_keeps_its_shape(tmp_path: Path) -> None:
+    lens = lens_from(tmp_path, "40 3 1.5 20 stop k=-0.6 A4=1.2e-06 A6=-3e-09\n-40 2 1 20\n")
+    scaled = lens.scaled(2.5 * lens.paraxial().focal_length)
+    r = np.linspace(0.0, 9.0, 7)
+    np.testing.assert_allclose(scaled.shape(0).sag(6.25 * r * r)[0], 2.5 * lens.shape(0).sag(r * r)[0], rtol=1e-12)
+
+
+def test_polynomial_of_r_squared_is_a_curvature(tmp_path: Path) -> None:
+    sphere, asphere = (
+        lens_from(tmp_path, f"{front} 3 1.5 20\n-40 2 1 20\n0 0 0 10\n") for front in ("50", "inf 3 1.5 20 A2=0.01 #")
+    )
+    assert asphere.paraxial().focal_length == pytest.approx(sphere.paraxial().focal_length, rel=1e-12)
 
 
 def test_source_is_kept() -> None:
@@ -140,6 +172,10 @@ def test_source_is_kept() -> None:
         ("0 1 0 18\n0 1 0 18\n", r"line 2, column radius: a second stop"),
         ("50 5 1.5 20\n0 1 1.7 18\n", r"line 2, column index: the stop does not change the index"),
         ("50 5 1.5 20\n-50 0 1 20\n", r"no aperture stop among 2 surfaces"),
+        ("50 5 1.5 20 stop\n0 1 0 18\n", r"line 2, column radius: a second stop"),
+        ("50 5 1.5 20 A5=1\n", r"line 1: behind the columns expected stop, k=NUMBER or A2=NUMBER to A16=.*got 'A5=1'"),
+        ("50 5 1.5 20 k=x\n", r"line 1: behind the columns expected .* got 'k=x'"),
+        ("50 5 1.5 20 k=inf\n", r"line 1: k must be finite, got 'inf'"),
         ("", r"no aperture stop among 0 surfaces"),
         ("50 5 1.5 20\n0 1 0 18\n", r"the index behind the last surface must be 1"),
     ],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchdof import BlurTable, Camera
+from torchdof import BlurTable, Camera, blur_by_coc
 from torchdof.fit import natural_psnr, trace_table
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.lens.spot import Spot, focus_sensor, point_spread
@@ -17,6 +17,7 @@ from torchdof.optics import psf
 
 WIDTH = 1920
 PIXEL = 36.0 / WIDTH
+SHARP_PX = 0.34  # from here on a shipped table shows all its blur in focus
 # lens, f-number, focus, nodes, wanted PSNR between nodes where images are blurred
 SHIPPED = {
     "double_gauss_50mm_f2": ("double_gauss_50mm", 2.0, 2.0, 33, 50.0),
@@ -65,7 +66,7 @@ def psnr(
     *,
     shown: bool,
 ) -> np.ndarray:
-    """PSNR at signed coc in mm: of what the table shows, or of its kernels without the fade below a pixel."""
+    """PSNR at signed coc in mm: of what the table shows, or of its kernels without the fade to focus."""
     focal, stopped = lens.paraxial().focal_length, lens.with_f_number(f_number)
     sensor = focus_sensor(stopped, focus_m)
     found = []
@@ -84,12 +85,47 @@ def test_shipped_table_matches_traced_spots_between_its_nodes(name: str, loops: 
     table = BlurTable.load(name)
     assert len(table.coc) == nodes
     places = between(table)
-    blurred = places[np.abs(places) >= PIXEL]
+    blurred = places[np.abs(places) >= SHARP_PX * PIXEL]
     shown = psnr(loops, table, blurred, Lens.read(lens), f_number, focus_m, shown=True)
     plain = psnr(loops, table, places, Lens.read(lens), f_number, focus_m, shown=False)
     print(f"{name}: {shown.min():.1f} dB (median {np.median(shown):.1f}), with focus {plain.min():.1f} dB")
     assert shown.min() >= wanted
     assert plain.min() >= 50.0
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_table_is_nowhere_worse_than_the_thin_lens_and_50_db_from_where_it_blurs(name: str, loops: ModuleType) -> None:
+    lens, f_number, focus_m, _, _ = SHIPPED[name]
+    px = np.array([-1.3, -0.85, -0.7, -0.35, -0.1, 0.1, 0.35, 0.7, 0.85, 1.3])
+    shown, thin = (
+        psnr(loops, table, px * PIXEL, Lens.read(lens), f_number, focus_m, shown=True)
+        for table in (BlurTable.load(name), BlurTable.disc())
+    )
+    assert (shown - np.minimum(thin, 60.0)).min() > 0.0
+    assert shown[np.abs(px) > SHARP_PX].min() >= 50.0
+
+
+def test_texture_and_point_are_rendered_as_traced_at_their_distance(loops: ModuleType) -> None:
+    lens, side = Lens.read("double_gauss_50mm"), 64
+    table = BlurTable.load("double_gauss_50mm_f2").replace(sensor_width_mm=side * PIXEL)  # the frame is a cut-out
+    sensor = focus_sensor(lens.with_f_number(2.0), 2.0)
+    frequency = torch.hypot(torch.fft.fftfreq(side)[:, None], torch.fft.rfftfreq(side)[None, :]).clamp_min(1 / side)
+    texture = torch.fft.irfft2(torch.fft.rfft2(torch.randn(side, side)) / frequency, s=(side, side))
+    texture = (0.5 + 0.22 * (texture - texture.mean()) / texture.std()).clamp(0.0, 1.0)
+    point = torch.zeros(side, side)
+    point[side // 2, side // 2] = 1.0
+    for px in (-1.7, -0.8, 0.6, 1.1):
+        z_m = distance_m(px * PIXEL, lens.paraxial().focal_length, 2.0, 2.0)
+        spot = point_spread(lens.with_f_number(2.0), z_m, sensor, meridional=True, rays=4_000)
+        kernel = torch.from_numpy(traced_kernel(spot, loops))[None, None].float()
+        for picture in (texture, point):
+            image = picture[None, None]
+            made = blur_by_coc(image, torch.full_like(image, px), table=table)
+            half = kernel.shape[-1] // 2
+            inner = (..., slice(half, -half), slice(half, -half))
+            truth = torch.nn.functional.conv2d(image, kernel)
+            error = float((made[inner] - truth).square().mean().sqrt() / truth.max())
+            assert -20 * math.log10(error) >= 50.0
 
 
 @pytest.mark.parametrize("share", [0.15, 1 / 3, 2 / 3, 0.85])
