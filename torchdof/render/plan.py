@@ -14,7 +14,7 @@ from ..options import tolerance_of
 from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
-from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
+from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 from .vignetting import CatsEye
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
@@ -148,7 +148,8 @@ class Plan:
     def of_pixels(self, coc_px: Tensor) -> "Plan":
         """The same plan, told which share of a scene's pixels each layer carries: ``[B, 1, H, W]``."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
-        behind = [float(weight_at_or_behind(x, self.nodes, k).double().mean()) for k in range(len(self.nodes) + 1)]
+        ends = ramps(self.nodes, x).split(1, 1)  # one at a time, for a frame may be large
+        behind = [float(weights_at_or_behind(x, end).double().mean()) for end in ends]
         pixels = tuple(behind[k] - behind[k + 1] for k in range(len(self.nodes)))
         return dataclasses.replace(self, pixels=pixels)
 
