@@ -18,12 +18,12 @@ from torchdof.validation import show
 
 from ..result import Array
 from . import prescription
+from .glass import C_UM, D_UM, F_UM, G_UM, Glass
 from .surface import Shape
 
 __all__ = ["RGB_UM", "Lens", "Paraxial"]
 
 
-D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
 RGB_UM = (C_UM, 0.54607, F_UM)
 """Wavelengths that stand for red, green and blue, in micrometres: the lines C, e and F."""
 
@@ -79,6 +79,8 @@ class Lens:
         conic: Conic constant of each surface ``[S]``, see :mod:`torchdof.fit.lens.surface`; None is 0 for all: spheres.
         polynomial: Coefficients ``A_2, A_4, ...`` of each surface ``[S, K]`` in powers of millimetres, see there; None
             is none.
+        glass: The glass behind each surface, None where there is none: one ``Glass`` or None a surface. Where there is
+            one, ``index``, ``abbe`` and ``partial`` are its own, whatever was given. None is none at all.
 
     Raises:
         ValueError: If a number is outside its range.
@@ -103,9 +105,14 @@ class Lens:
     partial: Array | None = None
     conic: Array | None = None
     polynomial: Array | None = None
+    glass: tuple[Glass | None, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers, so that whatever is computed later is about a lens."""
+        glasses = [None] * np.size(self.radius) if self.glass is None else list(self.glass)
+        if len(glasses) != np.size(self.radius) or not all(isinstance(one, Glass | None) for one in glasses):
+            raise ValueError(f"glass must hold one Glass or None a surface, got {show(self.glass)}")
+        object.__setattr__(self, "glass", tuple(glasses))
         columns = {name: getattr(self, name) for name in (*prescription.COLUMNS, "abbe")}
         for name, value in columns.items():
             try:
@@ -121,6 +128,10 @@ class Lens:
         partial = np.full(self.radius.shape, np.nan) if self.partial is None else np.asarray(self.partial, np.float64)
         if partial.shape != self.radius.shape or not np.all(np.isnan(partial) | ((partial > 0) & (partial < 1))):
             raise ValueError(f"partial must hold one number a surface, 0 to 1 or NaN, got {show(self.partial)}")
+        partial = partial.copy()
+        for i, glass in enumerate(glasses):
+            if glass is not None:
+                self.index[i], self.abbe[i], partial[i] = glass.index(D_UM), glass.abbe, glass.partial
         object.__setattr__(self, "partial", partial)
         for name, given in (("conic", self.conic), ("polynomial", self.polynomial)):
             shape = self.radius.shape if name == "conic" else (*self.radius.shape, 0)
@@ -183,9 +194,10 @@ class Lens:
     def indices(self, wavelength_um: float | None = None) -> Array:
         """Refractive indices along the light's way ``[S + 1]``: before the first surface (air), then behind each.
 
-        Cauchy's three terms, ``n = a + b / wavelength^2 + c / wavelength^4``, through the index at d, of the dispersion
-        ``n_F - n_C = (n_d - 1) / V`` and the partial dispersion ``n_g - n_F = P_gF (n_F - n_C)``. For a glass whose
-        P_gF is not stated that of a normal one is taken, ``0.6438 - 0.001682 V``. None is the d line.
+        Sellmeier's formula for a :class:`torchdof.fit.lens.glass.Glass`. For other media Cauchy's three terms,
+        ``n = a + b / wavelength^2 + c / wavelength^4``, through the index at d, of the dispersion
+        ``n_F - n_C = (n_d - 1) / V`` and the partial dispersion ``n_g - n_F = P_gF (n_F - n_C)``. Where P_gF is not
+        stated that of a normal glass is taken, ``0.6438 - 0.001682 V``. None is the d line.
 
         Reference:
             SCHOTT, "TIE-29: Refractive index and dispersion", 2016 (the line of normal glasses).
@@ -202,6 +214,9 @@ class Lens:
             )
             share = np.linalg.solve(np.stack([across, beyond]), np.stack([np.ones_like(partial), partial]))
             index = index + (index - 1.0) / self.abbe * (here @ share)
+            for i, glass in enumerate(self.glass or ()):
+                if glass is not None:
+                    index[i] = glass.index(wavelength_um)
         return np.concatenate([[1.0], index])
 
     def matrix(self, first: int, last: int, wavelength_um: float | None = None) -> Array:
@@ -280,7 +295,8 @@ class Lens:
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
         columns = (self.radius, self.thickness, self.index, self.abbe, self.partial, self.diameter)
-        return prescription.lines(*columns, self.conic, self.polynomial, self.stop)  # type: ignore[arg-type]
+        shape = self.conic, self.polynomial, self.glass
+        return prescription.lines(*columns, *shape, self.stop)  # type: ignore[arg-type]
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -1,10 +1,12 @@
+import dataclasses
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from torchdof.fit.lens.lens import C_UM, D_UM, F_UM, Lens
+from torchdof.fit.lens.glass import C_UM, D_UM, F_UM, Glass, _catalogue
+from torchdof.fit.lens.lens import Lens
 
 FACTS = {
     "double_gauss_50mm": (50.3582, 36.1059),
@@ -115,6 +117,43 @@ def test_three_numbers_of_a_catalogue_give_the_index_at_every_line(
     assert found == pytest.approx(lines, abs=1.5e-4)
 
 
+@pytest.mark.parametrize(
+    ("glass", "lines"),  # SCHOTT's data sheets: C, d, F, g
+    [
+        ("N-BK7", (1.51432, 1.51680, 1.52238, 1.52668)),
+        ("F2", (1.61503, 1.62004, 1.63208, 1.64202)),
+        ("N-SK16", (1.61727, 1.62041, 1.62756, 1.63312)),
+    ],
+)
+def test_glass_of_the_catalogue_has_its_makers_indices_to_the_last_digit(
+    glass: str, lines: tuple[float, ...], tmp_path: Path
+) -> None:
+    lens = lens_from(tmp_path, f"50 5 {glass} 20\n-50 0 1 20\n0 0 0 19\n")
+    found = [float(lens.indices(at)[1]) for at in (C_UM, D_UM, F_UM, 0.43584)]
+    assert found == pytest.approx(lines, abs=1.1e-5)
+    assert lens.indices()[1] == lens.indices(D_UM)[1] and lens.dispersive
+
+
+def test_catalogue_is_that_of_glasses() -> None:
+    assert len(_catalogue()) > 100
+    for name, glass in _catalogue().items():
+        assert (
+            glass.name == name and 1.4 < glass.index(D_UM) < 2.1 and 15 < glass.abbe < 100 and 0.5 < glass.partial < 0.7
+        )
+
+
+def test_index_beyond_what_a_glass_lets_pass_is_refused() -> None:
+    with pytest.raises(ValueError, match="glass N-BK7 has no refractive index from 1 to 5 at 0.14 um"):
+        Glass.named("n-bk7").index(0.14)
+
+
+def test_glass_beside_a_surface_is_refused() -> None:
+    lens = Lens.read("wide_22mm")
+    for wrong in ((Glass.named("F2"),), ("F2",) * len(lens.radius)):
+        with pytest.raises(ValueError, match="glass must hold one Glass or None a surface"):
+            dataclasses.replace(lens, glass=wrong)
+
+
 def test_crown_and_flint_bring_red_and_blue_together(tmp_path: Path) -> None:
     # powers in the ratio of the Abbe numbers: 0.01 V1 / (V1 - V2) and -0.01 V2 / (V1 - V2)
     text = "44.78 4 1.5168/64.17 20\n-44.78 2 1.6200/36.37 20\n-811 1 1 20\n0 0 0 19\n"
@@ -130,12 +169,13 @@ def test_lines_are_read_back_as_the_same_lens(tmp_path: Path) -> None:
         "inf 3 1.5 20\n-40 2 1 20\n0 0 0 10\n",
         "40 3 1.5 20 stop k=-0.6 A4=1.2e-06 A10=-3e-13\n-40 2 1 20 A2=0.001\n",
         "40 3 1.5 20\ninf 3 1.5 12 stop\n-40 2 1 20\n",
+        "glass MINE 1.04 0.23 1.01 0.006 0.02 103.56\n40 3 N-SK15 20\n0 1 0 9\n-90 2 MINE 20\n-40 2 1 20\n",
     ):
         lens = lens_from(tmp_path, text)
         again = lens_from(tmp_path, "\n".join(lens.lines()))
         for name in ("radius", "thickness", "index", "abbe", "partial", "diameter", "conic", "polynomial"):
             np.testing.assert_array_equal(getattr(again, name), getattr(lens, name))
-        assert again.stop == lens.stop
+        assert (again.stop, again.glass) == (lens.stop, lens.glass)
 
 
 def test_scaling_an_asphere_keeps_its_shape(tmp_path: Path) -> None:
@@ -162,7 +202,7 @@ def test_source_is_kept() -> None:
         ("50 5 1.5 20\n0 1 0\n", r"line 2: expected the columns radius thickness index diameter, got 3"),
         ("50 5 1.5 20\n0 1 0 18\n-50 x 1 20\n", r"line 3, column thickness: expected a number, got 'x'"),
         ("50 5/2 1.5 20\n", r"line 1, column thickness: expected a number, got '5/2'"),
-        ("50 5 1.5/ 20\n", r"line 1, column index: expected a number, index/V or index/V/P_gF, got '1.5/'"),
+        ("50 5 1.5/ 20\n", r"line 1, column index: expected a number, index/V, index/V/P_gF or a glass, got '1.5/'"),
         ("50 5 1.5/-3 20\n", r"line 1, column index: the Abbe number must be positive"),
         ("50 5 0.9 20\n", r"line 1, column index: index must be between 1 and 5"),
         ("50 5 0 20\n", r"line 1, column index: index must be between 1 and 5"),
@@ -175,6 +215,13 @@ def test_source_is_kept() -> None:
         ("50 5 1.5 20 stop\n0 1 0 18\n", r"line 2, column radius: a second stop"),
         ("50 5 1.5 20 A5=1\n", r"line 1: behind the columns expected stop, k=NUMBER or A2=NUMBER to A16=.*got 'A5=1'"),
         ("50 5 1.5 20 k=x\n", r"line 1: behind the columns expected .* got 'k=x'"),
+        (
+            "50 5 BK8 20\n",
+            r"line 1, column index: no glass 'BK8' in the catalogue of SCHOTT; define it by",
+        ),
+        ("glass X 1 2 3\n", r"line 1: expected glass NAME B1 B2 B3 C1 C2 C3, got 'X 1 2 3'"),
+        ("glass X 30 0 0 0.01 0.02 90\n", r"line 1: glass X has no refractive index from 1 to 5 at 0.4 um"),
+        ("glass X nan 0 0 0.01 0.02 90\n", r"line 1: glass X must have six finite coefficients"),
         ("50 5 1.5 20 k=inf\n", r"line 1: k must be finite, got 'inf'"),
         ("", r"no aperture stop among 0 surfaces"),
         ("50 5 1.5 20\n0 1 0 18\n", r"the index behind the last surface must be 1"),

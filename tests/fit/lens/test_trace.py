@@ -20,10 +20,10 @@ PIXEL = 36.0 / WIDTH
 SHARP_PX = 0.34  # from here on a shipped table shows all its blur in focus
 # lens, f-number, focus, nodes, wanted PSNR between nodes where images are blurred
 SHIPPED = {
-    "double_gauss_50mm_f2": ("double_gauss_50mm", 2.0, 2.0, 33, 50.0),
-    "double_gauss_50mm_f4": ("double_gauss_50mm", 4.0, 2.0, 17, 60.0),
-    "telephoto_250mm_f8": ("telephoto_250mm", 8.0, 10.0, 33, 55.0),
-    "wide_22mm_f4": ("wide_22mm", 4.0, 0.5, 17, 60.0),
+    "double_gauss_50mm_f2": ("double_gauss_50mm", 2.0, 2.0, 41, 55.0),
+    "double_gauss_50mm_f4": ("double_gauss_50mm", 4.0, 2.0, 16, 60.0),
+    "telephoto_250mm_f8": ("telephoto_250mm", 8.0, 10.0, 32, 60.0),
+    "wide_22mm_f4": ("wide_22mm", 4.0, 0.5, 20, 60.0),
 }
 
 
@@ -93,6 +93,17 @@ def test_shipped_table_matches_traced_spots_between_its_nodes(name: str, loops: 
     assert plain.min() >= 50.0
 
 
+def test_a_table_takes_as_many_nodes_as_50_db_need(tmp_path: Path, loops: ModuleType) -> None:
+    (tmp_path / "single.txt").write_text("50 5 1.5168 20\n0 1 0 18\n-50 0 1 20\n")
+    lens = Lens.read(tmp_path / "single.txt")
+    given = {"f_number": 6.0, "nodes": None, "points": 33, "rays": 500}
+    coarse, fine = (small(lens, **given, width_px=width) for width in (480, WIDTH))
+    assert len(coarse.coc) < len(fine.coc) < 33
+    places = between(fine)
+    places = places[np.abs(places) < 2 * PIXEL]
+    assert psnr(loops, fine, places, lens, 6.0, 2.0, shown=False).min() >= 50.0
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_table_is_nowhere_worse_than_the_thin_lens_and_50_db_from_where_it_blurs(name: str, loops: ModuleType) -> None:
     lens, f_number, focus_m, _, _ = SHIPPED[name]
@@ -101,7 +112,7 @@ def test_table_is_nowhere_worse_than_the_thin_lens_and_50_db_from_where_it_blurs
         psnr(loops, table, px * PIXEL, Lens.read(lens), f_number, focus_m, shown=True)
         for table in (BlurTable.load(name), BlurTable.disc())
     )
-    assert (shown - np.minimum(thin, 60.0)).min() > 0.0
+    assert (shown - np.minimum(thin, 55.0)).min() > 0.0
     assert shown[np.abs(px) > SHARP_PX].min() >= 50.0
 
 
@@ -259,7 +270,6 @@ def test_command_in_the_provenance_makes_the_table_again() -> None:
         ({"points": 2}, "points must be at least 3, got 2"),
         ({"width_px": 0}, "width_px must be a number of pixels > 0"),
         ({"sensor_width_mm": math.nan}, "sensor_width_mm must be a number > 0"),
-        ({"wavelengths_um": RGB_UM}, "wavelengths_um need a lens with Abbe numbers"),
         ({"f_number": 1.0}, "f_number must be at least 2.03"),
         ({"f_number": math.nan}, "f_number must be positive"),
         ({"focus_m": 0.04}, "farther than the focal length"),
@@ -273,3 +283,8 @@ def test_command_in_the_provenance_makes_the_table_again() -> None:
 def test_wrong_arguments_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         small(Lens.read("double_gauss_50mm"), **changes)
+
+
+def test_colours_of_a_lens_without_dispersion_are_refused() -> None:
+    with pytest.raises(ValueError, match="wavelengths_um need a lens with Abbe numbers"):
+        small(Lens.read("wide_22mm"), wavelengths_um=RGB_UM)
