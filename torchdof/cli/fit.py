@@ -38,8 +38,11 @@ def fit(
         "table.json"
     ),
     family: Annotated[
-        Literal["auto", "gaussian", "ring", "disc", "softm", "radial"],
-        typer.Option(help="Kernel family; auto takes the cheapest that is accurate enough.", rich_help_panel=_CAPTURE),
+        Literal["auto", "gaussian", "ring", "disc", "softm", "radial", "polygon", "image"],
+        typer.Option(
+            help="Kernel family; auto takes the cheapest that is accurate enough, image any shape.",
+            rich_help_panel=_CAPTURE,
+        ),
     ] = "auto",
     accuracy_db: Annotated[
         float, typer.Option(help="PSNR on a natural image that auto asks for.", rich_help_panel=_CAPTURE)
