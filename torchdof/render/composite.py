@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from . import field
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
 from .exporting import where_needed
@@ -128,7 +129,7 @@ def _composite_layers(
 
     # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
     # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
-    uniform = each == 1 and blurs[0].cats_eye is None
+    uniform = each == 1 and blurs[0].shares is None
     most = CHANNELS // (frame.colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
@@ -163,14 +164,13 @@ def _scattered(
     layers = [frame.layer(k, halo, visibility) for k in group]
     terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1) for terms in layers for term in terms], 1)
     terms, channels = downsampled(terms, blurs[group[0]].scale), terms.shape[1] // len(group)
-    kernels = blurs[group[0]].kernel
+    kernels, shares = blurs[group[0]].kernel, blurs[group[0]].shares
+    if shares is not None:
+        yield field.scattered(shares, terms, kernels, half, blurs[group[0]].scale, frame.size)
+        return
     if len(group) > 1 or each > 1:
         padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in group]
         kernels = torch.cat([kernel.repeat(channels // each, 1, 1) for kernel in padded])
-    cats_eye = blurs[group[0]].cats_eye
-    if cats_eye is not None:
-        yield cats_eye.scattered(terms, kernels, half)
-        return
     yield from scatter(terms, kernels, half).split(channels, 1)
 
 
