@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from torchdof.io import foreign
 from torchdof.io.images import read_image
 from torchdof.io.metadata import camera_facts
 from torchdof.io.transfer import decode, encode
@@ -29,12 +30,6 @@ from .target import DOT_MM, SQUARE_MM, Target, find_target
 __all__ = ["Photograph", "Photographs", "read_photographs"]
 
 _READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
-_FOREIGN = {
-    ".heic": "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)",
-    ".dng": "develop it to linear 16-bit TIFF (dcraw -4 -T, or a converter's linear profile) and copy its EXIF",
-}
-_FOREIGN |= {".heif": _FOREIGN[".heic"], ".avif": _FOREIGN[".heic"]}
-_FOREIGN |= dict.fromkeys((".cr2", ".cr3", ".nef", ".arw", ".raf"), _FOREIGN[".dng"])
 _WINDOW = 0.36  # half the dot's window, of the square's side
 _SAME_PLACE = 0.03  # as a share of the distance
 _PRINTED = 0.01  # how exactly the dot's light can be known
@@ -92,10 +87,11 @@ def read_photographs(folder: str | os.PathLike[str], *, square_mm: float = SQUAR
         FitError: fewer than two photographs show the target, or no EXIF tells the lens.
         OSError: a picture is damaged.
     """
-    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *_FOREIGN))
+    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *foreign.SUFFIXES))
     for path in files:
-        if path.suffix.lower() in _FOREIGN:
-            raise FitError(f"{path.suffix} is not read here: {_FOREIGN[path.suffix.lower()]}", file=str(path))
+        unread = foreign.refusal(path)
+        if unread is not None:
+            raise FitError(unread, file=str(path))
     if len(files) < 2:
         raise ManifestError(
             "there is neither a capture.toml nor two photographs (.jpg .png .tif .exr) of the target that "
