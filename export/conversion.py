@@ -95,6 +95,8 @@ def to_onnx(
 def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
     """The module as an ONNX graph, as torch.onnx gives it: not yet slimmed."""
     program = trace(portable, channels)
+    # torch.onnx would trace all of it once more, to take apart operators, most of which it can translate as they are
+    vars(program)["run_decompositions"] = lambda _: program
     frame = {0: "B", 2: "H", 3: "W"}
     names = INPUTS[portable.inputs]
     shapes = (frame, frame, *(({0: "B"}, {0: "B"}),) * (len(names) > 2))
@@ -108,7 +110,7 @@ def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
             dynamic_shapes=shapes,
             optimize=False,
             verbose=False,
-            custom_translation_table={torch.ops.aten.remainder.Scalar: _remainder},
+            custom_translation_table=_TRANSLATIONS,
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
@@ -118,6 +120,49 @@ def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
 def _remainder(self: Any, other: Any) -> Any:
     """``index % width`` with a width that is known only when the graph runs; torch.onnx takes numbers only."""
     return opset20.Mod(self, opset20.CastLike(other, self))
+
+
+def _to_dtype(self: Any, dtype: int, non_blocking: bool = False, copy: bool = False) -> Any:
+    return opset20.Cast(self, to=dtype)
+
+
+def _to_device(self: Any, device: str, dtype: int, non_blocking: bool = False, copy: bool = False) -> Any:
+    return opset20.Cast(self, to=dtype)
+
+
+def _detached(self: Any) -> Any:
+    return opset20.Identity(self)
+
+
+def _both(self: Any, other: Any) -> Any:
+    return opset20.And(self, other)
+
+
+def _subtracted(self: Any, other: Any) -> Any:
+    return opset20.Sub(opset20.CastLike(other, self), self)
+
+
+def _put(self: Any, dim: int, index: Any, source: Any) -> Any:
+    if dim != 1:
+        raise ValueError(f"values are put along axis 1 of [C, P], got axis {dim}")
+    changed = opset20.ScatterND(
+        opset20.Transpose(self, perm=[1, 0]),
+        opset20.Unsqueeze(index, opset20.Constant(value_ints=[1])),
+        opset20.Transpose(source, perm=[1, 0]),
+    )
+    return opset20.Transpose(changed, perm=[1, 0])
+
+
+_TRANSLATIONS = {
+    torch.ops.aten.remainder.Scalar: _remainder,
+    torch.ops.aten.to.dtype: _to_dtype,
+    torch.ops.aten.to.device: _to_device,
+    torch.ops.aten.detach_.default: _detached,
+    torch.ops.aten.__and__.Tensor: _both,
+    torch.ops.aten.rsub.Scalar: _subtracted,
+    torch.ops.aten.index_copy.default: _put,
+}
+"""Operators that torch.onnx does not translate as they are."""
 
 
 @contextlib.contextmanager
