@@ -65,9 +65,9 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     behind = None if frame.behind is None else fields.pop()[inner]
     each = 2 if frame.surfaces[0].weight is None else 3
     surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
-    piece = Frame(
-        surfaces, frame.nodes, frame.ramps, behind, margin, (length, length), (length, length), frame.occlusion
-    )
+    size = (length, length)
+    held = _ranges(surfaces)
+    piece = _Tile(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion, ranges=held)
     tile = where_needed(
         lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0,
         render(piece, blurs),
@@ -106,7 +106,7 @@ class _Tile(Frame):
         ranges = self.ranges[..., start : stop[0], start : stop[1]]
         # the least lies below the upper end, and the largest above the lower one
         beyond = ranges - ranges.new_tensor([high, -low])[:, None, None, None]
-        return beyond.amax(1).amin() < 0
+        return beyond.amax(1).min() < 0
 
 
 @contextlib.contextmanager
