@@ -293,7 +293,7 @@ class Lens:
         factor = focal_length_mm / self.paraxial().focal_length
         lengths = {name: getattr(self, name) * factor for name in ("radius", "thickness", "diameter")}
         powers = 2.0 * np.arange(self.polynomial.shape[1]) + 1.0  # type: ignore[union-attr]
-        return dataclasses.replace(self, **lengths, polynomial=self.polynomial / factor**powers)
+        return dataclasses.replace(self, **lengths, polynomial=self.polynomial / factor**powers)  # type: ignore[operator]
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""

@@ -9,7 +9,7 @@ with the curvature c = 1 / radius and the conic constant k: 0 is a sphere, -1 a 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,7 +65,7 @@ class Meeting(NamedTuple):
     z: Array
     run: Array
     normal: tuple[Array | float, Array | float, Array | float]
-    met: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    met: np.ndarray[Any, np.dtype[np.bool_]]
 
 
 def meet(x: Array, y: Array, z: Array, u: Array, v: Array, w: Array, shape: Shape) -> Meeting:
