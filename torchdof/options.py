@@ -87,7 +87,7 @@ class Options:
             raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
         if self.method == "fold" and self.table.depends_on_place:
             raise ValueError(
-                "method='fold' has one kernel a blur radius; take 'layered', or a table without vignetting"
+                "method='fold' has one kernel a blur radius; take 'layered', or a table without vignetting or field"
             )
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
@@ -102,12 +102,16 @@ class Options:
 
         Raises:
             ValueError: Naming the option that makes no sense.
+            TypeError: Naming an argument that is no option.
 
         Example:
             >>> Options.of(table=None, tolerance="preview") == Options(tolerance=4 / 255)
             True
         """
         values: dict[str, Any] = dict(arguments)
+        for name in values:
+            if name not in OPTION_NAMES:
+                raise TypeError(f"there is no option {name!r}; options are {', '.join(OPTION_NAMES)}")
         if "tolerance" in values:
             values["tolerance"] = tolerance_of(values["tolerance"])
         return cls(_DISC if table is None else table, **values)

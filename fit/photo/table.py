@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchdof.optics.aperture import Aperture
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
@@ -17,13 +18,16 @@ from torchdof.validation import show
 from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
 from ..result import Array, BlurFit
 from .agreement import check_agreement, frame_width, promised_px
-from .distances import fit_distances, fit_one
+from .colours import Colour, fit_colours
+from .distances import fit_distances, fit_one, fit_openings
 from .family_choice import COST
+from .forward import OPENINGS, SHAPES
 from .manifest import Capture, Captures
 
 __all__ = ["TableFit", "fit_captures", "fit_table"]
 
 _EXPOSED = 1.3
+_ORDER = (*COST, *OPENINGS)
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,8 @@ class TableFit:
         coc_px: signed circle of confusion of each, px of the frame.
         why: how the family was chosen.
         scale: where the circles of confusion come from: "camera" or "measured".
+        colours: red, green and blue by themselves, where the captures have colours: the table then holds a kernel for
+            each, and `fits` are those of their mean.
         coc_per_dioptre_px: the circle of confusion over 1/focus - 1/distance [1/m], px of the frame.
     """
 
@@ -45,6 +51,7 @@ class TableFit:
     why: str
     scale: str
     coc_per_dioptre_px: float
+    colours: tuple[Colour, ...] = ()
 
 
 def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **options: Any) -> BlurTable:
@@ -52,7 +59,7 @@ def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **op
 
     Args:
         captures: from `read_captures`, or made of arrays.
-        family: "auto", or one of `torchdof.optics.psf.FAMILIES`.
+        family: "auto", or one of the families of `fit_pair`.
         **options: see `fit_captures`.
 
     Returns:
@@ -102,7 +109,9 @@ def fit_captures(
 
     Args:
         captures: pairs at increasing distances.
-        family: "auto" takes the cheapest family that is enough at every distance; or one of the families.
+        family: "auto" takes the cheapest family that is enough at every distance; or one of the families of `fit_pair`.
+            A blur that is not round at one distance is not round at any: "polygon" and "image" make one opening of all
+            distances, turned by half in front of the focus, and fit its size at each.
         accuracy_db: what "auto" asks for, see `fit_pair`.
         smooth: whether neighbouring distances inform each other.
         progress: called with (done, all, what) after each fit.
@@ -125,14 +134,20 @@ def fit_captures(
     """
     if not isinstance(captures, Captures):
         raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
-    if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
-        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
+    if not isinstance(family, str) or family not in (*SHAPES, "auto"):
+        raise FitError(f"family must be 'auto' or one of {', '.join(SHAPES)}, got {show(family)}")
     pairs = list(captures)
-    total, done = len(pairs) * (2 if family == "auto" else 1), 0
-    why = f"family {family!r} was asked for"
-    if family == "auto":
-        family, why = _choose(pairs, captures.focus_m, accuracy_db, progress, total)
+    twice = family == "auto" or family in OPENINGS
+    total, done = len(pairs) * (2 if twice else 1), 0
+    why, firsts, opening = f"family {family!r} was asked for", list[BlurFit](), None
+    if twice:
+        firsts = _first_fits(pairs, captures.focus_m, family, accuracy_db, progress, total)
         done = len(pairs)
+    if family == "auto":
+        # the richest family that any distance needs serves all
+        needs_most = max(range(len(pairs)), key=lambda i: _ORDER.index(firsts[i].family))
+        family = firsts[needs_most].family
+        why = f"{family}, for {pairs[needs_most].distance_m:g} m: {firsts[needs_most].why}"
 
     def report(pair: Capture, fit: BlurFit) -> None:
         nonlocal done
@@ -141,18 +156,19 @@ def fit_captures(
         if progress:
             progress(done, total, f"{pair.distance_m:g} m")
 
-    ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
+    if family in OPENINGS:
+        ordered, opening = fit_openings(pairs, captures.focus_m, family, firsts, report)
+    else:
+        ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
     radius_px = [f.radius for f in ordered]
     captures = replace(captures, width_px=frame_width(captures, radius_px))
     check_agreement(captures, radius_px)
     coc_px, scale = _keys(captures, radius_px, scale_of)
-    if family == "radial":
-        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
-        radius = np.array([float(f.params["radius"]) for f in ordered])
-        values = np.stack([np.asarray(f.params["values"]) for f in ordered]) * radius[:, None] ** 2
-        params = {"values": values, "radius": radius}
-    else:
-        params = {n: np.array([float(f.params[n]) for f in ordered]) for n in FAMILIES[family]}
+    params, colours = _params(ordered, family), tuple[Colour, ...]()
+    if all(pair.colours is not None for pair in pairs):
+        colours = fit_colours(pairs, ordered, captures.focus_m, family, opening)
+        each = [_params(colour.fits, family) for colour in colours]
+        params = {n: np.stack([p[n] for p in each]) for n in params}
     if len(pairs) == 1:
         text = (
             f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
@@ -160,33 +176,43 @@ def fit_captures(
         )
         warn(SingleDistanceWarning(text, file=pairs[0].files[1], number=pairs[0].distance_m))
     return TableFit(
-        table=_table(captures, ordered, coc_px, params, family, scale, command, why),
+        table=_table(captures, ordered, coc_px, params, family, opening, scale, command, why, colours),
         fits=tuple(ordered),
         coc_px=tuple(coc_px),
         why=why,
         scale=scale,
         coc_per_dioptre_px=coc_px[0] / (1 / captures.focus_m - 1 / pairs[0].distance_m),
+        colours=colours,
     )
 
 
-def _choose(
+def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
+    """Parameters of a table of these fits by name, px: `[N]`, and `values` `[N, P]`."""
+    radius = np.array([float(f.params.get("radius", 0.0)) for f in fits])
+    if family == "radial":
+        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
+        values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
+        return {"values": values, "radius": radius}
+    if family in OPENINGS:
+        return {"radius": radius}
+    return {n: np.array([float(f.params[n]) for f in fits]) for n in FAMILIES[family]}
+
+
+def _first_fits(
     pairs: list[Capture],
     focus_m: float,
+    family: str,
     accuracy_db: float,
     progress: Callable[[int, int, str], None] | None,
     total: int,
-) -> tuple[str, str]:
-    """The cheapest family that is accurate enough at every distance, and why."""
-    worst = 0
-    why = ""
+) -> list[BlurFit]:
+    """Every pair by itself, which tells the family, or the lens's opening."""
+    fits = []
     for i, pair in enumerate(pairs):
-        fit = fit_one(pair, focus_m, "auto", None, accuracy_db)
-        # the richest family that any distance needs serves all
-        if not why or COST.index(fit.family) > worst:
-            worst, why = COST.index(fit.family), f"{fit.family}, for {pair.distance_m:g} m: {fit.why}"
+        fits.append(fit_one(pair, focus_m, family, None, accuracy_db))
         if progress:
             progress(i + 1, total, f"{pair.distance_m:g} m")
-    return COST[worst], why
+    return fits
 
 
 def _check_exposure(pair: Capture, fit: BlurFit) -> None:
@@ -220,9 +246,11 @@ def _table(
     coc_px: list[float],
     params: dict[str, Array],
     family: str,
+    opening: Aperture | None,
     scale: str,
     command: str,
     why: str,
+    colours: tuple[Colour, ...],
 ) -> BlurTable:
     """The blur table of the fits, in mm of the sensor where its width is known, with its provenance."""
     sensor = captures.sensor_width_mm
@@ -240,11 +268,16 @@ def _table(
         "asymmetry": [round(f.asymmetry, 4) for f in fits],
         **dict(captures.notes),
     }
+    if colours:
+        provenance["colours"] = [c.name for c in colours]
+        shifts = [c.focus_shift_dioptres for c in colours]
+        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
+        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
     for name in ("focal_length_mm", "f_number", "sensor_width_mm"):
         if getattr(captures, name) is not None:
             provenance[name] = getattr(captures, name)
     return BlurTable(
-        family,
+        family if opening is None else "disc",
         [c / unit for c in coc_px],
         {k: (v / unit if k in LENGTHS else v).tolist() for k, v in params.items()},
         unit="fraction" if sensor is None else "mm",
@@ -252,4 +285,5 @@ def _table(
         name=captures.name,
         provenance=provenance,
         residual=[round(f.residual, 6) for f in fits],
+        aperture=opening,
     )

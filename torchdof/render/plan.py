@@ -14,8 +14,8 @@ from ..options import tolerance_of
 from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
-from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
-from .vignetting import CatsEye
+from .field import Shares, layer_shares, own_kernels
+from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
@@ -23,6 +23,7 @@ KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
 _LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
 _SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
+_FARTHEST_PX = 1e9  # of a layer; frames are smaller
 _kernels = KernelCache(256 * 2**20)
 
 
@@ -30,12 +31,12 @@ _kernels = KernelCache(256 * 2**20)
 class Blur:
     """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
 
-    Where the lens's barrel shows, ``cats_eye`` tells what becomes of the kernel across the frame.
+    Where kernels depend on the place, ``shares`` tell what becomes of the kernel across the frame.
     """
 
     kernel: Tensor
     scale: int
-    cats_eye: CatsEye | None = None
+    shares: Shares | None = None
 
     @property
     def half(self) -> int:
@@ -72,9 +73,11 @@ class Plan:
         if is_traced():  # its numbers are not to be looked at
             return
         nodes = self.nodes
-        plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in nodes)
+        plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and abs(x) < _FARTHEST_PX for x in nodes)
         if not plain or not nodes or any(low >= high for low, high in zip(nodes, nodes[1:], strict=False)):
-            raise ValueError(f"plan must hold layers as a tuple of strictly increasing numbers, got {show(nodes)}")
+            raise ValueError(
+                f"plan must hold layers as a tuple of strictly increasing numbers below 1e9 px, got {show(nodes)}"
+            )
         if isinstance(self.tolerance, str):  # names are for those who call a rendering
             raise ValueError(f"tolerance of a plan must be a number in [0, 1), such as 1/255, got {self.tolerance!r}")
         tolerance_of(self.tolerance)
@@ -145,7 +148,8 @@ class Plan:
     def of_pixels(self, coc_px: Tensor) -> "Plan":
         """The same plan, told which share of a scene's pixels each layer carries: ``[B, 1, H, W]``."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
-        behind = [float(weight_at_or_behind(x, self.nodes, k).double().mean()) for k in range(len(self.nodes) + 1)]
+        ends = ramps(self.nodes, x).split(1, 1)  # one at a time, for a frame may be large
+        behind = [float(weights_at_or_behind(x, end).double().mean()) for end in ends]
         pixels = tuple(behind[k] - behind[k + 1] for k in range(len(self.nodes)))
         return dataclasses.replace(self, pixels=pixels)
 
@@ -182,8 +186,7 @@ class Plan:
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
-        finest = 1.0 if table.aperture is None else table.aperture.finest
-        scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
+        scales = tuple(self._scale(table.finest_px(coc, width)) if coarse else 1 for coc in self.coc_px)
         if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
@@ -203,11 +206,11 @@ class Plan:
                 window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
         blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
-        if table.aperture is None or not table.aperture.depends_on_place:
+        if not table.depends_on_place:
             return blurs
         frame = (int(size[0]), int(size[1]))
         return [
-            dataclasses.replace(blur, cats_eye=CatsEye(table.aperture, coc / blur.scale, blur.scale, frame))
+            dataclasses.replace(blur, shares=layer_shares(table, coc, blur.scale, frame))
             for blur, coc in zip(blurs, self.coc_px, strict=True)
         ]
 
@@ -225,12 +228,12 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> T
     within a frame whose longer side is ``longest`` pixels.
     """
     if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
-        kernels = table.kernels(coc_px, width)
+        kernels = own_kernels(table, coc_px, width)
     else:
         steps = coc_px.double() * KERNELS_PER_PX
         below = steps.floor()
         radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
-        low, high = (table.kernels(radii.cpu() / KERNELS_PER_PX, width).to(coc_px.device)[i] for i in which)
+        low, high = (own_kernels(table, radii.cpu() / KERNELS_PER_PX, width).to(coc_px.device)[i] for i in which)
         kernels = torch.lerp(low, high, (steps - below)[:, None, None, None])
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
     return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
@@ -242,9 +245,9 @@ def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, 
     @torch.inference_mode(False)  # what is kept must serve autograd as well
     def made() -> Tensor:
         coc = coc_px / scale
-        if scale > 1:  # averaging and interpolation blur as well
+        if scale > 1 and table.field is None:  # averaging and interpolation blur as well
             coc *= shrink(table, coc, width / scale, scale)
-        return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0].clone()
+        return own_kernels(table, torch.tensor([coc], dtype=torch.float64), width / scale, window)[0].clone()
 
     if torch.is_grad_enabled() and table.requires_grad:
         return made()
