@@ -62,7 +62,9 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     behind = None if frame.behind is None else fields.pop()[inner]
     each = 2 if frame.surfaces[0].weight is None else 3
     surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
-    piece = Frame(surfaces, frame.nodes, behind, margin, (length, length), (length, length), frame.occlusion)
+    piece = Frame(
+        surfaces, frame.nodes, frame.ramps, behind, margin, (length, length), (length, length), frame.occlusion
+    )
     tile = where_needed(
         lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0,
         render(piece, blurs),

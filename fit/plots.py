@@ -53,9 +53,11 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         count = np.bincount(bins)
         r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
         axes.plot(r, level, color=MODEL, label="forward model", zorder=3)
-        line = np.linspace(0, fit.samples[0].max(), 400)
-        shape = evaluate(fit.family, line, fit.kernel_params())
-        axes.plot(line, shape / shape.max() * level.max(), "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
+        if fit.aperture is None:  # what is not round has no profile
+            line = np.linspace(0, fit.samples[0].max(), 400)
+            shape = evaluate(fit.family, line, fit.kernel_params())
+            scaled = shape / shape.max() * level.max()
+            axes.plot(line, scaled, "--", color="#1d4ed8", label="kernel f(r), scaled", zorder=2)
     else:
         axes.plot(*fit.curve, color=MODEL, label=f"fitted {fit.family}", zorder=3)
     axes.set(xlabel=f"r [{unit}]", ylabel="level above background" if forward else "blur strength", ylim=(0, None))

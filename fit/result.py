@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from torchdof.optics.aperture import Aperture
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
@@ -20,7 +22,8 @@ class BlurFit:
     """A fitted kernel, its errors and its residual.
 
     Attributes:
-        family: "gaussian", "ring", "disc", "softm" or "radial".
+        family: "gaussian", "ring", "disc", "softm" or "radial"; or, where the blur is not round, "polygon" or "image":
+            a disc of `params["radius"]` seen through the `aperture`, as in `BlurTable.polygon` and `from_aperture`.
         params: the family's parameters (see `torchdof.optics.psf.FAMILIES`), lengths in the caller's unit (pixels for
             `fit_pair`). Floats, and for `radial` the array "values" [P]. A profile fit (`fit_profile`, model "ratio")
             has the strength "N" too.
@@ -37,8 +40,12 @@ class BlurFit:
         gain: the fitted exposure ratio between the pictures (forward model), else 1.
         background: the fitted level under the blurred dot (forward model), else 0.
         shift: the fitted displacement (x, y) of the blurred dot against the sharp one, px.
+        centre: (x, y) of the blurred dot in its picture, px from the middle of pixel (0, 0).
         magnification: the fitted size of the blurred picture's dot over the sharp one's.
-        asymmetry: the share of the blur's contrast that depends on the angle (0 for a round one), NaN where unknown.
+        aperture: the lens's opening as it shows in the defocused picture (turned by half where that was nearer than the
+            focus), None where the kernel is round.
+        asymmetry: the share of the blur's light that depends on the angle in a way that the kernel does not have, NaN
+            where unknown.
         why: one sentence: how the family was chosen.
         psnr: for family="auto", dB on a natural image that each family reached against "radial".
         samples: the radii and strengths [2, n] that a picture of the fit shows.
@@ -58,11 +65,13 @@ class BlurFit:
     gain: float = 1.0
     background: float = 0.0
     shift: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)
     magnification: float = 1.0
     asymmetry: float = math.nan
     radius: float = math.nan
     radius_stderr: float = math.nan
     why: str = ""
+    aperture: Aperture | None = None
     psnr: dict[str, float] = field(default_factory=dict)
     samples: Array = field(default_factory=lambda: np.zeros((2, 0)), repr=False)
     curve: Array = field(default_factory=lambda: np.zeros((2, 0)), repr=False)
@@ -73,8 +82,8 @@ class BlurFit:
         return self.residual / self.noise if self.noise > 0 else math.nan
 
     def kernel_params(self) -> dict[str, float | Array]:
-        """The parameters that `torchdof.optics.psf` takes (without the strength N)."""
-        return {name: value for name, value in self.params.items() if name != "N"}
+        """The parameters that `torchdof.optics.psf` takes (without the strength N and those of the aperture)."""
+        return {name: value for name, value in self.params.items() if name not in ("N", "rotation_deg", "curvature")}
 
     def summary(self) -> str:
         """A few readable lines: each parameter with its error, the residual against the noise, the reason."""

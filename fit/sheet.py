@@ -111,10 +111,4 @@ def _through(table: BlurTable, share: float) -> BlurTable:
     """The same lens seen through a share of the frame's width."""
     if table.unit != "mm" or table.sensor_width_mm is None:
         return table
-    return BlurTable(
-        table.family,
-        table.coc.tolist(),
-        {name: values.tolist() for name, values in table.node_params.items()},
-        unit="mm",
-        sensor_width_mm=table.sensor_width_mm * share,
-    )
+    return table.replace(sensor_width_mm=table.sensor_width_mm * share)

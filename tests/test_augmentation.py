@@ -279,6 +279,8 @@ def test_it_is_pickled_with_its_lenses() -> None:
         ({"transfer": "gamma"}, "transfer must be 'linear' or 'srgb'"),
         ({"camera": 50}, "camera must be a torchdof.Camera"),
         ({"tolerance": 2.0}, "tolerance must be a number"),
+        ({"p": 2.0}, "p must be a probability from 0 to 1"),
+        ({"p": True}, "p must be a probability from 0 to 1"),
     ],
 )
 def test_wrong_arguments_are_refused_by_name(arguments: dict[str, Any], message: str) -> None:

@@ -5,7 +5,7 @@ import inspect
 
 import pytest
 
-from torchdof import DepthOfField, blur_by_coc, depth_of_field
+from torchdof import Camera, DepthOfField, blur_by_coc, depth_of_field
 from torchdof.options import OptionArguments, Options
 
 OPTIONS = {field.name: field.default for field in dataclasses.fields(Options)}
@@ -20,3 +20,8 @@ def test_signature_and_help_tell_every_option_with_its_default(function: object)
     parameters = inspect.signature(function).parameters  # type: ignore[arg-type]
     assert {name: parameters[name].default for name in OPTIONS} == {**OPTIONS, "table": None}
     assert all(f"{name}: " in (function.__doc__ or "") for name in OPTIONS)
+
+
+def test_an_argument_that_is_no_option_is_refused_with_those_there_are() -> None:
+    with pytest.raises(TypeError, match="there is no option 'blades'; options are table, tolerance"):
+        DepthOfField(Camera(), blades=5)  # type: ignore[call-arg]

@@ -80,6 +80,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         keepdim: bool = False,
         **options: Unpack[OptionArguments],
     ) -> None:
+        if isinstance(p, bool) or not isinstance(p, int | float) or not 0.0 <= p <= 1.0:
+            raise ValueError(f"p must be a probability from 0 to 1, got {show(p)}")
         super().__init__(p=p, same_on_batch=same_on_batch, keepdim=keepdim)
         near_m, far_m = _range("focus_m", focus_m, math.inf)
         widest, narrowest = _range("f_number", f_number, 1e300)

@@ -102,12 +102,16 @@ class Options:
 
         Raises:
             ValueError: Naming the option that makes no sense.
+            TypeError: Naming an argument that is no option.
 
         Example:
             >>> Options.of(table=None, tolerance="preview") == Options(tolerance=4 / 255)
             True
         """
         values: dict[str, Any] = dict(arguments)
+        for name in values:
+            if name not in OPTION_NAMES:
+                raise TypeError(f"there is no option {name!r}; options are {', '.join(OPTION_NAMES)}")
         if "tolerance" in values:
             values["tolerance"] = tolerance_of(values["tolerance"])
         return cls(_DISC if table is None else table, **values)

@@ -18,11 +18,12 @@ from torchdof.validation import show
 
 from ..result import Array
 from . import prescription
+from .glass import C_UM, D_UM, F_UM, G_UM, Glass
+from .surface import Shape
 
 __all__ = ["RGB_UM", "Lens", "Paraxial"]
 
 
-D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
 RGB_UM = (C_UM, 0.54607, F_UM)
 """Wavelengths that stand for red, green and blue, in micrometres: the lines C, e and F."""
 
@@ -62,10 +63,10 @@ class Paraxial:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Spherical surfaces on one axis with an aperture stop, in air.
+    """Surfaces on one axis, spheres or even aspheres, one of them the aperture stop, in air.
 
     Args:
-        radius: Radii of curvature ``[S]``, ``inf`` for a flat surface and for the stop.
+        radius: Radii of curvature at the vertex ``[S]``, ``inf`` for a flat surface.
         thickness: Distance from each surface to the next ``[S]``, >= 0; the last is not used.
         index: Refractive index behind each surface at the d line ``[S]``, >= 1; 1 behind the last.
         abbe: Abbe number V of the medium behind each surface ``[S]``, ``inf`` where there is no dispersion.
@@ -75,6 +76,11 @@ class Lens:
         source: Where the numbers are from.
         partial: Partial dispersion P_gF of the medium behind each surface ``[S]``, as in glass catalogues; NaN, and
             None for all, takes that of a normal glass with its Abbe number.
+        conic: Conic constant of each surface ``[S]``, see :mod:`torchdof.fit.lens.surface`; None is 0 for all: spheres.
+        polynomial: Coefficients ``A_2, A_4, ...`` of each surface ``[S, K]`` in powers of millimetres, see there; None
+            is none.
+        glass: The glass behind each surface, None where there is none: one ``Glass`` or None a surface. Where there is
+            one, ``index``, ``abbe`` and ``partial`` are its own, whatever was given. None is none at all.
 
     Raises:
         ValueError: If a number is outside its range.
@@ -97,9 +103,16 @@ class Lens:
     name: str = ""
     source: str = ""
     partial: Array | None = None
+    conic: Array | None = None
+    polynomial: Array | None = None
+    glass: tuple[Glass | None, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers, so that whatever is computed later is about a lens."""
+        glasses = [None] * np.size(self.radius) if self.glass is None else list(self.glass)
+        if len(glasses) != np.size(self.radius) or not all(isinstance(one, Glass | None) for one in glasses):
+            raise ValueError(f"glass must hold one Glass or None a surface, got {show(self.glass)}")
+        object.__setattr__(self, "glass", tuple(glasses))
         columns = {name: getattr(self, name) for name in (*prescription.COLUMNS, "abbe")}
         for name, value in columns.items():
             try:
@@ -115,7 +128,18 @@ class Lens:
         partial = np.full(self.radius.shape, np.nan) if self.partial is None else np.asarray(self.partial, np.float64)
         if partial.shape != self.radius.shape or not np.all(np.isnan(partial) | ((partial > 0) & (partial < 1))):
             raise ValueError(f"partial must hold one number a surface, 0 to 1 or NaN, got {show(self.partial)}")
+        partial = partial.copy()
+        for i, glass in enumerate(glasses):
+            if glass is not None:
+                self.index[i], self.abbe[i], partial[i] = glass.index(D_UM), glass.abbe, glass.partial
         object.__setattr__(self, "partial", partial)
+        for name, given in (("conic", self.conic), ("polynomial", self.polynomial)):
+            shape = self.radius.shape if name == "conic" else (*self.radius.shape, 0)
+            array = np.zeros(shape) if given is None else np.asarray(given, np.float64)
+            if array.ndim != len(shape) or len(array) != len(self.radius) or not np.isfinite(array).all():
+                wanted = "one number" if name == "conic" else "as many numbers"
+                raise ValueError(f"{name} must hold {wanted} for each surface, all finite, got {show(given)}")
+            object.__setattr__(self, name, array)
         if isinstance(self.stop, bool) or not isinstance(self.stop, int) or not 0 <= self.stop < len(self.radius):
             raise ValueError(
                 f"stop must be the number of a surface (0 to {len(self.radius) - 1}), got {show(self.stop)}"
@@ -157,6 +181,11 @@ class Lens:
         """Position of each surface's vertex on the axis ``[S]``; the first is 0."""
         return np.concatenate([[0.0], np.cumsum(self.thickness[:-1])])
 
+    def shape(self, surface: int) -> Shape:
+        """What a surface, by its number, looks like."""
+        coefficients = tuple(float(a) for a in self.polynomial[surface])  # type: ignore[index]
+        return Shape(1.0 / float(self.radius[surface]), float(self.conic[surface]), coefficients)  # type: ignore[index]
+
     @property
     def dispersive(self) -> bool:
         """Whether any glass has an Abbe number."""
@@ -165,9 +194,10 @@ class Lens:
     def indices(self, wavelength_um: float | None = None) -> Array:
         """Refractive indices along the light's way ``[S + 1]``: before the first surface (air), then behind each.
 
-        Cauchy's three terms, ``n = a + b / wavelength^2 + c / wavelength^4``, through the index at d, of the dispersion
-        ``n_F - n_C = (n_d - 1) / V`` and the partial dispersion ``n_g - n_F = P_gF (n_F - n_C)``. For a glass whose
-        P_gF is not stated that of a normal one is taken, ``0.6438 - 0.001682 V``. None is the d line.
+        Sellmeier's formula for a :class:`torchdof.fit.lens.glass.Glass`. For other media Cauchy's three terms,
+        ``n = a + b / wavelength^2 + c / wavelength^4``, through the index at d, of the dispersion
+        ``n_F - n_C = (n_d - 1) / V`` and the partial dispersion ``n_g - n_F = P_gF (n_F - n_C)``. Where P_gF is not
+        stated that of a normal glass is taken, ``0.6438 - 0.001682 V``. None is the d line.
 
         Reference:
             SCHOTT, "TIE-29: Refractive index and dispersion", 2016 (the line of normal glasses).
@@ -184,6 +214,9 @@ class Lens:
             )
             share = np.linalg.solve(np.stack([across, beyond]), np.stack([np.ones_like(partial), partial]))
             index = index + (index - 1.0) / self.abbe * (here @ share)
+            for i, glass in enumerate(self.glass or ()):
+                if glass is not None:
+                    index[i] = glass.index(wavelength_um)
         return np.concatenate([[1.0], index])
 
     def matrix(self, first: int, last: int, wavelength_um: float | None = None) -> Array:
@@ -193,7 +226,8 @@ class Lens:
         for i in range(first, last):
             if i > first:
                 matrix = np.array([[1.0, self.thickness[i - 1]], [0.0, 1.0]]) @ matrix
-            power = (n[i + 1] - n[i]) / self.radius[i]
+            shape = self.shape(i)
+            power = (n[i + 1] - n[i]) * (shape.curvature + 2.0 * sum(shape.polynomial[:1]))
             matrix = np.array([[1.0, 0.0], [-power / n[i + 1], n[i] / n[i + 1]]]) @ matrix
         return matrix
 
@@ -254,14 +288,15 @@ class Lens:
         """The lens enlarged or shrunk as a whole to another focal length; its f-number stays."""
         _check_positive("focal_length_mm", focal_length_mm)
         factor = focal_length_mm / self.paraxial().focal_length
-        return dataclasses.replace(
-            self, radius=self.radius * factor, thickness=self.thickness * factor, diameter=self.diameter * factor
-        )
+        lengths = {name: getattr(self, name) * factor for name in ("radius", "thickness", "diameter")}
+        powers = 2.0 * np.arange(self.polynomial.shape[1]) + 1.0  # type: ignore[union-attr]
+        return dataclasses.replace(self, **lengths, polynomial=self.polynomial / factor**powers)
 
     def lines(self) -> list[str]:
         """The surfaces as lines of a prescription file."""
         columns = (self.radius, self.thickness, self.index, self.abbe, self.partial, self.diameter)
-        return prescription.lines(*columns, self.stop)  # type: ignore[arg-type]
+        shape = self.conic, self.polynomial, self.glass
+        return prescription.lines(*columns, *shape, self.stop)  # type: ignore[arg-type]
 
 
 def _check_positive(name: str, value: float) -> None:

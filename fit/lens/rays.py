@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ..result import Array
 from .lens import Lens
+from .surface import meet
 
 __all__ = ["Rays", "trace_rays"]
 
 _CHUNK = 1 << 14  # rays that stay in the processor's cache on their way through the lens
+_SLACK_MM = 1e-9  # by which rounding may put a surface behind the one before it
 
 
 class Rays(NamedTuple):
@@ -21,8 +22,9 @@ class Rays(NamedTuple):
     Attributes:
         position: ``[3, R]`` in mm: x, y, z with z = 0 at the first vertex.
         direction: Unit vectors ``[3, R]``.
-        alive: ``[R]``; False where a ray missed a surface, hit beyond a clear diameter or was totally reflected. The
-            position and direction of such a ray mean nothing.
+        alive: ``[R]``; False where a ray missed a surface, hit beyond a clear diameter, was totally reflected, or met
+            a surface before the one in front of it (two that cross at their rims). The position and direction of such
+            a ray mean nothing.
     """
 
     position: Array
@@ -81,25 +83,20 @@ def trace_rays(
 
 
 def _trace_chunk(lens: Lens, index: Array, vertices: Array, position: Array, direction: Array, clip: bool) -> Rays:
-    """Rays ``[3, R]`` through all surfaces: where each meets the sphere, whether it passes, how it is refracted."""
+    """Rays ``[3, R]`` through all surfaces: where each meets them in turn, whether it passes, how it is refracted."""
     (x, y, z), (u, v, w) = position.copy(), direction.copy()
     alive = np.ones(x.shape, dtype=bool)
-    for i, radius in enumerate(lens.radius):
+    for i in range(len(lens.radius)):
         z = z - vertices[i]  # from here on relative to this surface's vertex
-        run = -z / w
-        x, y = x + run * u, y + run * v
-        z = np.zeros_like(x)
-        if math.isfinite(radius):
-            # sphere through the vertex: the crossing nearest to it
-            half = w - (x * u + y * v) / radius
-            discriminant = half * half - (x * x + y * y) / (radius * radius)
-            alive &= (discriminant >= 0) & (half > 0)
-            run = (x * x + y * y) / radius / np.where(alive, half + np.sqrt(np.maximum(discriminant, 0.0)), 1.0)
-            x, y, z = x + run * u, y + run * v, run * w
+        met = meet(x, y, z, u, v, w, lens.shape(i))
+        alive &= met.met
+        if i > 0:  # a surface that lies behind the one before it there is no lens's
+            alive &= met.run >= -_SLACK_MM
+        x, y, z = met.x, met.y, met.z
         if clip:
             alive &= x * x + y * y <= (lens.diameter[i] / 2) ** 2
         if index[i + 1] != index[i]:
-            nx, ny, nz = (-x / radius, -y / radius, 1.0 - z / radius)
+            nx, ny, nz = met.normal
             ratio = index[i] / index[i + 1]
             cosine = u * nx + v * ny + w * nz
             inside = 1.0 - ratio * ratio * (1.0 - cosine * cosine)

@@ -28,7 +28,7 @@ def trace_table(
     f_number: float = 2.0,
     focus_m: float = 2.0,
     *,
-    nodes: int = 33,
+    nodes: int | None = None,
     nearest_m: float | None = None,
     family: str = "radial",
     points: int = 65,
@@ -44,11 +44,12 @@ def trace_table(
     field_rays: int = 160_000,
     name: str | None = None,
 ) -> BlurTable:
-    """Blur table of a lens, traced at ``nodes`` distances on both sides of focus.
+    """Blur table of a lens, traced at many distances on both sides of focus.
 
     Nodes are keyed by the signed coc that :class:`torchdof.Camera` computes with the lens's paraxial focal length,
     ``f_number`` and ``focus_m``: use that camera to render with the table. Nodes are placed where interpolation between
-    them would be worst; intervals whose spots stay within one pixel are not divided, nor those of a hundredth of one.
+    them would be worst, as many as keep a natural image to 50 dB between them; intervals whose spots stay within one
+    pixel are not divided, nor those of a hundredth of one.
 
     The table is exact for its focus and f-number. At another focus of the same f-number it holds as far as the lens's
     aberrations do not change with distance; at another f-number it does not.
@@ -57,7 +58,7 @@ def trace_table(
         lens: The prescription.
         f_number: Marked f-number, see :meth:`Lens.with_f_number`.
         focus_m: Focus distance in metres from ``reference``; ``inf`` allowed.
-        nodes: Number of nodes, at least 5, or 3 for a focus at infinity.
+        nodes: Number of nodes, at least 5, or 3 for a focus at infinity; None is as many as it takes.
         nearest_m: Nearest object distance in metres; None is a third of the focus distance (then the blur on the near
             side reaches twice that of infinity), or 25 focal lengths for a focus at infinity. The farthest is infinity.
         family: ``"radial"``, or a named shape fitted by least squares: ``"softm"``, ``"ring"``, ``"gaussian"``,
@@ -98,7 +99,7 @@ def trace_table(
         if focus_m > 1e9:
             raise ValueError(f"focus_m must be at most 1e9 metres, or inf, got {show(focus_m)}")
     number("field_mm", field_mm, -1e6, 1e6)
-    if nodes < (5 if math.isfinite(focus_m) else 3):
+    if nodes is not None and nodes < (5 if math.isfinite(focus_m) else 3):
         raise ValueError(f"nodes must be at least 5 (3 for a focus at infinity), got {nodes}")
     _check_field(field, field_mm, field_nodes, field_rays)
     number("sensor_width_mm", sensor_width_mm, 0, 1e9)
@@ -198,7 +199,8 @@ def _check(
             raise ValueError(f"{what} must be one of {', '.join(known)}, got {show(value)}")
     if isinstance(points, bool) or not isinstance(points, int) or not 3 <= points <= 1000:
         raise ValueError(f"points must be at least 3, got {show(points)} (and 1000 at most)")
-    whole("nodes", nodes, 3, 1000)
+    if nodes is not None:
+        whole("nodes", nodes, 3, 1000)
     if rays is not None:
         if isinstance(rays, bool) or not isinstance(rays, int) or not 16 <= rays <= 10**7:
             raise ValueError(f"rays must be at least 16 (and 10 million at most), got {show(rays)}")

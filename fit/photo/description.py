@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchdof.optics.psf import FAMILIES
+from torchdof.optics.aperture import Aperture
 
 from ..result import Array, BlurFit
 from ..solve import information_criterion
 from .diagnostics import asymmetry_of, noise_near, signal_pixels, size_of_blur
-from .forward import Forward, Solution
+from .forward import OPENINGS, SHAPES, Forward, Solution
 from .noise import independent_share
 
 __all__ = ["bic_of", "describe", "kernel_lists"]
+
+_LIT = 0.01  # of its peak, from which on a pixel of a free kernel counts as one of its parameters
 
 
 def kernel_lists(solution: Solution) -> dict[str, Array]:
@@ -23,9 +25,14 @@ def kernel_lists(solution: Solution) -> dict[str, Array]:
 def bic_of(pair: Forward, solution: Solution) -> float:
     """Bayesian information criterion of a solution."""
     floor = pair.values.size * (1e-6 * pair.unit) ** 2
-    free = len(FAMILIES[solution.family])
+    free = len(SHAPES[solution.family])
     if solution.family == "radial":
         free = int(np.sum(np.asarray(solution.params["values"]) > 0))
+    elif solution.family == "polygon":
+        free += 1  # its number of blades
+    elif solution.family == "image":
+        kernel = pair.kernels("image", kernel_lists(solution))[0]
+        free = int(np.sum(kernel > _LIT * kernel.max()))
     # neighbours whose noise goes together are no independent witnesses
     count = pair.values.size * independent_share(pair.noise_correlation)
     squares = (solution.squares + floor) * count / pair.values.size
@@ -64,14 +71,23 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
             pair.data_dot.x + solution.moves["dx"] - pair.source.dot.x,
             pair.data_dot.y + solution.moves["dy"] - pair.source.dot.y,
         ),
+        centre=(pair.data_dot.x + solution.moves["dx"], pair.data_dot.y + solution.moves["dy"]),
         magnification=solution.moves["magnification"],
         asymmetry=asymmetry_of(pair, solution)[0],
         radius=float(np.sqrt(2) * rms),
         radius_stderr=float(np.sqrt(2) * rms_error),
         why=why,
+        aperture=_aperture(pair, solution),
         samples=_samples(pair, solution),
         curve=_samples(pair, solution, modelled=True),
     )
+
+
+def _aperture(pair: Forward, solution: Solution) -> Aperture | None:
+    """The lens's opening that a solution found, or None where its kernel is round."""
+    if solution.family not in OPENINGS:
+        return None
+    return pair.opening_with({n: float(v) for n, v in solution.params.items()})
 
 
 def _samples(pair: Forward, solution: Solution, modelled: bool = False) -> Array:

@@ -16,16 +16,30 @@ from ..problems import (
     WindowWarning,
     warn,
 )
-from ..result import BlurFit, Mask
+from ..result import Array, BlurFit, Mask
 from .dot import noise_of
 from .forward import Forward, Solution, without_level
 from .noise import independent_share
 
-__all__ = ["asymmetry_of", "check_fit", "noise_near", "signal_pixels", "size_of_blur"]
+__all__ = [
+    "CHANCE",
+    "UNEVEN",
+    "asymmetry_of",
+    "check_fit",
+    "noise_near",
+    "signal_pixels",
+    "size_of_blur",
+    "unexplained",
+]
+
+UNEVEN = 0.02
+"""Share of a blur's light that depends on the angle, from which on it is said not to be round."""
+
+CHANCE = 1e-6
+"""How seldom noise may do as much."""
 
 _FAR_ABOVE = 1.6  # residual over noise
 _MATTERS, _SEEN = 0.005, 1e-3
-_UNEVEN, _CHANCE = 0.02, 1e-6  # least share of the light, and how seldom noise may do it
 _HARMONICS, _RINGS = 8, 4
 _SPOT, _SPOT_MATTERS = 8.0, 0.003
 _MAGNIFIED = 0.08
@@ -61,22 +75,35 @@ def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
         for order in range(1, _HARMONICS + 1):
             templates += [hat * np.cos(order * angle), hat * np.sin(order * angle)]
     basis = np.stack([t.ravel()[pair.flat] for t in templates], axis=1)
-    slopes = solution.slopes if solution.slopes is not None else np.zeros((basis.shape[0], 0))
-    # what the fit could have taken up is not seen in its residual
-    known, _ = np.linalg.qr(slopes[:, np.abs(slopes).max(axis=0) > 0]) if slopes.shape[1] else (slopes, None)
-    basis = without_level(basis - known @ (known.T @ basis), solution.model.ravel()[pair.flat])
+    basis = _left_open(pair, solution, basis)
     left, values, _ = np.linalg.svd(basis, full_matrices=False)
     left = left[:, values > 1e-6 * values.max()]
-    residual = pair.values - solution.model.ravel()[pair.flat]
-    deviation, correlation = pair.residual_noise(residual)
-    # a smooth deviation would take the shape itself for noise: its level beside the dot and within it is enough
-    deviation = np.full_like(deviation, noise_near(pair, solution, near))
-    spread = left.T @ pair.noise_times(left, deviation, pair.noise_correlation)
-    found = left.T @ residual
+    found, spread = unexplained(pair, solution, left)
     chance = float(chi2.sf(found @ np.linalg.solve(spread, found), found.size)) if np.trace(spread) > 0 else 0.0
     light = float(np.sum((pair.data[near] - solution.background) ** 2))
     share = np.sqrt(max(float(found @ found) - float(np.trace(spread)), 0.0) / light) if light > 0 else np.inf
     return float(share), chance
+
+
+def unexplained(pair: Forward, solution: Solution, basis: Array) -> tuple[Array, Array]:
+    """What patterns `[pixels used, n]` have in common with a fit's residual.
+
+    Returns:
+        Their products with the residual `[n]`, what the fit could have taken up left out, and the covariance `[n, n]`
+        of those products under noise alone.
+    """
+    basis = _left_open(pair, solution, basis)
+    residual = pair.values - solution.model.ravel()[pair.flat]
+    # a smooth deviation would take the shape itself for noise: its level beside the dot and within it is enough
+    deviation = np.full(residual.shape, noise_near(pair, solution, signal_pixels(pair)))
+    return basis.T @ residual, basis.T @ pair.noise_times(basis, deviation, pair.noise_correlation)
+
+
+def _left_open(pair: Forward, solution: Solution, basis: Array) -> Array:
+    """Patterns without what the fit could have taken up, which is not seen in its residual."""
+    slopes = solution.slopes if solution.slopes is not None else np.zeros((basis.shape[0], 0))
+    known, _ = np.linalg.qr(slopes[:, np.abs(slopes).max(axis=0) > 0]) if slopes.shape[1] else (slopes, None)
+    return without_level(basis - known @ (known.T @ basis), solution.model.ravel()[pair.flat])
 
 
 def noise_near(pair: Forward, solution: Solution, near: Mask) -> float:
@@ -156,10 +183,11 @@ def check_fit(
         )
         warn(MagnificationWarning(text, file=file, number=change), stacklevel)
     _check_spots(pair, solution, file, stacklevel + 1)
-    if fit.asymmetry > _UNEVEN and asymmetry_of(pair, solution)[1] < _CHANCE:
+    if fit.asymmetry > UNEVEN and asymmetry_of(pair, solution)[1] < CHANCE:
         text = (
-            f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle, which no family here "
-            "has; is the lens decentred, the dot off the axis, or the stop a polygon?"
+            f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
+            f"{fit.family!r} has not; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
+            "'auto' and 'image' take any shape"
         )
         warn(AsymmetryWarning(text, file=file, number=fit.asymmetry), stacklevel)
     if solution.family != "radial":
@@ -218,8 +246,8 @@ def _check_parameters(pair: Forward, solution: Solution, file: str | None, stack
                     file=file,
                     number=float(value),
                 )
-            if name == "m":
-                continue  # the exponent of a tilt that is not there
+            if name in ("m", "curvature"):
+                continue  # the exponent of a tilt that is not there; blades that are straight, or leave a circle
             text = f"{name} ended on its bound {float(value):.4g}; it is only a limit"
             warn(BoundaryWarning(text, file=file, number=float(value)), stacklevel)
     size, error = size_of_blur(pair, solution)
@@ -245,7 +273,8 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     covariance = solution.covariance[np.ix_(index, index)]
     known = np.isfinite(np.diag(covariance))
     if known.all():
-        return float(rms[0]), float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+        variance = max(float(slope @ covariance @ slope), 0.0)
+        return float(rms[0]), float(np.sqrt(variance + (_error_of_moment(pair, solution, float(rms[0])) ** 2)))
     # parameters trade with each other without limit; their size may be known all the same
     numbers = np.array([solution.params.get(n, solution.moves.get(n, 0.0)) for n in solution.names])
     jacobian = pair._jacobian(solution.family, solution.names, numbers)[:, index]
@@ -256,6 +285,18 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
         return float(rms[0]), np.inf
     noise = np.sqrt(solution.squares / pair.values.size)
     return float(rms[0]), float(noise * np.linalg.norm(along[seen] / values[seen]))
+
+
+def _error_of_moment(pair: Forward, solution: Solution, rms: float) -> float:
+    """What noise does to the rms radius of a kernel whose shape is free: only the picture's second moment fixes it."""
+    if solution.family != "image":
+        return 0.0
+    near = signal_pixels(pair)
+    squared = pair.distance[near] ** 2
+    light = pair.data[near] - solution.background
+    away = squared - float(light @ squared / light.sum())
+    noise = noise_near(pair, solution, near) / np.sqrt(independent_share(pair.noise_correlation))
+    return float(noise * np.linalg.norm(away) / abs(light.sum()) / (2 * max(rms, 1e-9)))
 
 
 def _size_of_profile(solution: Solution) -> tuple[float, float]:

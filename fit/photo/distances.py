@@ -8,14 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from torchdof.optics.aperture import Aperture
 from torchdof.optics.psf import FAMILIES, LENGTHS
 
 from ..problems import FitWarning
 from ..result import Array, BlurFit
 from .manifest import Capture
+from .opening import common_opening, turned
 from .pair import fit_pair
 
-__all__ = ["fit_distances", "fit_one"]
+__all__ = ["fit_distances", "fit_one", "fit_openings"]
 
 _KNOTS = 33
 _SWEEPS = 2
@@ -66,6 +68,7 @@ def fit_one(
     accuracy_db: float = 45.0,
     prior: dict[str, tuple[float, float]] | None = None,
     reach: float | None = None,
+    aperture: Aperture | None = None,
 ) -> BlurFit:
     """Fit one pair, its size expected from the distances."""
     return fit_pair(
@@ -79,8 +82,40 @@ def fit_one(
         prior=prior,
         knots=_KNOTS if family == "radial" else None,
         reach=reach,
+        aperture=aperture,
         files=pair.files,
     )
+
+
+def fit_openings(
+    pairs: list[Capture],
+    focus_m: float,
+    family: str,
+    firsts: list[BlurFit],
+    done: Callable[[Capture, BlurFit], None],
+) -> tuple[list[BlurFit], Aperture]:
+    """Fit all pairs with kernels that are not round, those of one opening in as many sizes.
+
+    Args:
+        pairs: by increasing distance.
+        focus_m: distance of the focus.
+        family: "polygon" or "image".
+        firsts: a fit of each pair with any family; those of `family` tell the opening.
+        done: called after each fit.
+
+    Returns:
+        One fit a pair, and the opening as it shows behind the focus.
+    """
+    nearer = [pair.distance_m < focus_m for pair in pairs]
+    telling = [i for i, fit in enumerate(firsts) if fit.family == family]
+    opening = common_opening([firsts[i] for i in telling], [nearer[i] for i in telling])
+    shown = turned(opening)
+    fits = []
+    for pair, near in zip(pairs, nearer, strict=True):
+        fit = fit_one(pair, focus_m, "image", None, aperture=shown if near else opening)
+        fits.append(replace(fit, family=family))
+        done(pair, fits[-1])
+    return fits, opening
 
 
 def _refine_together(pairs: list[Capture], focus_m: float, family: str, fits: dict[int, BlurFit]) -> dict[int, BlurFit]:

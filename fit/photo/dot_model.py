@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from .dot import Dot, noise_inside
 from .noise import correlate, correlation_of, fine_share
 from .profile_fit import inverse
 
-__all__ = ["STEPS", "Edge", "draw_edge", "soft_edge"]
+__all__ = ["STEPS", "Edge", "draw_edge", "soft_edge", "with_softness"]
 
 STEPS = {"radius": 1e-2, "softness": 0.1}
 """Steps in px over which an edge's errors are passed on."""
@@ -45,6 +45,12 @@ class Edge:
     covariance: Array
     rms: float
     misfit: float
+
+
+def with_softness(edge: Edge, softness: float) -> Edge:
+    """The edge of the same dot through another blur: its light, pi (radius^2 + softness^2), stays."""
+    square = edge.radius**2 + edge.softness**2 - softness**2
+    return replace(edge, radius=float(np.sqrt(max(square, 0.0))), softness=softness)
 
 
 def draw_edge(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:

@@ -11,7 +11,7 @@ from ..problems import FitError
 from ..result import Array
 from ..validation import a_picture
 
-__all__ = ["COST", "choose", "highlight_psnr", "natural_psnr"]
+__all__ = ["COST", "choose", "highlight_psnr", "looks_alike", "natural_psnr"]
 
 COST = ("gaussian", "disc", "ring", "softm", "radial")
 """Families by growing number of parameters."""
@@ -117,7 +117,7 @@ def choose(
     natural = {f: natural_psnr(kernels[f], kernels[likeliest]) for f in kernels}
     look = {f: highlight_psnr(kernels[f], kernels[likeliest]) for f in kernels}
     wanted_look = accuracy_db - _LOOK_BELOW
-    enough = [f for f in kernels if natural[f] >= accuracy_db and look[f] >= wanted_look]
+    enough = [f for f in kernels if looks_alike(kernels[f], kernels[likeliest], accuracy_db)]
     family = min([*enough, likeliest], key=COST.index)
     others = ", ".join(
         f"{f} {natural[f]:.1f} and {look[f]:.1f} dB, BIC {bic[f] - bic[likeliest]:+.0f}"
@@ -136,6 +136,18 @@ def choose(
             f"({natural[family]:.1f} and {look[family]:.1f} dB) against {likeliest}, the likeliest"
         )
     return family, f"{why} ({others})", {f: natural_psnr(kernels[f], kernels["radial"]) for f in kernels}
+
+
+def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
+    """Whether a photograph through one kernel is within `accuracy_db` of that through another, a highlight 20 dB less.
+
+    Args:
+        kernel: `[k, k]`, k odd, sums to 1.
+        other: `[l, l]`, l odd, sums to 1: the one to be like.
+        accuracy_db: wanted PSNR on a natural image.
+    """
+    look = highlight_psnr(kernel, other)
+    return natural_psnr(kernel, other) >= accuracy_db and look >= accuracy_db - _LOOK_BELOW
 
 
 def _square(name: str, kernel: ArrayLike) -> Array:

@@ -7,11 +7,12 @@ parameters, the displacement and the magnification are searched by `curve_fit`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
+from torchdof.optics.aperture import Aperture
 from torchdof.optics.psf import FAMILIES, pixel_kernels, support
 
 from ..result import Array, Mask
@@ -21,9 +22,17 @@ from .noise import correlate, correlation_of, fine_share
 from .profile_fit import inverse
 from .source import Source
 
-__all__ = ["ALL_MOVES", "Forward", "Solution"]
+__all__ = ["ALL_MOVES", "OPENINGS", "SHAPES", "Forward", "Solution"]
 
 ALL_MOVES = ("dx", "dy", "magnification")
+OPENINGS = {"polygon": ("radius", "rotation_deg", "curvature"), "image": ("radius",)}
+"""Parameters of the kernels that are not round: discs seen through a lens's opening."""
+
+SHAPES = {**FAMILIES, **OPENINGS}
+"""Parameters of every kernel that can be fitted."""
+
+_LEAST, _MOST = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}
+_DRAWN_PX = 16.0
 _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
 
 
@@ -64,6 +73,7 @@ class Forward:
         fine_share: share of the noise's variance that second differences see.
         start: kernel parameters to start from beside the moments, by family.
         prior: expected value and standard deviation of kernel parameters, as if measured elsewhere.
+        opening: of the lens, for the kernels in `OPENINGS`: its blades, or its image.
     """
 
     source: Source
@@ -76,6 +86,7 @@ class Forward:
     start: dict[str, dict[str, float]] = field(default_factory=dict)
     prior: dict[str, tuple[float, float]] = field(default_factory=dict)
     shot_noise: float = 0.0
+    opening: Aperture | None = None
 
     def __post_init__(self) -> None:
         """Prepare the window the source is drawn in and the size of the Fourier grid."""
@@ -146,8 +157,26 @@ class Forward:
     def kernels(self, family: str, params: dict[str, Array]) -> Array:
         """Kernels `[n, k, k]` for parameters `[n]`, as wide as they need and at most as wide as the window."""
         tensors = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
+        if family in OPENINGS:
+            radius = tensors["radius"]
+            size = 2 * min(int(np.ceil(float(radius.max()))) + 1, self.half) + 1
+            each = [self.opening_with({n: float(v[i]) for n, v in tensors.items()}) for i in range(len(radius))]
+            drawn = [pixel_kernels("disc", {"radius": r}, size, None, o) for r, o in zip(radius, each, strict=True)]
+            return torch.stack(drawn).numpy()
         half = min(int(np.ceil(support(family, tensors))) + 1, self.half)
         return pixel_kernels(family, tensors, 2 * half + 1).numpy()
+
+    def opening_with(self, params: dict[str, float]) -> Aperture:
+        """The lens's opening with the parameters that belong to it."""
+        if self.opening is None:
+            raise AssertionError("kernels that are not round are those of an opening")
+        return replace(self.opening, **{n: v for n, v in params.items() if n != "radius"})
+
+    def _size_of_opening(self) -> float:
+        """Radius of the uniform disc with the opening's second moment, over the radius of the circle around it."""
+        kernel = pixel_kernels("disc", {"radius": _DRAWN_PX}, None, None, self.opening).numpy()
+        away = np.arange(kernel.shape[-1]) - kernel.shape[-1] // 2
+        return float(np.sqrt(2 * (kernel * (away[:, None] ** 2 + away**2)).sum())) / _DRAWN_PX
 
     def solve(self, family: str, tolerance: float = 1e-7) -> Solution:
         """Fit one family from several starts (or from `start`, and from the moments beside it).
@@ -155,7 +184,7 @@ class Forward:
         Raises:
             NotConvergedError: when no start converges.
         """
-        shape = FAMILIES[family]
+        shape = SHAPES[family]
         names = (*shape, *self.fit_moves)
         low, high = self.bounds(names)
         starts = [self._start(names, s) for s in self._seeds(family)]
@@ -288,7 +317,7 @@ class Forward:
     def _shaped(self, family: str, names: tuple[str, ...], p: Array) -> Array:
         """Kernel convolved with the moved source, before gain and background: `[pixels used]`."""
         params = dict(zip(names, p, strict=True))
-        kernels = self.kernels(family, {n: np.array([params[n]]) for n in FAMILIES[family]})
+        kernels = self.kernels(family, {n: np.array([params[n]]) for n in SHAPES[family]})
         return self.convolve(self.moved_source(self.moves(params)), kernels)[0]
 
     def _project(self, shaped: Array) -> tuple[Array, float, float]:
@@ -303,13 +332,14 @@ class Forward:
     def _jacobian(self, family: str, names: tuple[str, ...], p: Array) -> Array:
         """Derivatives of the projected model `[pixels used, parameters]` (Kaufman's form)."""
         params = dict(zip(names, p, strict=True))
-        shape = FAMILIES[family]
+        shape = SHAPES[family]
         source = self.moved_source(self.moves(params))
         near = {n: np.repeat(params[n], 2 * len(shape) + 1) for n in shape}
         steps = [1e-4 * max(abs(params[n]), 0.1) for n in shape]
         for i, n in enumerate(shape):
             near[n][2 * i + 1] += steps[i]
-            near[n][2 * i + 2] = max(near[n][2 * i + 2] - steps[i], -1.0 if n == "b" else 0.0)
+            near[n][2 * i + 2] = max(near[n][2 * i + 2] - steps[i], _LEAST.get(n, 0.0))
+            near[n] = np.minimum(near[n], _MOST.get(n, np.inf))
         kernels = self.kernels(family, near)
         slopes = [
             (kernels[2 * i + 1] - kernels[2 * i + 2]) / (near[n][2 * i + 1] - near[n][2 * i + 2])
@@ -342,6 +372,8 @@ class Forward:
             "radius": (0.1, width),
             "b": (-0.98, 8.0),
             "m": (0.5, 12.0),
+            "rotation_deg": (-400.0, 400.0),
+            "curvature": (0.0, 1.0),
             "dx": (-wander, wander),
             "dy": (-wander, wander),
             "magnification": (0.7 * self.magnification, 1.4 * self.magnification),
@@ -353,7 +385,12 @@ class Forward:
         return [float(seed[n]) if n in seed else unmoved[n] for n in names]
 
     def _seeds(self, family: str) -> list[dict[str, float]]:
-        """Starts from the second moments: what the blur added to the dot's own, per axis."""
+        """Starts from the second moments: what the blur added to the dot's own, per axis; an opening's are given."""
+        if family in OPENINGS:
+            if family in self.start:
+                return []
+            added = (self.data_dot.radius**2 - (self.magnification * self.source.dot.radius) ** 2) / 4
+            return [{"radius": float(np.sqrt(max(4 * added, 0.6))) / self._size_of_opening()}]
         added = (self.data_dot.radius**2 - (self.magnification * self.source.dot.radius) ** 2) / 4
         s = float(np.sqrt(max(added, 0.15)))
         s = min(s, self.half / 3)

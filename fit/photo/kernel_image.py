@@ -1,8 +1,4 @@
-"""A kernel as a picture, for shapes that no round family has: polygons, cat's eyes, coma, scratched or dusty lenses.
-
-Its pixels are free but for three things: none is negative, they sum to 1, and neighbours are alike as far as the noise
-leaves them undetermined. The smoothing is the one under which pixels that were kept back are foretold best.
-"""
+"""A kernel as a picture, for shapes that no round family has: polygons, cat's eyes, coma, scratched or dusty lenses."""
 
 from __future__ import annotations
 
@@ -12,18 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..problems import FitError
-from ..result import Array, Mask
+from ..result import Array
 from ..validation import a_picture
-from .diagnostics import noise_near, signal_pixels
-from .forward import Forward
+from .deconvolution import estimate
+from .diagnostics import signal_pixels
 from .pair import prepared_pair
 from .radial import solve_round
 
 __all__ = ["KernelImage", "fit_kernel_image"]
-
-_SMOOTHNESS = 10.0 ** np.arange(0.0, -6.5, -0.5)
-_STEPS = 150
-_KEPT_BACK = 0.2
 
 
 @dataclass(frozen=True)
@@ -81,70 +73,8 @@ def fit_kernel_image(
     if still.shape != data.shape:
         raise FitError(f"sharp and blurred must have the same shape, got {list(still.shape)} and {list(data.shape)}")
     pair = prepared_pair(still, data, "auto", magnification, white, files)[0]
-    round_one = solve_round(pair)
+    found = estimate(pair, solve_round(pair))
     near = signal_pixels(pair)
-    noise = noise_near(pair, round_one, near)
-    half = min(int(np.ceil(float(round_one.params["radius"]))) + 2, pair.half)
-    source = pair.moved_source(round_one.moves)
-    size = 2 * half + 1
-    begin = pair.kernels("radial", {k: np.asarray(v)[None] for k, v in round_one.params.items()})[0]
-    start = _fitted_to(begin, size)
-    # a fifth of the pixels is kept back; the smoothing under which they are foretold best is taken
-    kept_back = np.random.default_rng(0).random(pair.values.size) < _KEPT_BACK
-    best: tuple[float, float, Array] | None = None
-    kernel = start
-    for smoothness in _SMOOTHNESS:
-        kernel, gain, background = _descend(pair, source, kernel, smoothness, ~kept_back)
-        model = gain * pair.convolve(source, kernel[None])[0] + background
-        squares = float(np.sum((pair.values - model)[kept_back & near.ravel()[pair.flat]] ** 2))
-        if best is None or squares < best[0]:
-            best = squares, float(smoothness), kernel
-    if best is None:
-        raise AssertionError("there is always a first strength of smoothing")
-    kernel, gain, background = _descend(pair, source, best[2], best[1], np.ones_like(kept_back))
-    model = gain * pair.convolve(source, kernel[None])[0] + background
-    rms = float(np.sqrt(np.mean((pair.values - model)[near.ravel()[pair.flat]] ** 2)))
-    light = float(np.sqrt(np.mean((pair.data[near] - background) ** 2)))
-    return KernelImage(kernel, gain, background, rms / light, noise / light)
-
-
-def _descend(pair: Forward, source: Array, start: Array, smoothness: float, fitted: Mask) -> tuple[Array, float, float]:
-    """Accelerated projected gradients on the kernel's pixels; the background is solved inside.
-
-    Reference:
-        Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.
-    """
-    size = start.shape[0]
-    level = float(pair.values.mean())
-    shaped = pair.convolve(source, start[None])[0]
-    gain = max(float((shaped - shaped.mean()) @ (pair.values - level)) / float(np.var(shaped) * shaped.size), 1e-12)
-    largest = float(np.abs(source).max()) ** 2
-    penalty = smoothness * largest * 1e-2
-    step = 1.0 / (largest + 8 * penalty)
-    weights = ahead = gain * start
-    pace = 1.0
-    for _ in range(_STEPS):
-        error = pair.convolve(source, ahead[None])[0] - pair.values
-        error = np.where(fitted, error - error[fitted].mean(), 0.0)
-        gradient = pair.correlate(source, error, size) + penalty * _laplacian(ahead)
-        after = np.maximum(ahead - step * gradient, 0.0)
-        faster = (1 + np.sqrt(1 + 4 * pace * pace)) / 2
-        ahead = after + (pace - 1) / faster * (after - weights)
-        weights, pace = after, faster
-    gain = float(weights.sum())
-    background = float((pair.values - pair.convolve(source, weights[None])[0])[fitted].mean())
-    return weights / gain, gain, background
-
-
-def _laplacian(picture: Array) -> Array:
-    """Minus the second differences of a picture that is dark around."""
-    wide = np.pad(picture, 1)
-    return np.asarray(4 * picture - wide[2:, 1:-1] - wide[:-2, 1:-1] - wide[1:-1, 2:] - wide[1:-1, :-2])
-
-
-def _fitted_to(kernel: Array, size: int) -> Array:
-    """A kernel cut or padded to a size."""
-    margin = (size - kernel.shape[0]) // 2
-    if margin >= 0:
-        return np.pad(kernel, margin)
-    return np.ascontiguousarray(kernel[-margin : margin or None, -margin : margin or None])
+    light = float(np.sqrt(np.mean((pair.data[near] - found.background) ** 2)))
+    rms = float(np.sqrt(np.mean((pair.values - found.model)[near.ravel()[pair.flat]] ** 2)))
+    return KernelImage(found.kernel, found.gain, found.background, rms / light, found.noise / light)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..problems import NotInFocusWarning, NotLinearWarning, warn
 from ..result import Array
 from .dot import Dot, noise_inside, noise_of
-from .dot_model import Edge, draw_edge, soft_edge
+from .dot_model import Edge, draw_edge, soft_edge, with_softness
 from .forward import Forward, Solution
 
 __all__ = ["EXPLAINED", "SENSOR_BLUR_PX", "check_focus", "check_linearity", "check_noise", "focused"]
@@ -95,7 +93,7 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
 
 def focused(edge: Edge) -> Edge:
     """The edge as it would be in focus: softer than any camera in focus leaves it, it is deconvolved to the usual."""
-    return replace(edge, softness=_FOCUSED_PX) if edge.softness > _UNFOCUSED_PX else edge
+    return with_softness(edge, _FOCUSED_PX) if edge.softness > _UNFOCUSED_PX else edge
 
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None, stacklevel: int = 4) -> None:

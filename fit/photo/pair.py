@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchdof.optics.psf import FAMILIES
+from torchdof.optics.aperture import Aperture
 from torchdof.validation import show
 
 from ..problems import FitError, SaturatedWarning, warn
@@ -18,10 +18,12 @@ from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
 from .diagnostics import check_fit
 from .dot import find_dot, noise_inside
-from .dot_model import Edge, soft_edge
-from .family_choice import COST, choose
-from .forward import ALL_MOVES, Forward, Solution
+from .dot_model import Edge, soft_edge, with_softness
+from .family_choice import COST, choose, looks_alike
+from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
 from .linearity import EXPLAINED, check_focus, check_linearity, check_noise, focused
+from .noise import independent_share
+from .opening import hides_a_polygon, solve_image, solve_opening, solve_polygon
 from .profile_fit import fit_profile
 from .radial import solve_radial, solve_round
 from .ratio import blur_strength
@@ -35,6 +37,8 @@ SourceKind = Literal["auto", "image", "dot"]
 
 _SMALLEST_WINDOW = 15
 _AS_GOOD = 2e-3
+_GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
+_FINE, _SMOOTH_PX = 0.5, 4.0  # share of fine noise and radius of a blur, from either of which on noise is seen
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
 
@@ -53,6 +57,8 @@ def fit_pair(
     prior: Mapping[str, tuple[float, float]] | None = None,
     knots: int | None = None,
     reach: float | None = None,
+    aperture: Aperture | None = None,
+    softness: float | None = None,
     files: tuple[str | None, str | None] = (None, None),
 ) -> BlurFit:
     """The kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
@@ -68,7 +74,10 @@ def fit_pair(
     Args:
         sharp: `[H, W]`, linear light, the dot in focus on a dark ground; None for a point of light (a star).
         blurred: `[H, W]`, linear light, the same dot out of focus, the whole blur inside the window.
-        family: "gaussian", "ring", "disc", "softm", "radial", or "auto": the cheapest that reaches `accuracy_db`.
+        family: "gaussian", "ring", "disc", "softm", "radial"; "polygon", the opening that a lens's blades leave;
+            "image", a kernel of any shape; or "auto": the cheapest that reaches `accuracy_db`, round unless the
+            pictures say otherwise. Detail finer than the dot is smooth in an "image": a dot of a third of the blur's
+            size shows most.
         model: "forward" or "ratio".
         accuracy_db: PSNR on a natural image that "auto" asks of a family, against the free profile `radial`.
         source: what stands for the sharp dot. "image": its picture; "dot": an ideal round dot fitted to it, which has
@@ -82,6 +91,10 @@ def fit_pair(
             distances), in px; the result is what both the pictures and it allow, and so are its standard errors.
         knots: number of values of a "radial" profile; None takes two a pixel.
         reach: where a "radial" profile ends, px; None finds it from a soft disc.
+        aperture: the lens's opening as it shows in `blurred`, if it is known (from another distance), for the family
+            "image": its size alone is then fitted.
+        softness: of the sharp dot's edge in focus (sigma, px), where that is known to be less than in `sharp`: of a
+            colour that is not the one in focus. An ideal dot then stands for the sharp one.
         files: names of the two pictures, for errors and warnings.
 
     Returns:
@@ -105,7 +118,7 @@ def fit_pair(
         >>> fit.family, round(fit.params["radius"], 3)
         ('disc', 8.0)
     """
-    _check_options(family, model, source, magnification, accuracy_db, fit_magnification, white, start, prior)
+    _check_options(family, model, source, magnification, accuracy_db, fit_magnification, white, start, prior, aperture)
     if knots is not None:
         a_count("knots", knots, 2, 1000)
     if reach is not None:
@@ -123,27 +136,40 @@ def fit_pair(
         r, strength, spokes = blur_strength(still, data)
         fit = fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes)
         return replace(fit, model="ratio")
-    pair, edge, linear = prepared_pair(still, data, source, magnification, white, files)
-    if start is not None and start.family in FAMILIES:
+    if softness is not None:
+        a_number("softness", softness, -1e-9, unit="pixels")
+    pair, edge, linear = prepared_pair(still, data, source, magnification, white, files, softness)
+    if start is not None and start.family in SHAPES:
         pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
     pair.prior = dict(prior or {})
     # whether the magnification is settled before the fit: a point has none
     held = True if sharp is None else None if fit_magnification is None else not fit_magnification
     pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
     why, psnr = "", dict[str, float]()
-    if family in ("auto", "radial"):
-        solutions = {"radial": _solve_radial(pair, held, knots, reach)}
+    if family in ("auto", "radial", *OPENINGS) and aperture is None:
+        solution = freest = _solve_radial(pair, held, knots, reach)
         if family == "auto":
-            family, why, psnr = _choose(pair, solutions, accuracy_db)
+            solution, why, psnr = _choose(pair, freest, accuracy_db)
+            found = solve_opening(pair, freest)
+            if found is not None and not _alike((pair, solution), found[:2], accuracy_db):
+                pair, solution, why = found
+                freest = solution
+            elif found is None and hides_a_polygon(pair, freest):
+                why += "; a hexagon would not have been told from it in this noise"
+        elif family != "radial":
+            pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
+            freest = solution
     else:
-        solutions = {family: pair.solve(family)}
-        if held is None and _improves(pair, solutions[family], free := _with_magnification(pair).solve(family)):
-            pair.fit_moves, solutions[family] = ALL_MOVES, free
-    fit = describe(pair, solutions[family], why)
-    # a family that was chosen for being cheap is not to blame for what the free profile explains
-    check_fit(pair, solutions[family], fit, files, describe(pair, solutions["radial"], "") if why else fit)
-    if edge is not None and linear:
-        check_noise(pair, solutions[family], edge.level, files[1])
+        pair.opening = aperture
+        solution = freest = pair.solve(family)
+        if held is None and _improves(pair, solution, free := _with_magnification(pair).solve(family)):
+            pair.fit_moves, solution, freest = ALL_MOVES, free, free
+    fit = describe(pair, solution, why)
+    # a family that was chosen for being cheap is not to blame for what the freest kernel explains
+    check_fit(pair, solution, fit, files, fit if freest is solution else describe(pair, freest, ""))
+    # what demosaicing leaves at a hard edge is no noise, and a blur takes it away
+    if edge is not None and linear and (pair.fine_share > _FINE or fit.radius > _SMOOTH_PX):
+        check_noise(pair, solution, edge.level, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)
@@ -159,10 +185,15 @@ def _check_options(
     white: Any,
     start: Any,
     prior: Any,
+    aperture: Any,
 ) -> None:
     """Refuse options of :func:`fit_pair` that make no sense, by name."""
-    if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
-        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
+    if not isinstance(family, str) or family not in (*SHAPES, "auto"):
+        raise FitError(f"family must be 'auto' or one of {', '.join(SHAPES)}, got {show(family)}")
+    if model == "ratio" and family in OPENINGS:
+        raise FitError(f"model='ratio' fits a profile over r, which {family!r} has not; use model='forward'")
+    if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
+        raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
     texts = isinstance(model, str) and isinstance(source, str)
     if not texts or model not in get_args(Model) or source not in get_args(SourceKind):
         got = f"got {show(model)}, {show(source)}"
@@ -195,6 +226,7 @@ def prepared_pair(
     magnification: float,
     white: float | None,
     files: tuple[str | None, str | None],
+    softness: float | None = None,
 ) -> tuple[Forward, Edge | None, bool]:
     """Find the dots, leave out what is clipped, and decide what stands for the sharp dot.
 
@@ -208,7 +240,9 @@ def prepared_pair(
     whole = used_pixels(still, dot, white, files[0], "sharp", refuse=False)
     clipped = int(np.sum(~whole))
     edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)
-    linear = clipped > 0 or check_linearity(still, dot, edge, files[0])
+    if softness is not None and softness < edge.softness:
+        source, edge = "dot", with_softness(edge, softness)
+    linear = clipped > 0 or softness is not None or check_linearity(still, dot, edge, files[0])
     bright = noise_inside(still, dot)
     shot_noise = 0.0 if bright is None else max(bright[0] ** 2 - dot.noise**2, 0.0) / edge.level
     if clipped:
@@ -221,8 +255,12 @@ def prepared_pair(
             ),
             stacklevel=4,
         )
-    # a spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified
+    # a spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified, and so is the
+    # sensor's softness, which does not grow with the dot
+    unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
+    magnified = edge.softness**2 * abs(1 - magnification**2) > _GROWN
     close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
+    close = close or (magnified and unexplained < _ALMOST)
     explained = close and edge.radius > 2 * edge.softness
     ideal = clipped or source == "dot" or (source == "auto" and explained)
     stand_in = IdealDot.of(dot, focused(edge)) if ideal else PictureOfDot.of(still, dot)
@@ -237,7 +275,8 @@ def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
     """Whether a fitted magnification explains the pictures significantly better than the expected one."""
     # the scale of chi squared: what remains, or the rounding of a spline where there is no noise
     floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
-    return (held.squares - free.squares) / floor > _SIGNIFICANT
+    # noise that goes together in neighbours does not average out over them
+    return (held.squares - free.squares) / floor * independent_share(pair.noise_correlation) > _SIGNIFICANT
 
 
 def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: float | None) -> Solution:
@@ -251,14 +290,23 @@ def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: fl
     return solution
 
 
-def _choose(pair: Forward, solutions: dict[str, Solution], accuracy_db: float) -> tuple[str, str, dict[str, float]]:
+def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
     """Fit every family at the free profile's magnification and choose; the chosen one's is then fitted with it."""
     fit_moves, pair.fit_moves = pair.fit_moves, ("dx", "dy")
-    solutions |= {f: pair.solve(f) for f in COST[:-1]}
-    kernels = {f: pair.kernels(f, kernel_lists(s))[0] for f, s in solutions.items()}
+    solutions = {"radial": radial} | {f: pair.solve(f) for f in COST[:-1]}
+    kernels = {f: _kernel(pair, s) for f, s in solutions.items()}
     family, why, psnr = choose(kernels, {f: bic_of(pair, s) for f, s in solutions.items()}, accuracy_db)
     pair.fit_moves = fit_moves
     if family != "radial" and fit_moves == ALL_MOVES:
         pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
         solutions[family] = pair.solve(family)
-    return family, why, psnr
+    return solutions[family], why, psnr
+
+
+def _alike(one: tuple[Forward, Solution], other: tuple[Forward, Solution], accuracy_db: float) -> bool:
+    """Whether nobody could tell a picture through one solution's kernel from that through the other's."""
+    return looks_alike(_kernel(*one), _kernel(*other), accuracy_db)
+
+
+def _kernel(pair: Forward, solution: Solution) -> Array:
+    return np.asarray(pair.kernels(solution.family, kernel_lists(solution))[0])

@@ -91,9 +91,10 @@ class IdealDot:
         return self.edge.radius + 5 * self.edge.softness + 1.0
 
     def draw(self, rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
-        """See `Source`."""
-        radius, softness = self.edge.radius * magnification, self.edge.softness * magnification
-        return self.edge.level * draw_edge(rows, columns, x, y, radius, softness)
+        """See `Source`. The softness is the sensor's, not the print's: it does not grow with the dot."""
+        softness = self.edge.softness
+        square = magnification**2 * (self.edge.radius**2 + softness**2) - softness**2  # as the light of a soft disc
+        return self.edge.level * draw_edge(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
 
     def variants(self) -> tuple[list[Source], Array]:
         """A little more radius, and more softness."""

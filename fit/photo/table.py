@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchdof.optics.aperture import Aperture
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
@@ -17,13 +18,15 @@ from torchdof.validation import show
 from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
 from ..result import Array, BlurFit
 from .agreement import check_agreement, frame_width, promised_px
-from .distances import fit_distances, fit_one
+from .distances import fit_distances, fit_one, fit_openings
 from .family_choice import COST
+from .forward import OPENINGS, SHAPES
 from .manifest import Capture, Captures
 
 __all__ = ["TableFit", "fit_captures", "fit_table"]
 
 _EXPOSED = 1.3
+_ORDER = (*COST, *OPENINGS)
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **op
 
     Args:
         captures: from `read_captures`, or made of arrays.
-        family: "auto", or one of `torchdof.optics.psf.FAMILIES`.
+        family: "auto", or one of the families of `fit_pair`.
         **options: see `fit_captures`.
 
     Returns:
@@ -102,7 +105,9 @@ def fit_captures(
 
     Args:
         captures: pairs at increasing distances.
-        family: "auto" takes the cheapest family that is enough at every distance; or one of the families.
+        family: "auto" takes the cheapest family that is enough at every distance; or one of the families of `fit_pair`.
+            A blur that is not round at one distance is not round at any: "polygon" and "image" make one opening of all
+            distances, turned by half in front of the focus, and fit its size at each.
         accuracy_db: what "auto" asks for, see `fit_pair`.
         smooth: whether neighbouring distances inform each other.
         progress: called with (done, all, what) after each fit.
@@ -125,14 +130,20 @@ def fit_captures(
     """
     if not isinstance(captures, Captures):
         raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
-    if not isinstance(family, str) or family not in (*FAMILIES, "auto"):
-        raise FitError(f"family must be 'auto' or one of {', '.join(FAMILIES)}, got {show(family)}")
+    if not isinstance(family, str) or family not in (*SHAPES, "auto"):
+        raise FitError(f"family must be 'auto' or one of {', '.join(SHAPES)}, got {show(family)}")
     pairs = list(captures)
-    total, done = len(pairs) * (2 if family == "auto" else 1), 0
-    why = f"family {family!r} was asked for"
-    if family == "auto":
-        family, why = _choose(pairs, captures.focus_m, accuracy_db, progress, total)
+    twice = family == "auto" or family in OPENINGS
+    total, done = len(pairs) * (2 if twice else 1), 0
+    why, firsts, opening = f"family {family!r} was asked for", list[BlurFit](), None
+    if twice:
+        firsts = _first_fits(pairs, captures.focus_m, family, accuracy_db, progress, total)
         done = len(pairs)
+    if family == "auto":
+        # the richest family that any distance needs serves all
+        needs_most = max(range(len(pairs)), key=lambda i: _ORDER.index(firsts[i].family))
+        family = firsts[needs_most].family
+        why = f"{family}, for {pairs[needs_most].distance_m:g} m: {firsts[needs_most].why}"
 
     def report(pair: Capture, fit: BlurFit) -> None:
         nonlocal done
@@ -141,7 +152,10 @@ def fit_captures(
         if progress:
             progress(done, total, f"{pair.distance_m:g} m")
 
-    ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
+    if family in OPENINGS:
+        ordered, opening = fit_openings(pairs, captures.focus_m, family, firsts, report)
+    else:
+        ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
     radius_px = [f.radius for f in ordered]
     captures = replace(captures, width_px=frame_width(captures, radius_px))
     check_agreement(captures, radius_px)
@@ -151,6 +165,8 @@ def fit_captures(
         radius = np.array([float(f.params["radius"]) for f in ordered])
         values = np.stack([np.asarray(f.params["values"]) for f in ordered]) * radius[:, None] ** 2
         params = {"values": values, "radius": radius}
+    elif family in OPENINGS:
+        params = {"radius": np.array([float(f.params["radius"]) for f in ordered])}
     else:
         params = {n: np.array([float(f.params[n]) for f in ordered]) for n in FAMILIES[family]}
     if len(pairs) == 1:
@@ -160,7 +176,7 @@ def fit_captures(
         )
         warn(SingleDistanceWarning(text, file=pairs[0].files[1], number=pairs[0].distance_m))
     return TableFit(
-        table=_table(captures, ordered, coc_px, params, family, scale, command, why),
+        table=_table(captures, ordered, coc_px, params, family, opening, scale, command, why),
         fits=tuple(ordered),
         coc_px=tuple(coc_px),
         why=why,
@@ -169,24 +185,21 @@ def fit_captures(
     )
 
 
-def _choose(
+def _first_fits(
     pairs: list[Capture],
     focus_m: float,
+    family: str,
     accuracy_db: float,
     progress: Callable[[int, int, str], None] | None,
     total: int,
-) -> tuple[str, str]:
-    """The cheapest family that is accurate enough at every distance, and why."""
-    worst = 0
-    why = ""
+) -> list[BlurFit]:
+    """Every pair by itself, which tells the family, or the lens's opening."""
+    fits = []
     for i, pair in enumerate(pairs):
-        fit = fit_one(pair, focus_m, "auto", None, accuracy_db)
-        # the richest family that any distance needs serves all
-        if not why or COST.index(fit.family) > worst:
-            worst, why = COST.index(fit.family), f"{fit.family}, for {pair.distance_m:g} m: {fit.why}"
+        fits.append(fit_one(pair, focus_m, family, None, accuracy_db))
         if progress:
             progress(i + 1, total, f"{pair.distance_m:g} m")
-    return COST[worst], why
+    return fits
 
 
 def _check_exposure(pair: Capture, fit: BlurFit) -> None:
@@ -220,6 +233,7 @@ def _table(
     coc_px: list[float],
     params: dict[str, Array],
     family: str,
+    opening: Aperture | None,
     scale: str,
     command: str,
     why: str,
@@ -244,7 +258,7 @@ def _table(
         if getattr(captures, name) is not None:
             provenance[name] = getattr(captures, name)
     return BlurTable(
-        family,
+        family if opening is None else "disc",
         [c / unit for c in coc_px],
         {k: (v / unit if k in LENGTHS else v).tolist() for k, v in params.items()},
         unit="fraction" if sensor is None else "mm",
@@ -252,4 +266,5 @@ def _table(
         name=captures.name,
         provenance=provenance,
         residual=[round(f.residual, 6) for f in fits],
+        aperture=opening,
     )

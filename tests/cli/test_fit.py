@@ -49,6 +49,21 @@ def test_json_holds_the_fits(folder: Path, tmp_path: Path) -> None:
     assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"]) and isinstance(facts["warnings"], list)
 
 
+def test_a_polygon_becomes_a_table_with_its_blades(simulator: ModuleType, tmp_path: Path) -> None:
+    camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
+
+    def hexagon(distance: float) -> tuple[str, dict[str, float]]:
+        return "hexagon", {"radius": 10.0 * abs(1 / 0.5 - 1 / distance)}
+
+    folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], hexagon, width=110, height=90)
+    out = tmp_path / "mine.json"
+    result = run(folder, "-o", out, "--family", "polygon", "--plots", tmp_path)
+    assert result.exit_code == 0, result.output
+    table = BlurTable.load(out)
+    assert table.family == "disc" and table.aperture is not None and table.aperture.blades == 6
+    assert "6 blades" in result.output and (tmp_path / "mine_800mm.png").is_file()
+
+
 def test_a_lens_becomes_a_table(tmp_path: Path) -> None:
     arguments = ("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
     result = run(*arguments)

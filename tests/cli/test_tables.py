@@ -44,7 +44,7 @@ def test_json_tells_programs_the_same() -> None:
     assert (facts["table"], facts["family"], facts["nodes"], facts["unit"]) == (
         "double_gauss_50mm_f2",
         "radial",
-        33,
+        41,
         "mm",
     )
     assert facts["coc"][0] < 0 < facts["coc"][1] and facts["aperture"] is None

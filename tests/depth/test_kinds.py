@@ -78,8 +78,8 @@ def test_pixels_without_depth_are_nan(kind: Any, options: dict[str, float], valu
         ("disparity", {}, "disparity needs a scale"),
         ("distance", {}, "needs the horizontal field of view"),
         ("distance", {"fov_x_deg": 180.0}, r"must be in \(0, 180\) degrees"),
-        ("z", {"scale": 0.0}, "scale must be finite and not 0"),
-        ("z", {"offset": NAN}, "offset finite"),
+        ("z", {"scale": 0.0}, r"scale \(--depth-scale\) must be finite and not 0"),
+        ("z", {"offset": NAN}, r"offset \(--depth-offset\) finite"),
     ],
 )
 def test_kind_that_lacks_something_is_refused(kind: Any, options: dict[str, float], says: str) -> None:

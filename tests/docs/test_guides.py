@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from typer.testing import CliRunner
 
+import torchdof
 from torchdof.cli import main
 from torchdof.cli.main import app
-from torchdof.io.images import read_image
+from torchdof.io.images import Picture, read_image, write_image
 from torchdof.reference.metrics import display, psnr
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = [ROOT / "README.md", ROOT / "docs" / "speed.md", *sorted((ROOT / "docs" / "guides").glob("*.md"))]
-RUN += [ROOT / "docs" / "index.md"]
+RUN += [ROOT / "docs" / f"{name}.md" for name in ("index", "datasets", "depth", "shapes")]
 """Pages whose blocks are run from top to bottom, but for those below a comment that says why not."""
 
 _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
@@ -50,6 +52,27 @@ def run_command(words: list[str]) -> None:
         raise AssertionError(f"{words[0]}: a command that this test does not know")
 
 
+def given(folder: Path) -> dict[str, Any]:
+    """What pages speak of as the reader's own: names of Python, and files in a folder."""
+    image = torch.rand(1, 3, 480, 640, generator=torch.Generator().manual_seed(0))
+    x, y = torch.meshgrid(torch.arange(640.0), torch.arange(480.0), indexing="xy")
+    values = (0.65 - 0.0012 * x + 0.00083 * y).clamp_min(0.1)[None, None]  # a plane, about as far as the pages say
+    write_image(folder / "photo.jpg", Picture(image))
+    write_image(folder / "depth.png", Picture(1 / values / 65.535, ("Y",)), "linear", "16")  # millimetres
+    camera = torchdof.Camera(focus_m=2.0)
+    return {
+        "__name__": "guide",
+        "torchdof": torchdof,
+        "image": image,
+        "depth": 1 / values,
+        "values": values,
+        "heart": torch.eye(9),
+        "camera": camera,
+        "dof": torchdof.DepthOfField(camera),
+        "frames": 2 * [(image, 1 / values)],
+    }
+
+
 @pytest.mark.parametrize("name", _names(RUN))
 def test_blocks_of_a_guide_run_from_top_to_bottom(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -57,7 +80,7 @@ def test_blocks_of_a_guide_run_from_top_to_bottom(
     monkeypatch.chdir(tmp_path)
     for folder in ("examples", "tests"):
         (tmp_path / folder).symlink_to(ROOT / folder)
-    names: dict[str, Any] = {"__name__": "guide"}
+    names = given(tmp_path)
     blocks = [match for match in _BLOCK.finditer((ROOT / name).read_text()) if not match["skip"]]
     assert blocks
     for block in blocks:

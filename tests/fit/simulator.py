@@ -24,8 +24,48 @@ def draw_dot(size: int, radius: float, centre: tuple[float, float] = (0.0, 0.0),
     return inside.reshape(size, oversample, size, oversample).mean((1, 3))
 
 
+def shape(kind: str, radius: float, size: int = 41, fine: int = 8, turn_deg: float = 11.0) -> np.ndarray:
+    """A blur that no round family has `[size, size]`, drawn as light falls: sums to 1, its centre of mass where it is.
+
+    "hexagon" and "heptagon" are inscribed in a circle of `radius` px, a corner `turn_deg` clockwise from the right; the
+    "cat's eye" is a disc of which another, 0.7 radii aside, lets only a part through; "coma" is a disc whose rays go
+    wrong by the square of their height; "mirror" is a disc without its middle, and "rim" one with a brighter edge.
+    """
+    axis = (np.arange(size * fine) + 0.5) / fine - size / 2
+    x, y = np.meshgrid(axis, axis)
+    r = np.hypot(x, y) / radius
+    if kind in ("hexagon", "heptagon"):
+        wedge = 2 * np.pi / {"hexagon": 6, "heptagon": 7}[kind]
+        from_corner = (np.arctan2(y, x) - np.deg2rad(turn_deg)) % wedge
+        light = r * np.cos(from_corner - wedge / 2) < np.cos(wedge / 2)
+    elif kind == "coma":
+        rays = r < 1
+        a, b, far = x[rays], y[rays], 0.15 / radius
+        there = a + far * (3 * a**2 + b**2), b + far * 2 * a * b
+        edges = np.arange(size * fine + 1) / fine - size / 2
+        light = np.histogram2d(there[1], there[0], bins=(edges, edges))[0]
+    else:
+        light = {
+            "cat's eye": (r < 1) & (np.hypot(x - 0.7 * radius, y) < radius),
+            "mirror": (r < 1) & (r > 0.45),
+            "rim": (r < 1) * (1 + 2.0 * r**6),
+        }[kind]
+    kernel = np.asarray(light, dtype=np.float64).reshape(size, fine, size, fine).mean((1, 3))
+    return kernel / kernel.sum()
+
+
+def through(kernel: np.ndarray, camera: Simulator, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Sharp and defocused picture of a dot through a kernel `[k, k]`."""
+    rng = np.random.default_rng(seed)
+    still = camera.level * draw_dot(camera.size, camera.dot_radius)
+    moved = camera.level * draw_dot(camera.size, camera.dot_radius * camera.magnification, camera.shift)
+    return camera.record(still, rng), camera.record(fftconvolve(moved, kernel, mode="same"), rng)
+
+
 def blur(picture: np.ndarray, family: str, params: dict) -> np.ndarray:
-    """The picture convolved with a kernel of `torchdof.optics.psf`."""
+    """The picture convolved with a kernel of `torchdof.optics.psf`, or with a `shape`."""
+    if family == "hexagon":
+        return fftconvolve(picture, shape(family, **params), mode="same")
     kernel = pixel_kernels(family, {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items()}).numpy()
     return fftconvolve(picture, kernel, mode="same")
 

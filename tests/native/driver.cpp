@@ -1,4 +1,4 @@
-// Renders random scenes through the C interface, for the sanitizers: `make sanitize`.
+// Renders random scenes, and repairs the edges of their depth, through the C interface, for the sanitizers: `make sanitize`.
 //
 // Each scene is rendered by one thread first. Then several callers at once, each with threads of its own, must get the
 // same bits, and one that is cancelled must come back. What a picture should look like is for the tests in Python.
@@ -190,13 +190,41 @@ void check(unsigned seed) {
   for (std::thread &caller : callers) caller.join();
 }
 
+// Depth edges of a scene, steps and ramps: by any number of threads the same.
+void check_edges(unsigned seed) {
+  const Scene made(seed);
+  const torchdof_scene &scene = made.scene;
+  const size_t pixels = size_t(scene.height) * scene.width;
+  std::vector<float> nearness = made.coc[0];
+  for (size_t i = 0; seed % 2 && i + 2 < pixels; i++) nearness[i] = (made.coc[0][i] + made.coc[0][i + 1] + made.coc[0][i + 2]) / 3;
+  std::vector<float> steps(pixels, 0.5f), alone(pixels);
+  const auto repair = [&](int threads, std::vector<float> &out) {
+    const int32_t never = 0;
+    const torchdof_map map = {scene.height, scene.width, scene.channels, made.light[0].data(), nearness.data(),
+                              seed % 3 ? nullptr : steps.data(), 1.0f, int(seed) % 5 == 0, threads, &never, out.data()};
+    if (torchdof_repair_edges(&map) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
+  };
+  repair(1, alone);
+  std::vector<std::thread> callers;
+  for (int threads : {2, 5})
+    callers.emplace_back([&, threads] {
+      std::vector<float> out(pixels);
+      repair(threads, out);
+      if (!same_bits(alone, out)) fail("the number of threads changes its edges", int(seed));
+    });
+  for (std::thread &caller : callers) caller.join();
+}
+
 }  // namespace
 
 int main(int count, char **arguments) {
   const int scenes = count > 1 ? std::atoi(arguments[1]) : 24;
   for (const char *instructions : {"baseline", "avx2"}) {
     if (!torchdof_use(instructions)) continue;
-    for (int seed = 0; seed < scenes; seed++) check(unsigned(seed));
+    for (int seed = 0; seed < scenes; seed++) {
+      check(unsigned(seed));
+      check_edges(unsigned(seed));
+    }
     std::printf("driver: %d scenes, %s\n", scenes, instructions);
   }
 }

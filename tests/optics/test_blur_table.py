@@ -139,10 +139,17 @@ def test_kernels_are_one_pixel_in_focus_and_move_light_with_the_square_of_the_co
 
 def test_a_blur_that_a_table_has_in_focus_fades_in_with_the_square_of_the_coc() -> None:
     table = BlurTable("gaussian", [0.0, 1.0], {"sigma": [0.8, 0.8]})
-    kernels = table.kernels(torch.tensor([0.0, 0.1, 0.5, 1.0], dtype=torch.float64), 100, size=9)
+    kernels = table.kernels(torch.tensor([0.0, 0.1, 0.2, 0.5], dtype=torch.float64), 100, size=9)
     moved = 1.0 - kernels[:, 0, 4, 4]
-    assert_close(moved, moved[3] * torch.tensor([0.0, 0.01, 0.25, 1.0], dtype=torch.float64), rtol=1e-12, atol=1e-12)
+    assert_close(moved[:3], torch.tensor([0.0, 0.04, 0.16], dtype=torch.float64), rtol=1e-12, atol=1e-12)
     assert_close(kernels[3, 0], psf.gaussian(0.8, size=9))
+
+
+def test_a_small_blur_in_focus_is_all_there_at_a_small_coc() -> None:
+    table = BlurTable("gaussian", [0.0, 1.0], {"sigma": [[0.05, 0.05], [0.8, 0.8]]})
+    kernels = table.kernels(torch.tensor([0.07], dtype=torch.float64), 100, size=9)[0]
+    assert_close(kernels[0], psf.gaussian(0.05, size=9))
+    assert float(kernels[1, 4, 4]) > 0.9  # each colour by its own
 
 
 @pytest.mark.parametrize("name", ["disc", "gaussian", "sato_j15"])

@@ -38,8 +38,11 @@ def fit(
         "table.json"
     ),
     family: Annotated[
-        Literal["auto", "gaussian", "ring", "disc", "softm", "radial"],
-        typer.Option(help="Kernel family; auto takes the cheapest that is accurate enough.", rich_help_panel=_CAPTURE),
+        Literal["auto", "gaussian", "ring", "disc", "softm", "radial", "polygon", "image"],
+        typer.Option(
+            help="Kernel family; auto takes the cheapest that is accurate enough, image any shape.",
+            rich_help_panel=_CAPTURE,
+        ),
     ] = "auto",
     accuracy_db: Annotated[
         float, typer.Option(help="PSNR on a natural image that auto asks for.", rich_help_panel=_CAPTURE)
@@ -72,7 +75,10 @@ def fit(
     ] = None,
     f_number: Annotated[float, typer.Option(help="Aperture of the lens.", rich_help_panel=_LENS)] = 2.0,
     focus_m: Annotated[float, typer.Option(help="Focus distance in metres; inf allowed.", rich_help_panel=_LENS)] = 2.0,
-    nodes: Annotated[int, typer.Option(help="Distances traced.", rich_help_panel=_LENS)] = 33,
+    nodes: Annotated[
+        int | None,
+        typer.Option(help="Distances traced; by default as many as keep pictures to 50 dB.", rich_help_panel=_LENS),
+    ] = None,
     field_deg: Annotated[
         float, typer.Option(help="Angle from the axis, degrees: 0 is the frame's centre.", rich_help_panel=_LENS)
     ] = 0.0,
@@ -163,7 +169,7 @@ def _trace(
     source: str,
     f_number: float,
     focus_m: float,
-    nodes: int,
+    nodes: int | None,
     field_deg: float,
     wavelengths: str | None,
     console: Console,
@@ -180,7 +186,7 @@ def _trace(
         raise FitError(f"--field-deg must be 0 to 90 degrees from the axis, got {field_deg:g}")
     focal = lens.paraxial().focal_length
     image_mm = focal if math.isinf(focus_m) else focal / (1 - focal / 1000 / focus_m)
-    with console.status(f"tracing {nodes} distances"):
+    with console.status("tracing the lens"):
         return trace_table(
             lens,
             f_number=f_number,

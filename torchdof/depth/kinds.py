@@ -69,7 +69,7 @@ def depth_from_values(
     for factor in (scale, offset):
         if isinstance(factor, bool) or not isinstance(factor, int | float) or not abs(factor) < 1e300 or scale == 0.0:
             got = f"got scale {show(scale)} and offset {show(offset)}"
-            raise ValueError(f"scale must be finite and not 0, offset finite, {got}")
+            raise ValueError(f"scale (--depth-scale) must be finite and not 0, offset (--depth-offset) finite, {got}")
     if unknown is not None and not math.isnan(unknown if isinstance(unknown, float) else 0.0):
         unknown = number("unknown", unknown, infinite=True)
     value = values.double()

@@ -127,8 +127,8 @@ def coc_doubts(coc_px: Tensor) -> list[Doubt]:
     if not size.numel() or _share_at(size, 0.99) <= _LARGEST_WIDTHS * width:
         return []
     message = (
-        f"a blur radius of {float(size.max()):.0f} px on an image of {width} px is more than a lens makes; are these "
-        "depths and no circles of confusion? (--depth-kind)"
+        f"a blur radius of {_pixels(float(size.max()))} px on an image of {width} px is more than a lens makes; are "
+        "these depths and no circles of confusion? (--depth-kind)"
     )
     return [Doubt("blur", message)]
 
@@ -204,12 +204,16 @@ def _out_of_focus(
     return f"the focus at {focus_m:.4g} m is {side} than all depth {extent}; {'; '.join(hints)}"
 
 
+def _pixels(count: float) -> str:
+    return f"{count:.0f}" if count < 1e6 else f"{count:.1e}"
+
+
 def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Camera) -> str:
     """What to say of blur that no lens makes."""
     hand = "all depth lies within a hand's breadth" if far < _HAND_M else "the depth"
     return (
-        f"a blur radius of {largest:.0f} px on an image of {width} px is more than a lens makes: {hand} {extent}, the "
-        f"focus {float(camera.focus_m):.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
+        f"a blur radius of {_pixels(largest)} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
+        f"the focus {float(camera.focus_m):.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
         f"(f/{float(camera.f_number):.2g}); which is in another unit? --depth-scale, --focus-m and --aperture-radius-m "
         "make or take metres"
     )

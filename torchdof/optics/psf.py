@@ -207,20 +207,18 @@ def pixel_kernels(
         ValueError: If the family, a parameter or the size is not as described.
     """
     checked = _checked(family, params)
-    if window is None:
-        whole = part = width_of(family, checked, size, aperture) // 2
-    else:
-        reach_px = support(family, checked, aperture)
-        whole = half_width(reach_px) if size is None else width_of(family, checked, size) // 2
-        part = min(whole, width_of(family, checked, window) // 2)
+    reach_px = _support(family, checked, aperture)
+    whole = half_width(reach_px) if size is None and window is not None else width_of(size, reach_px) // 2
+    part = whole if window is None else min(whole, width_of(window, reach_px) // 2)
     half = whole if whole <= _ALWAYS_WHOLE else part
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in checked.items()}
     reach = _reach(family, lengths, aperture)
-    squeeze = 1.0 if aperture is None else aperture.squeeze
-    high, wide = (reach / _CELLS).clamp(max=1.0), (reach / squeeze / _CELLS).clamp(max=1.0)  # of a cell, in pixels
+    high = wide = (reach / _CELLS).clamp(max=1.0)  # of a cell, in pixels
+    if aperture is not None:
+        wide = (reach / aperture.squeeze / _CELLS).clamp(max=1.0)
     in_cells = {k: v / high if k in LENGTHS else v for k, v in lengths.items()}
-    aspect = None if aperture is None else wide * squeeze / high  # of a cell, as seen from a lens that is round
-    farthest = math.ceil(min(support(family, lengths, aperture), half + _AROUND))  # px, which are cells if many
+    aspect = None if aperture is None else wide * aperture.squeeze / high  # of a cell, seen from a round lens
+    farthest = math.ceil(min(_support(family, lengths, aperture), half + _AROUND))  # px, which are cells if many
     cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, whole, aperture, aspect))
     kernel = _settled(_interpolated(cells, high, wide, half + _AROUND))[..., _AROUND:-_AROUND, _AROUND:-_AROUND]
     if half == whole:
@@ -270,18 +268,22 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
 
 def support(family: str, params: Mapping[str, Number], aperture: Aperture | None = None) -> float:
     """Radius in pixels beyond which a kernel holds less than 4e-6 of its light (for the largest parameters given)."""
-    reach = float(_reach(family, _checked(family, params), aperture).detach().max())
+    return _support(family, _checked(family, params), aperture)
+
+
+def _support(family: str, checked: Mapping[str, Tensor], aperture: Aperture | None) -> float:
+    reach = float(_reach(family, checked, aperture).detach().max())
     return reach if aperture is None else reach * aperture.widest
 
 
-def width_of(family: str, params: Mapping[str, Number], size: int | None, aperture: Aperture | None = None) -> int:
-    """Width in pixels of kernels: ``size`` if that is one, else the smallest that holds the largest kernel.
+def width_of(size: int | None, reach_px: float) -> int:
+    """Width in pixels of kernels: ``size`` if that is one, else the smallest that holds a PSF of radius ``reach_px``.
 
     Raises:
         ValueError: If the size is not odd and positive, or the kernel would be too wide.
     """
     if size is None:
-        size = 2 * half_width(support(family, params, aperture)) + 1
+        size = 2 * half_width(reach_px) + 1
         if size > _LARGEST:
             raise ValueError(
                 f"a kernel must be at most {_LARGEST} pixels wide, got parameters that need {size}; state its size"
@@ -421,13 +423,13 @@ def _interpolated(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tenso
         return functional.pad(cells, (half - n,) * 4)
     pixel = torch.arange(-half, half + 1, dtype=torch.float64, device=cells.device)[:, None]
     splines, lines = [], []
-    for cell in (high, wide):
+    for cell in (high,) if wide is high else (high, wide):
         place = cell[..., None, None] * torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
         away = (pixel - place).abs()  # [..., pixels, cells]
         splines.append(_cardinal_spline(away))
         lines.append((1.0 - away).clamp_min(0.0))
-    at_most = 2.0 * (lines[0] @ cells @ lines[1].transpose(-2, -1)).clamp_min(0.0)
-    return torch.minimum(splines[0] @ cells @ splines[1].transpose(-2, -1), at_most)
+    at_most = 2.0 * (lines[0] @ cells @ lines[-1].transpose(-2, -1)).clamp_min(0.0)
+    return torch.minimum(splines[0] @ cells @ splines[-1].transpose(-2, -1), at_most)
 
 
 def _cardinal_spline(t: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Layers, far to near, to one image: each is scattered with its kernel and composited with what is behind it."""
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -19,6 +19,9 @@ __all__ = ["Scatter", "accumulate", "accumulate_once", "over"]
 
 Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
+
+Picture = tuple[Tensor, Tensor]
+"""Light ``[B, C, h, w]`` and what it is to be weighed with, of one channel or C; ``[B, C, n, h, w]`` of n layers."""
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 _KNOWN = 0.002  # share of scattered weight from which on a layer is known in full
@@ -46,18 +49,18 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
 
     # Beside light goes the share 1 - a that is left of what is behind, in sums of what is positive: behind bright light
     # the rounding of a difference would show. Where nothing is behind, a itself: what is divided by it in the end.
-    def normalised(layer: Tensor) -> Tensor:
-        light, weight, beyond = layer.tensor_split((colours, (colours + layer.shape[1]) // 2), 1)
+    def normalised(layers: Tensor) -> Picture:
+        light, weight, beyond = layers.tensor_split((colours, (colours + layers.shape[1]) // 2), 1)
         lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
         beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
         known = weight + beyond
-        return torch.cat([light / known, (beyond if backed else weight) / known], 1)
+        return light / known, (beyond if backed else weight) / known
 
-    def composited(front: Tensor, behind: Tensor) -> Tensor:
-        (light, share), (light_behind, share_behind) = (t.tensor_split((colours,), 1) for t in (front, behind))
+    def composited(front: Picture, behind: Picture) -> Picture:
+        (light, share), (light_behind, share_behind) = front, behind
         left = share if backed else (1.0 - share).clamp_min(0.0)
         share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
-        return torch.cat([torch.addcmul(light, left, light_behind), share], 1)
+        return torch.addcmul(light, left, light_behind), share
 
     picture = _composite_layers(frame, blurs, scatter, composited, 1.0 if backed else 0.0, normalised)
     light, left = picture.tensor_split((colours,), 1)
@@ -76,7 +79,11 @@ def accumulate(
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
     """
-    summed = _composite_layers(frame, blurs, scatter, torch.add)[..., : frame.size[0], : frame.size[1]]
+
+    def added(front: Picture, behind: Picture) -> Picture:
+        return front[0] + behind[0], front[1] + behind[1]
+
+    summed = _composite_layers(frame, blurs, scatter, added)[..., : frame.size[0], : frame.size[1]]
     if highlights is not None:
         light, weight = summed.tensor_split((frame.colours,), 1)
         summed = torch.cat([light + highlights, weight], 1)
@@ -93,7 +100,7 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Ten
         accumulate.
     """
     halo = frame.margin
-    weights = torch.cat([frame.layer(k, halo, visibility=True)[1] for k in range(len(blurs))], 1)
+    weights = frame.layers(0, len(blurs), halo)[1][:, 0]
     kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
     light = frame.surfaces[0].light
     each = kernels.shape[1]
@@ -107,71 +114,80 @@ def _composite_layers(
     frame: Frame,
     blurs: Sequence[Blur],
     scatter: Scatter,
-    composited: Callable[[Tensor, Tensor], Tensor],
+    composited: Callable[[Picture, Picture], Picture],
     empty: float = 0.0,
-    normalised: Callable[[Tensor], Tensor] | None = None,
+    normalised: Callable[[Tensor], Picture] | None = None,
 ) -> Tensor:
     """All layers, far to near: light ``[B, C, h, w]`` and, after it, what it is to be weighed with.
 
     The weights have one channel, or C where each colour has a kernel of its own, and are ``empty`` where there is no
     layer. ``composited`` puts what is in front and what is behind it together; ``normalised`` makes light and weights
-    of a layer's scattered terms, which without it are just that.
+    of scattered layers, which without it are just that.
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
-    light = frame.surfaces[0].light
+    light, colours = frame.surfaces[0].light, frame.colours
     each = blurs[0].kernel.shape[0]
 
     def blank(height: int, width: int) -> Tensor:
-        none = light.new_zeros(light.shape[0], frame.colours, height, width)
+        none = light.new_zeros(light.shape[0], colours, height, width)
         return torch.cat([none, light.new_full((light.shape[0], each, height, width), empty)], 1)
+
+    def parts(values: Tensor) -> Picture:
+        light, weight = values.tensor_split((colours,), 1)
+        return light, weight
 
     picture = blank(*frame.area)
 
     # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
     # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
     uniform = each == 1 and blurs[0].shares is None
-    most = CHANNELS // (frame.colours + (2 if normalised else 1)) if uniform else 1
+    most = CHANNELS // (colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
-        groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and frame.nodes[k] < 0), [[]])
-        widths = [blurs[j].kernel.shape[-1] for j in [*groups[-1], k]]
-        if len(widths) > max(most, 1) or max(widths) ** 2 > 2 * min(widths) ** 2:
-            groups.append([])
-        groups[-1].append(k)
+        groups = runs.setdefault((blurs[k].scale, blurs[k].scale > 1 and frame.nodes[k] < 0), [])
+        group = groups[-1] if groups else []
+        widths = [blurs[j].kernel.shape[-1] for j in [*group, k]]
+        if group and group[-1] == k + 1 and len(group) < most and max(widths) ** 2 <= 2 * min(widths) ** 2:
+            group.append(k)
+        else:
+            groups.append([k])
     for (scale, _), groups in runs.items():
         part = picture
         if scale > 1:  # one pixel more on each side, to interpolate from
             part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
-            behind = part
-            for layer in _scattered(frame, blurs, scatter, group, normalised is not None):
-                part = composited(layer if normalised is None else normalised(layer), part)
-            part = where_needed(_needed(frame, blurs, group), part, behind)
+            layers = _scattered(frame, blurs, scatter, group, normalised is not None)
+            light, weight = parts(layers) if normalised is None else normalised(layers)
+            front = parts(part)
+            for i in reversed(range(len(group))):
+                front = composited((light[:, :, i], weight[:, :, i]), front)
+            part = where_needed(_needed(frame, blurs, group), torch.cat(front, 1), part)
         if scale > 1:
             fine = upsampled(part, scale)
             fine = fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
             needed = _needed(frame, blurs, [k for group in groups for k in group])
-            part = where_needed(needed, composited(fine, picture), picture)
+            part = where_needed(needed, torch.cat(composited(parts(fine), parts(picture)), 1), picture)
         picture = part
     return picture
 
 
-def _scattered(
-    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
-) -> Iterator[Tensor]:
-    """Scattered terms of the layers of a group; each has C channels where each colour has a kernel of its own."""
+def _scattered(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool) -> Tensor:
+    """Scattered layers of a group, near to far: light, weight and, with visibility, the weight behind.
+
+    They are ``[B, C + 1 + 1, n, h, w]``, or ``[B, 3 C, n, h, w]`` where each colour has a kernel of its own.
+    """
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
-    layers = [frame.layer(k, halo, visibility) for k in group]
-    terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1) for terms in layers for term in terms], 1)
-    terms, channels = downsampled(terms, blurs[group[0]].scale), terms.shape[1] // len(group)
+    layers = frame.layers(min(group), len(group), halo)
+    terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1, -1) for term in layers[: 2 + visibility]], 1)
+    terms, kinds = downsampled(terms.flatten(1, 2), blurs[group[0]].scale), terms.shape[1]
     kernels, shares = blurs[group[0]].kernel, blurs[group[0]].shares
     if shares is not None:
-        yield field.scattered(shares, terms, kernels, half, blurs[group[0]].scale, frame.size)
-        return
+        scattered = field.scattered(shares, terms, kernels, half, blurs[group[0]].scale, frame.size)
+        return scattered.unflatten(1, (kinds, len(group)))
     if len(group) > 1 or each > 1:
-        padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in group]
-        kernels = torch.cat([kernel.repeat(channels // each, 1, 1) for kernel in padded])
-    yield from scatter(terms, kernels, half).split(channels, 1)
+        padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in sorted(group)]
+        kernels = torch.cat(padded).repeat(kinds // each, 1, 1)
+    return scatter(terms, kernels, half).unflatten(1, (kinds, len(group)))
 
 
 def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[[], Tensor]:

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["blur_axis", "eased", "from_blur_axis", "weight_at_or_behind"]
+__all__ = ["blur_axis", "eased", "from_blur_axis", "ramps", "weights_at_or_behind"]
 
 _SQUARE_PX = 0.5  # coc around which the axis goes over from the square to the coc itself
 _IN_FOCUS = 2e-4  # where focus ends: a coc of 0.01 px
@@ -42,19 +42,27 @@ def from_blur_axis(x: float) -> float:
     return 0.0 if x == 0 else math.copysign(beyond + math.sqrt(beyond * (beyond + 2.0 * _SQUARE_PX)), x)
 
 
-def weight_at_or_behind(x: Tensor, nodes: Sequence[float], k: int) -> Tensor:
-    """How much of each pixel, 0 to 1, lies in layer ``k`` or behind it: ``M_k`` of the composite.
+def ramps(nodes: Sequence[float], like: Tensor) -> Tensor:
+    """Where the ramps of layers begin and how wide they are, ``[2, n + 1]``, as the second argument of the next.
 
     Args:
-        x: Places on the blur axis, any shape; those beyond the outermost nodes belong to these.
-        nodes: Places of the layers, strictly increasing: near to far.
-        k: Layer, 0 to ``len(nodes)``, which is behind everything.
+        nodes: Places of the layers, strictly increasing: near to far. Everything is at or behind the first, nothing
+            behind the last.
+        like: Its dtype and device are taken.
     """
-    if k == 0:
-        return torch.ones_like(x)
-    if k == len(nodes):
-        return torch.zeros_like(x)
-    return ((x - nodes[k - 1]) / (nodes[k] - nodes[k - 1])).clamp(0.0, 1.0)
+    widths = [1.0, *(high - low for low, high in zip(nodes, nodes[1:], strict=False)), 1.0]
+    return like.new_tensor([[-math.inf, *nodes[:-1], math.inf], widths])
+
+
+def weights_at_or_behind(x: Tensor, ramps: Tensor) -> Tensor:
+    """How much of each pixel, 0 to 1, lies in layers or behind them, ``M_k`` of the composite: ``[B, n, H, W]``.
+
+    Args:
+        x: Places on the blur axis ``[B, 1, H, W]``; those beyond the outermost nodes belong to these.
+        ramps: Some of those that :func:`ramps` gives, ``[2, n]``.
+    """
+    start, width = ramps[..., None, None]
+    return ((x - start) / width).clamp(0.0, 1.0)
 
 
 def eased(weight: Tensor) -> Tensor:

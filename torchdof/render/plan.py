@@ -15,7 +15,7 @@ from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .field import Shares, layer_shares, own_kernels
-from .layer_weights import blur_axis, from_blur_axis, weight_at_or_behind
+from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
@@ -23,6 +23,7 @@ KERNELS_PER_PX = 32  # of radius, for highlights
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
 _LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
 _SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
+_FARTHEST_PX = 1e9  # of a layer; frames are smaller
 _kernels = KernelCache(256 * 2**20)
 
 
@@ -72,9 +73,11 @@ class Plan:
         if is_traced():  # its numbers are not to be looked at
             return
         nodes = self.nodes
-        plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in nodes)
+        plain = isinstance(nodes, tuple) and all(isinstance(x, int | float) and abs(x) < _FARTHEST_PX for x in nodes)
         if not plain or not nodes or any(low >= high for low, high in zip(nodes, nodes[1:], strict=False)):
-            raise ValueError(f"plan must hold layers as a tuple of strictly increasing numbers, got {show(nodes)}")
+            raise ValueError(
+                f"plan must hold layers as a tuple of strictly increasing numbers below 1e9 px, got {show(nodes)}"
+            )
         if isinstance(self.tolerance, str):  # names are for those who call a rendering
             raise ValueError(f"tolerance of a plan must be a number in [0, 1), such as 1/255, got {self.tolerance!r}")
         tolerance_of(self.tolerance)
@@ -145,7 +148,8 @@ class Plan:
     def of_pixels(self, coc_px: Tensor) -> "Plan":
         """The same plan, told which share of a scene's pixels each layer carries: ``[B, 1, H, W]``."""
         x = layer_cocs.on_axis(coc_px.detach(), max(coc_px.shape[-2:])).clamp(self.nodes[0], self.nodes[-1])
-        behind = [float(weight_at_or_behind(x, self.nodes, k).double().mean()) for k in range(len(self.nodes) + 1)]
+        ends = ramps(self.nodes, x).split(1, 1)  # one at a time, for a frame may be large
+        behind = [float(weights_at_or_behind(x, end).double().mean()) for end in ends]
         pixels = tuple(behind[k] - behind[k + 1] for k in range(len(self.nodes)))
         return dataclasses.replace(self, pixels=pixels)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..validation import is_traced
 from .border import continued
 from .disocclusion import behind_pixels, behind_size, fill_hidden
-from .layer_weights import blur_axis, eased, weight_at_or_behind
+from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 from .matting import emitters_behind, matte
 from .plan import Blur
 
@@ -48,6 +48,7 @@ class Frame:
     Args:
         surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area.
         nodes: Places of the layers on the blur axis, near to far.
+        ramps: Of these, as :func:`torchdof.render.layer_weights.ramps` gives them.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
         margin: Pixels on each side, as many as the widest kernel reaches.
         area: Height and width, continued to whole blocks of the coarsest layer.
@@ -59,6 +60,7 @@ class Frame:
 
     surfaces: Sequence[Placed]
     nodes: Sequence[float]
+    ramps: Tensor
     behind: Tensor | None
     margin: int
     area: tuple[int, int]
@@ -92,26 +94,28 @@ class Frame:
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         return torch.stack([(self.cut(s.x, halo) - middle).abs().min() for s in self.surfaces]).min() < half
 
-    def layer(self, k: int, halo: int, visibility: bool) -> list[Tensor]:
-        """What layer k scatters, with so many pixels beyond the area: light ``m_k I`` and its weight ``m_k``.
+    def layers(self, first: int, count: int, halo: int) -> tuple[Tensor, Tensor, Tensor]:
+        """What layers that follow each other scatter, with so many pixels beyond the area.
 
-        With visibility ``M_k - m_k`` as well, the weight behind the layer.
+        It is their light ``m_k I``, ``[B, C, n, h, w]``, its weight ``m_k`` and the weight behind them ``M_k - m_k``,
+        ``[B, 1, n, h, w]``.
         """
         surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
-        ramps = [[weight_at_or_behind(s.x, self.nodes, i) for i in (k, k + 1)] for s in surfaces]
+        weights = [weights_at_or_behind(s.x, self.ramps[:, first : first + count + 1]) for s in surfaces]
         if self.occlusion:
-            ramps = [[eased(ramp) for ramp in pair] for pair in ramps]
-        light, weight, beyond = (_stacked if self.stacked else _mixed)(surfaces, ramps)
-        return [light, weight, beyond] if visibility else [light, weight]
+            weights = [eased(weight) for weight in weights]
+        pairs = [(weight[:, None, :-1], weight[:, None, 1:]) for weight in weights]
+        surfaces = [Placed(*(t.unsqueeze(2) for t in s if t is not None)) for s in surfaces]
+        return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
 
-def _mixed(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of surfaces that share their pixels: each is a sum over them.
 
-    Ramps are how much of each surface lies at or behind layer k, and behind it.
+    Pairs are how much of each surface lies at or behind layers k, and behind them, ``[B, 1, n, h, w]``.
     """
     sums: list[Tensor] = []
-    for (light, _, cover), (behind, beyond) in zip(surfaces, ramps, strict=True):
+    for (light, _, cover), (behind, beyond) in zip(surfaces, pairs, strict=True):
         own = behind - beyond
         if cover is not None:
             beyond, own = beyond * cover, own * cover
@@ -120,7 +124,7 @@ def _mixed(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> tup
     return sums[0], sums[1], sums[2]
 
 
-def _stacked(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+def _stacked(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """The same of surfaces that cover a pixel independently, near to far.
 
     A pixel counts for layer k as far as what is at or behind it is known, but for what that has in front. A surface of
@@ -129,7 +133,7 @@ def _stacked(surfaces: Sequence[Placed], ramps: Sequence[Sequence[Tensor]]) -> t
     visible = torch.ones_like(surfaces[0].x)
     arriving = unknown = visible
     stopped = []
-    for (_, x, weight), (behind, beyond) in zip(surfaces, ramps, strict=True):
+    for (_, x, weight), (behind, beyond) in zip(surfaces, pairs, strict=True):
         cover = torch.ones_like(x) if weight is None else weight
         here = cover * eased((behind / _HAIR).clamp(max=1.0))
         passes = 1.0 - here * (1.0 - behind)  # what layers in front leave
@@ -180,7 +184,7 @@ def framed(
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
     if behind is not None:
         behind = functional.pad(behind_pixels(behind, size), beyond, mode="replicate")
-    return Frame(placed, nodes, behind, margin, (height, width), size, occlusion, stacked)
+    return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)
 
 
 def surfaces_of_image(

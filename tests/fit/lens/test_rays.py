@@ -115,6 +115,77 @@ def test_rays_that_miss_or_are_clipped_end_without_warnings() -> None:
     assert trace_rays(small, position, forward, clip=False).alive[0]
 
 
+def shaped(radius: float, index: float, conic: float = 0.0, polynomial: tuple[float, ...] = ()) -> Lens:
+    """A surface of glass behind a wide stop, and a sphere of glass that ends behind it where light has its focus."""
+    wide = np.full(2, 1e3)
+    return Lens(
+        np.array([math.inf, radius]), np.array([30.0, 0.0]), np.array([index, 1.0]), np.full(2, math.inf), wide, stop=0,
+        conic=np.array([0.0, conic]), polynomial=np.array([[0.0] * len(polynomial), polynomial]),
+    )  # fmt: skip
+
+
+def test_hyperboloid_focuses_a_beam_in_one_point() -> None:
+    # Descartes: glass ends in a hyperboloid of conic constant -n^2; the focus lies at R / (1 - n), for any height
+    n, radius = 1.5, -20.0
+    height = np.linspace(-15.0, 15.0, 31)
+    position = np.stack([0.3 * height, height, np.full_like(height, -3.0)])
+    forward = np.tile([[0.0], [0.0], [1.0]], 31)
+    rays = trace_rays(shaped(radius, n, -n * n), position, forward)
+    assert rays.alive.all()
+    np.testing.assert_allclose(rays.at(30.0 + radius / (1 - n)), 0.0, atol=1e-10)
+    assert np.abs(rays.at(29.0 + radius / (1 - n))[1]).max() > 0.1
+
+
+def test_polynomial_asphere_is_the_conic_whose_series_it_is() -> None:
+    # sag of a sphere: c r^2 / 2 + c^3 r^4 / 8 + c^5 r^6 / 16 + 5 c^7 r^8 / 128 + 7 c^9 r^10 / 256 + ...
+    c = -1 / 60.0
+    series = tuple(factor * c**power for factor, power in ((1 / 2, 1), (1 / 8, 3), (1 / 16, 5), (5 / 128, 7)))
+    position, direction = beam(reach=5.0, tilt=0.2)
+    made = trace_rays(shaped(math.inf, 1.5, 0.0, series), position, direction)
+    sphere = trace_rays(shaped(-60.0, 1.5), position, direction)
+    assert made.alive.all()
+    np.testing.assert_allclose(made.position, sphere.position, atol=1e-7)
+    np.testing.assert_allclose(made.direction, sphere.direction, atol=1e-8)
+
+
+def test_snell_holds_at_an_asphere() -> None:
+    lens = shaped(-30.0, 1.6, -0.7, (0.0, 2e-5, -1e-7))
+    position, direction = beam()
+    rays = trace_rays(lens, position, direction)
+    at, shape = rays.position - np.array([[0.0], [0.0], [30.0]]), lens.shape(1)
+    height, slope = shape.sag(at[0] ** 2 + at[1] ** 2)
+    np.testing.assert_allclose(at[2], height, atol=1e-10)
+    step = 1e-4  # the slope is the sag's own
+    np.testing.assert_allclose(
+        slope, (shape.sag(at[0] ** 2 + at[1] ** 2 + step)[0] - shape.sag(at[0] ** 2 + at[1] ** 2 - step)[0]) / 2 / step,
+        atol=1e-8,
+    )  # fmt: skip
+    normal = np.stack([-2 * slope * at[0], -2 * slope * at[1], np.ones_like(slope)])
+    u, v = direction[:2] / 1.6  # behind the flat front
+    inside = np.stack([u, v, np.sqrt(1 - u * u - v * v)])
+    change = np.cross(1.6 * inside - rays.direction, normal, axis=0)
+    np.testing.assert_allclose(change[:, rays.alive], 0.0, atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(rays.direction, axis=0)[rays.alive], 1.0, atol=1e-12)
+
+
+def test_rays_beyond_the_rim_of_a_conic_end() -> None:
+    height = np.array([5.0, 9.9, 10.1, 40.0, 1e6])
+    position = np.stack([np.zeros(5), height, np.full(5, -1.0)])
+    forward = np.tile([[0.0], [0.0], [1.0]], 5)
+    for conic, polynomial in ((0.0, (0.0, 1e-7)), (0.0, ())):
+        lens = shaped(-10.0, 1.0, conic, polynomial)
+        assert trace_rays(lens, position, forward).alive.tolist() == [True, True, False, False, False]
+
+
+def test_rays_that_meet_surfaces_out_of_order_end() -> None:
+    # a lens whose surfaces cross at a height of 6 mm: beyond, there is no glass between them
+    lens = surfaces([math.inf, 20.0, -20.0], [1.0, 2 * (20.0 - math.sqrt(400.0 - 36.0)), 0.0], [1.0, 1.5, 1.0])
+    height = np.array([0.0, 5.9, 6.1, 8.0])
+    position = np.stack([np.zeros(4), height, np.full(4, -1.0)])
+    rays = trace_rays(lens, position, np.tile([[0.0], [0.0], [1.0]], 4))
+    assert rays.alive.tolist() == [True, True, False, False]
+
+
 def test_wrong_shapes_are_refused() -> None:
     lens = Lens.read("wide_22mm")
     for position, direction in ((np.zeros(3), np.zeros(3)), (np.zeros((3, 2)), np.zeros((3, 1)))):

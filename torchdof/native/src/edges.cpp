@@ -1,4 +1,7 @@
 // Depth edges: what torchdof/depth/edges.py states, compiled. Names and constants are that file's.
+//
+// Work is done part by part of the frame, and in a part only as far as there may be edges. Each part is copied with what
+// is around it, which beyond the frame goes on as it is at the border, so that loops run in whole vectors.
 #include <algorithm>
 #include <cmath>
 #include <vector>
@@ -13,95 +16,137 @@ namespace {
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
 constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f;
-constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9;
-constexpr int AREA = 64;
-constexpr int HALO = 21, STEP_HALO = RINGS + REACH;  // what a pixel shows depends on what is so far around it; without ramps
+constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+constexpr int AREA = 64, FLAT_REACH = 8;
+// What a pixel shows depends on what is so far around it; without ramps, and with them.
+constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
 constexpr float NONE = 1e30f;
 constexpr float LARGEST = 3.402823466e38f;
-constexpr int FLAT_REACH = 8, PLANES = 7 + 3 + 3 * RINGS;
-constexpr int SIDE = 2 * REACH + 1, WINDOW = SIDE * SIDE, ROOM = (WINDOW + LANES - 1) / LANES * LANES;
+constexpr int SIDE = 2 * REACH + 1, ACROSS = (SIDE + LANES - 1) / LANES * LANES;  // of a window, and in whole vectors
 
-// A part of the frame and its surroundings, as far as the frame goes.
+constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8;  // marks of a pixel; NEAR: it shows the near surface
+
+// A part of the frame, and what is around it, even beyond the frame.
 struct Part {
   int y0, x0, height, width;
+
+  int bottom() const { return y0 + height; }
+  int right() const { return x0 + width; }
+  Part grown(int by) const { return {y0 - by, x0 - by, height + 2 * by, width + 2 * by}; }
 };
 
-using Plane = std::vector<float>;
-
-// Each value becomes the larger of two; where `from` overlaps `to` it lies behind it.
-void raise(float *to, const float *from, int count) {
-  int x = 0;
-  for (; x + LANES <= count; x += LANES) store(to + x, most(load<vec>(to + x), load<vec>(from + x)));
-  for (; x < count; x++) to[x] = to[x] < from[x] ? from[x] : to[x];
-}
-
-// The largest of 2 reach + 1 values, in place: of 2, of 4, ... and of two such that overlap.
-template <typename Merge>
-void widen(int reach, const Merge &merge) {
-  int covered = 1;
-  for (; 2 * covered <= 2 * reach + 1; covered *= 2) merge(covered);
-  if (covered < 2 * reach + 1) merge(2 * reach + 1 - covered);
-}
-
-// The largest of a square around each value; rows: scratch of height + 2 reach times width + 2 reach.
-void highest(const float *in, float *out, float *rows, int height, int width, int reach) {
-  const int wide = width + 2 * reach;
-  std::fill(rows, rows + (size_t)reach * wide, -NONE);
-  std::fill(rows + (size_t)(height + reach) * wide, rows + (size_t)(height + 2 * reach) * wide, -NONE);
-  for (int y = 0; y < height; y++) {
-    float *to = rows + (size_t)(y + reach) * wide;
-    std::fill(to, to + reach, -NONE);
-    memcpy(to + reach, in + (size_t)y * width, width * sizeof(float));
-    std::fill(to + reach + width, to + wide, -NONE);
-    int length = wide;
-    widen(reach, [&](int by) {
-      length -= by;
-      raise(to, to + by, length);
-    });
+// Values of a part, by their place in the frame. Rows are longer than the part, by two vectors that hold something.
+class Grid : public Part {
+ public:
+  explicit Grid(const Part &part, int planes = 1)
+      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), data_(size * planes + LANES) {
+    std::fill(data_.data() + size * planes, data_.data() + size * planes + LANES, 0.0f);
   }
-  int count = height + 2 * reach;
-  widen(reach, [&](int by) {
-    count -= by;
-    for (int y = 0; y < count; y++) raise(rows + (size_t)y * wide, rows + (size_t)(y + by) * wide, width);
+  float *at(int y, int x) const { return data_.data() + (size_t)(y - y0) * pitch + (x - x0); }
+  void clear() const { std::fill(data_.data(), data_.data() + size, 0.0f); }
+
+  const int pitch;
+  const size_t size;  // of a plane
+
+ private:
+  Buffer<float> data_;
+};
+
+inline float sum(vec v) {
+  typedef float half __attribute__((vector_size(16)));
+  half parts[LANES / 4], total;
+  memcpy(parts, &v, sizeof(v));
+  total = parts[0];
+  for (int i = 1; i < LANES / 4; i++) total += parts[i];
+  return (total[0] + total[1]) + (total[2] + total[3]);
+}
+inline vec size_of(vec v) { return most(v, -v); }
+
+// Calls body(y, x) for each vector of a part; the last of a row goes beyond it.
+template <typename Body>
+inline void each_vector(const Part &part, const Body &body) {
+  for (int y = part.y0; y < part.bottom(); y++)
+    for (int x = part.x0; x < part.right(); x += LANES) body(y, x);
+}
+
+// The largest of a square around each value of a part.
+template <int REACH_>
+void highest(const Grid &in, const Grid &out, const Grid &rows, const Part &part) {
+  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) {
+    const float *from = in.at(y, x);
+    vec high = load<vec>(from);
+    for (int d = 1; d <= REACH_; d++) high = most(high, most(load<vec>(from - d), load<vec>(from + d)));
+    store(rows.at(y, x), high);
   });
-  for (int y = 0; y < height; y++) memcpy(out + (size_t)y * width, rows + (size_t)y * wide, width * sizeof(float));
+  each_vector(part, [&](int y, int x) {
+    const float *from = rows.at(y, x);
+    vec high = load<vec>(from);
+    for (int d = 1; d <= REACH_; d++) high = most(high, most(load<vec>(from - d * rows.pitch), load<vec>(from + d * rows.pitch)));
+    store(out.at(y, x), high);
+  });
 }
 
-// The mean of a square around each value, which goes on beyond the border as it is at it.
-void mean(const float *in, float *out, float *rows, int height, int width, int reach) {
-  const float share = 1.0f / (2 * reach + 1);
-  for (int y = 0; y < height; y++) {
-    const float *from = in + (size_t)y * width;
-    float *to = rows + (size_t)y * width;
-    const int first = std::min(reach, width), last = std::max(first, width - reach);
-    for (int x = 0; x < width; x++) to[x] = 0.0f;
-    for (int d = -reach; d <= reach; d++) {
-      for (int x = 0; x < first; x++) to[x] += from[std::min(std::max(x + d, 0), width - 1)];
-      for (int x = first; x < last; x++) to[x] += from[x + d];
-      for (int x = last; x < width; x++) to[x] += from[std::min(std::max(x + d, 0), width - 1)];
+// Around one vector of values, the largest of 3 x 3.
+inline vec highest_beside(const float *from, int pitch) {
+  vec high = most(load<vec>(from), most(load<vec>(from - 1), load<vec>(from + 1)));
+  for (const float *row : {from - pitch, from + pitch}) high = most(high, most(load<vec>(row), most(load<vec>(row - 1), load<vec>(row + 1))));
+  return high;
+}
+
+// The same of each value of a part.
+void highest_beside(const Grid &in, const Grid &out, const Part &part) {
+  for (int x = part.x0; x < part.right(); x += LANES) {
+    const auto row = [&](int y) {
+      const float *from = in.at(y, x);
+      return most(load<vec>(from), most(load<vec>(from - 1), load<vec>(from + 1)));
+    };
+    vec above = row(part.y0 - 1), here = row(part.y0);
+    for (int y = part.y0; y < part.bottom(); y++) {
+      const vec below = row(y + 1);
+      store(out.at(y, x), most(here, most(above, below)));
+      above = here;
+      here = below;
     }
-    for (int x = 0; x < width; x++) to[x] *= share;
-  }
-  for (int y = 0; y < height; y++) {
-    float *to = out + (size_t)y * width;
-    std::fill(to, to + width, 0.0f);
-    for (int d = -reach; d <= reach; d++) {
-      const float *from = rows + (size_t)std::min(std::max(y + d, 0), height - 1) * width;
-      for (int x = 0; x < width; x++) to[x] += from[x] * share;
-    }
   }
 }
 
-float sum(vec v) {
-  float total = 0;
-  for (int i = 0; i < LANES; i++) total += v[i];
-  return total;
+// The sum of a square around each value of a part, times a factor.
+template <int REACH_>
+void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float factor) {
+  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) {
+    const float *from = in.at(y, x);
+    vec total = load<vec>(from);
+    for (int d = 1; d <= REACH_; d++) total += load<vec>(from - d) + load<vec>(from + d);
+    store(rows.at(y, x), total);
+  });
+  each_vector(part, [&](int y, int x) {
+    const float *from = rows.at(y, x);
+    vec total = load<vec>(from);
+    for (int d = 1; d <= REACH_; d++) total += load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch);
+    store(out.at(y, x), total * factor);
+  });
 }
 
-float logit(float p) { return std::log(p / (1.0f - p)); }
+// The largest value of the square of LOWEST_REACH around a place.
+inline float largest_around(const Grid &in, int y, int x) {
+  vec high = all(-NONE);
+  for (int v = y - LOWEST_REACH; v <= y + LOWEST_REACH; v++) {
+    const float *row = in.at(v, x - LOWEST_REACH);
+    for (int u = 0; u + LANES <= 2 * LOWEST_REACH + 1; u += LANES) high = most(high, load<vec>(row + u));
+    high = most(high, load<vec>(row + 2 * LOWEST_REACH + 1 - LANES));
+  }
+  return largest(high);
+}
 
 struct Judgement {
-  float score, tells, near, far;
+  float score, tells, near, far, evidence;
+};
+
+// Pixels of a part that are looked at together.
+struct Group {
+  Part part;
+  std::vector<int> pixels;
+  std::vector<Judgement> judged;
 };
 
 class Repair {
@@ -116,31 +161,23 @@ class Repair {
     allocate();
     const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
     const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
-    spares ? find_sample(every) : find();
-    const std::vector<int> sampled = sample(every);
-    std::vector<Judgement> judged = judge(sampled);
-    std::vector<float> evidence;
-    decide(sampled, judged, evidence);
-    calibrate(sampled, judged);
-    int64_t ramps = 0;
-    for (const int i : sampled) ramps += ramp_[i];
-    bool is_soft = (double)ramps > SOFT * (double)sampled.size();
-    if (map_.automatic && (!is_related(sampled, judged) || !(is_soft || is_inexact(sampled)))) return;
+    std::vector<Group> sampled = blocks(every);
+    spares ? find_around(sampled) : find();
+    list(sampled, [](int) { return true; });
+    judge(sampled);
+    decide(sampled);
+    calibrate(sampled);
+    const bool is_soft = ramps_of(sampled) > SOFT;
+    if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return;
     if (spares) find();
-    const std::vector<int> pixels = list([&](size_t i) { return !map_.automatic || (ramp_[i] ? is_soft : wrong(i) > EXACT); });
-    if (pixels.empty() && !is_soft) return;
-    judged = judge(pixels);
-    decide(pixels, judged, evidence);
-    std::vector<uint8_t> shows(pixels.size());
-    for (size_t k = 0; k < pixels.size(); k++) shows[k] = judged[k].score + logit(shares_[kind_[pixels[k]]]) > 0;
+    std::vector<Group> groups = tiles();
+    list(groups, [&](int i) { return !map_.automatic || (marks_[i] & RAMP ? is_soft : wrong(i) > EXACT); });
+    judge(groups);
+    decide(groups);
     const float sigma = blur();
-    unmix(pixels, shows, sigma, judged);
-    for (size_t k = 0; k < pixels.size(); k++) {
-      const size_t i = pixels[k];
-      const float moved = ramp_[i] ? evidence[k] : (float)((bool)shows[k] != is_near(i));
-      const float to = shows[k] ? judged[k].near : judged[k].far;
-      if (moved > 0) map_.out[i] = given_[i] + moved * (to - given_[i]);
-    }
+    choose(groups);
+    unmix(groups, sigma);
+    move(groups);
     if (is_soft) lift_lamps(sigma);
   }
 
@@ -151,459 +188,602 @@ class Repair {
   }
 
   float step(size_t i) const { return map_.steps ? map_.steps[i] : map_.step; }
-  bool is_near(size_t i) const { return 2.0f * given_[i] > near_[i] + far_[i]; }
+  bool is_near(size_t i) const { return 2.0f * map_.nearness[i] > near_[i] + far_[i]; }
   float wrong(size_t i) const { return is_near(i) ? 1.0f - shares_[kind_[i]] : shares_[kind_[i]]; }
+  static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
+  static float colour(float light) { return (light <= LARGEST) & (light > 0) ? std::sqrt(light) : 0.0f; }
+
+  // Share of ramps among a sample's pixels.
+  double ramps_of(const std::vector<Group> &sampled) const {
+    double ramps = 0, all = 0;
+    for (const Group &group : sampled) {
+      all += (double)group.pixels.size();
+      for (const int i : group.pixels) ramps += marks_[i] & RAMP ? 1 : 0;
+    }
+    return ramps / std::max(all, 1.0);
+  }
 
   // Whether more of a sample's pixels at steps are wrong than exact maps have.
-  bool is_inexact(const std::vector<int> &sampled) const {
+  bool is_inexact(const std::vector<Group> &sampled) const {
     double found = 0, steps = 0;
-    for (const int i : sampled)
-      if (!ramp_[i]) {
-        found += wrong(i);
-        steps++;
-      }
+    for (const Group &group : sampled)
+      for (const int i : group.pixels)
+        if (!(marks_[i] & RAMP)) {
+          found += wrong(i);
+          steps++;
+        }
     return found > EXACT * steps;
   }
 
+  // Parts of a grid of squares, cut to the frame.
+  template <typename Wanted>
+  std::vector<Group> squares(int side, const Wanted &wanted) const {
+    std::vector<Group> found;
+    for (int y = 0; y * side < height_; y++)
+      for (int x = 0; x * side < width_; x++)
+        if (wanted(y, x)) found.push_back({{y * side, x * side, std::min(side, height_ - y * side), std::min(side, width_ - x * side)}, {}, {}});
+    return found;
+  }
+  std::vector<Group> tiles() const {
+    return squares(AREA, [](int, int) { return true; });
+  }
+  std::vector<Group> blocks(int every) const {
+    return squares(SAMPLE_BLOCK, [&](int y, int x) { return (y + 3 * x) % every == 0; });
+  }
+
+  // The pixels of groups that are edges and chosen.
   template <typename Chosen>
-  std::vector<int> list(const Chosen &chosen) const {
-    std::vector<int> found;
-    for (size_t i = 0; i < area_; i++)
-      if (edge_[i] && chosen(i)) found.push_back((int)i);
-    return found;
-  }
-
-  // Calls body(top, left, bottom, right) for each block of a sample.
-  template <typename Body>
-  void each_sampled(int every, const Body &body) const {
-    for (int y = 0; y * SAMPLE_BLOCK < height_; y++)
-      for (int x = 0; x * SAMPLE_BLOCK < width_; x++)
-        if ((y + 3 * x) % every == 0)
-          body(y * SAMPLE_BLOCK, x * SAMPLE_BLOCK, std::min(height_, (y + 1) * SAMPLE_BLOCK), std::min(width_, (x + 1) * SAMPLE_BLOCK));
-  }
-
-  std::vector<int> sample(int every) const {
-    std::vector<int> found;
-    each_sampled(every, [&](int top, int left, int bottom, int right) {
-      for (int y = top; y < bottom; y++)
-        for (int x = left; x < right; x++)
-          if (const size_t i = (size_t)y * width_ + x; edge_[i]) found.push_back((int)i);
+  void list(std::vector<Group> &groups, const Chosen &chosen) {
+    parallel((int)groups.size(), [&](int g) {
+      Group &group = groups[g];
+      for (int y = group.part.y0; y < group.part.bottom(); y++)
+        for (int i = y * width_ + group.part.x0, end = i + group.part.width; i < end; i++) {
+          if (uint64_t eight; i + 8 <= end && (memcpy(&eight, &marks_[i], 8), eight == 0)) {
+            i += 7;
+            continue;
+          }
+          if (!(marks_[i] & EDGE)) continue;
+          const bool is_listed = chosen(i);
+          marks_[i] = (uint8_t)((marks_[i] & ~LISTED) | (is_listed ? LISTED : 0));
+          if (is_listed) group.pixels.push_back(i);
+        }
+      group.judged.resize(group.pixels.size());
     });
-    return found;
   }
 
   void allocate() {
-    given_ = Buffer<float>(area_);
-    colour_ = Buffer<float>(area_ * channels_);
     near_ = Buffer<float>(area_);
     far_ = Buffer<float>(area_);
     witness_ = Buffer<float>(area_);
-    edge_ = Buffer<uint8_t>(area_);
-    ramp_ = Buffer<uint8_t>(area_);
+    score_ = Buffer<float>(area_);
+    marks_ = Buffer<uint8_t>(area_);
     kind_ = Buffer<uint8_t>(area_);
   }
 
-  void take(const Part &part) {
-    for (int y = part.y0; y < part.y0 + part.height; y++) {
-      const size_t from = (size_t)y * width_ + part.x0, to = from + part.width;
-      for (size_t i = from; i < to; i++) {
-        const float v = map_.nearness[i];
-        const bool valid = std::fabs(v) <= LARGEST;
-        given_[i] = valid ? v : 0.0f;
-        witness_[i] = valid ? 1.0f : 0.0f;
-      }
-      memset(edge_.data() + from, 0, part.width);
-      memset(ramp_.data() + from, 0, part.width);
+  Part in_frame(const Part &part) const {
+    const int y0 = std::max(0, part.y0), x0 = std::max(0, part.x0);
+    return {y0, x0, std::min(height_, part.bottom()) - y0, std::min(width_, part.right()) - x0};
+  }
+
+  // Fills a grid's whole rows from a plane of the frame.
+  template <typename Value, typename Of>
+  void fetch(const Value *plane, const Grid &grid, float *to, const Of &of) const {
+    const int first = std::max(0, -grid.x0), last = std::min(grid.pitch, width_ - grid.x0);
+    for (int y = grid.y0; y < grid.bottom(); y++, to += grid.pitch) {
+      const Value *from = plane + (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + grid.x0;
+      for (int x = first; x < last; x++) to[x] = of(from[x]);
+      std::fill(to, to + first, to[first]);
+      std::fill(to + last, to + grid.pitch, to[last - 1]);
     }
   }
-
-  void take_colours(const Part &part) {
-    for (int y = part.y0; y < part.y0 + part.height; y++)
-      for (int c = 0; c < channels_; c++) {
-        const size_t from = (size_t)y * width_ + part.x0;
-        const float *light = map_.light + c * area_ + from;
-        float *to = colour_.data() + from * channels_ + c;
-        for (int x = 0; x < part.width; x++) to[(size_t)x * channels_] = light[x] <= LARGEST && light[x] > 0 ? std::sqrt(light[x]) : 0.0f;
-      }
+  template <typename Value, typename Of>
+  void fetch(const Value *plane, const Grid &grid, const Of &of) const {
+    fetch(plane, grid, grid.at(grid.y0, grid.x0), of);
   }
 
-  Part around(int top, int left, int bottom, int right, int reach) const {
-    const int y0 = std::max(0, top - reach), x0 = std::max(0, left - reach);
-    return {y0, x0, std::min(height_, bottom + reach) - y0, std::min(width_, right + reach) - x0};
+  // Values of a part that are beyond the frame become those at its border.
+  void go_on(const Grid &grid, const Part &part) const {
+    const Part inside = in_frame(part);
+    for (int y = inside.y0; y < inside.bottom(); y++) {
+      float *row = grid.at(y, 0);
+      std::fill(row + part.x0, row + inside.x0, row[inside.x0]);
+      if (inside.right() < part.right()) std::fill(row + inside.right(), row + part.right(), row[inside.right() - 1]);
+    }
+    for (int y = part.y0; y < part.bottom(); y++)
+      if (const int nearest = std::min(std::max(y, inside.y0), inside.bottom() - 1); nearest != y)
+        memcpy(grid.at(y, part.x0), grid.at(nearest, part.x0), part.width * sizeof(float));
   }
 
   // Ramps and steps, and the two surfaces that meet there.
   void find() {
-    const int rows = ceil_div(height_, AREA), columns = ceil_div(width_, AREA), parts = rows * columns;
-    std::vector<double> steepness(parts, 0.0);
-    std::vector<int64_t> middles(parts, 0);
-    parallel(parts, [&](int p) {
-      const int top = p / columns * AREA, left = p % columns * AREA;
-      const Part inner = around(top, left, top + AREA, left + AREA, 0);
-      take_colours(inner);
-      find_in(inner, steepness[p], middles[p]);
-    });
-    for (int p = 0; p < parts; p++) {
+    const std::vector<Group> all = tiles();
+    std::vector<double> steepness(all.size(), 0.0);
+    std::vector<int64_t> middles(all.size(), 0);
+    parallel((int)all.size(), [&](int p) { find_in(all[p].part, steepness[p], middles[p]); });
+    for (size_t p = 0; p < all.size(); p++) {
       steepness_ += steepness[p];
       middles_ += middles[p];
     }
   }
 
   // The same, in the blocks of a sample and what is around them.
-  void find_sample(int every) {
-    std::vector<Part> blocks;
-    each_sampled(every, [&](int top, int left, int bottom, int right) { blocks.push_back(around(top, left, bottom, right, REACH)); });
-    parallel((int)blocks.size(), [&](int p) {
+  void find_around(const std::vector<Group> &sampled) {
+    parallel((int)sampled.size(), [&](int p) {
       double steepness;
       int64_t middles;
-      if (find_in(blocks[p], steepness, middles)) take_colours(blocks[p]);
+      find_in(in_frame(sampled[p].part.grown(REACH)), steepness, middles);
     });
   }
 
-  // The largest change between neighbours in a part.
-  float changes(const Part &part) const {
-    Buffer<float> most(part.width);
-    std::fill(most.data(), most.data() + part.width, 0.0f);
-    for (int y = part.y0; y < part.y0 + part.height; y++) {
-      const float *at = map_.nearness + (size_t)y * width_ + part.x0, *above = y > part.y0 ? at - width_ : at;
-      for (int x = 0; x < part.width - 1; x++) {
-        const float change = std::fabs(at[x + 1] - at[x]), down = std::fabs(at[x] - above[x]);
-        most[x] = most[x] < change ? change : most[x];
-        most[x] = most[x] < down ? down : most[x];
-      }
-      const float down = std::fabs(at[part.width - 1] - above[part.width - 1]);
-      most[part.width - 1] = std::max(most[part.width - 1], down);
+  void find_in(const Part &part, double &steepness, int64_t &middles) {
+    for (int y = part.y0; y < part.bottom(); y++) {
+      const size_t i = (size_t)y * width_ + part.x0;
+      const float *nearness = map_.nearness + i;
+      float *witness = witness_.data() + i;
+      for (int x = 0; x < part.width; x++) witness[x] = std::fabs(nearness[x]) <= LARGEST ? 1.0f : 0.0f;
+      memset(marks_.data() + i, 0, part.width);
     }
-    return *std::max_element(most.data(), most.data() + part.width);
+    const Part busy = changing(part);
+    if (busy.height <= 0 || busy.width <= 0) return;
+    if (!find_in(busy, STEP_HALO, steepness, middles)) find_in(busy, HALO, steepness, middles);
   }
 
-  float least_step(const Part &part) const {
-    if (!map_.steps) return map_.step;
-    float least = NONE;
-    for (int y = part.y0; y < part.y0 + part.height; y++)
-      for (int x = part.x0; x < part.x0 + part.width; x++) least = std::min(least, step((size_t)y * width_ + x));
-    return least;
+  // Where there may be edges.
+  Part changing(const Part &part) const {
+    const Part around = in_frame(part.grown(STEP_HALO));
+    float least_step = map_.step;
+    if (map_.steps) {
+      least_step = NONE;
+      for (int y = around.y0; y < around.bottom(); y++)
+        for (int x = around.x0; x < around.right(); x++) least_step = std::min(least_step, step((size_t)y * width_ + x));
+    }
+    const float change = 0.09f * least_step;
+    Grid changes({0, 0, 2, around.width});
+    float *of_row = changes.at(0, 0), *of_columns = changes.at(1, 0);
+    changes.clear();
+    int top = height_, bottom = 0;
+    for (int y = around.y0; y < around.bottom(); y++) {
+      const float *at = map_.nearness + (size_t)y * width_ + around.x0, *above = y > around.y0 ? at - width_ : at;
+      for (int x = 0; x < around.width - 1; x++) {
+        const float beside = std::fabs(at[x + 1] - at[x]), below = std::fabs(at[x] - above[x]);
+        const float known = beside > 0 ? beside : 0.0f;  // NaN is no change
+        of_row[x] = below > known ? below : known;
+      }
+      of_row[around.width - 1] = std::fabs(at[around.width - 1] - above[around.width - 1]);
+      vec row{};
+      for (int x = 0; x < around.width; x += LANES) {
+        const vec v = load<vec>(of_row + x);
+        row = most(v, row);
+        store(of_columns + x, most(v, load<vec>(of_columns + x)));
+      }
+      if (largest(row) > change) {
+        top = std::min(top, y);
+        bottom = y + 1;
+      }
+    }
+    int left = 0, right = around.width;
+    while (left < right && !(of_columns[left] > change)) left++;
+    while (left < right && !(of_columns[right - 1] > change)) right--;
+    const Part found = {top, around.x0 + left, bottom - top, right - left};
+    if (found.height <= 0 || found.width <= 0) return found;
+    const Part wide = found.grown(STEP_HALO);
+    const int y0 = std::max(part.y0, wide.y0), x0 = std::max(part.x0, wide.x0);
+    return {y0, x0, std::min(part.bottom(), wide.bottom()) - y0, std::min(part.right(), wide.right()) - x0};
   }
 
-  // Returns whether there may be edges.
-  bool find_in(const Part &inner, double &steepness, int64_t &middles) {
-    take(inner);
-    const int bottom = inner.y0 + inner.height, right = inner.x0 + inner.width;
-    const Part part = around(inner.y0, inner.x0, bottom, right, STEP_HALO);
-    if (!(changes(part) > 0.09f * least_step(part))) return false;
-    if (!find_in(inner, part, false, steepness, middles))
-      find_in(inner, around(inner.y0, inner.x0, bottom, right, HALO), true, steepness, middles);
-    return true;
-  }
-
-  // Returns whether the part was enough of what is around.
-  bool find_in(const Part &inner, const Part &part, bool wide_enough, double &steepness, int64_t &middles) {
-    const int h = part.height, w = part.width;
-    const size_t size = (size_t)h * w;
-    const auto at = [&](int y, int x) { return (size_t)(part.y0 + y) * width_ + part.x0 + x; };
-    const size_t padded = (size_t)(h + 2 * FLAT_REACH) * (w + 2 * FLAT_REACH);
-    Buffer<float> planes(PLANES * size + padded + 2 * (h + 1) * (w + 1));
-    Buffer<uint8_t> marks(2 * size);
-    float *next = planes.data();
-    const auto plane = [&] {
-      float *taken = next;
-      next += size;
-      return taken;
+  // Returns whether the halo was wide enough.
+  bool find_in(const Part &inner, int halo, double &steepness, int64_t &middles) {
+    const bool is_wide = halo == HALO;
+    const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
+    const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
+    fetch(map_.nearness, raw, [](float v) { return v; });
+    each_vector(whole, [&](int y, int x) {
+      const vec v = load<vec>(raw.at(y, x));
+      const auto is_valid = size_of(v) <= all(LARGEST);
+      store(up.at(y, x), is_valid ? v : all(-NONE));
+      store(down.at(y, x), is_valid ? -v : all(-NONE));
+    });
+    const auto step_at = [&](int y, int x) {
+      if (!map_.steps) return all(map_.step);
+      vec steps;
+      const float *row = map_.steps + (size_t)std::min(std::max(y, 0), height_ - 1) * width_;
+      for (int i = 0; i < LANES; i++) steps[i] = row[std::min(std::max(x + i, 0), width_ - 1)];
+      return steps;
     };
-    float *value = plane(), *up = plane(), *down = plane(), *slope = plane(), *jump = plane(), *a = plane(), *b = plane();
-    float *rows = planes.data() + PLANES * size;
-    float *across = rows + padded, *along = across + (size_t)(h + 1) * (w + 1);  // changes from the left and from above
-    uint8_t *ok = marks.data(), *ramp = ok + size;
-    for (int y = 0; y < h; y++)
-      for (int x = 0; x < w; x++) {
-        const size_t k = (size_t)y * w + x;
-        const float v = map_.nearness[at(y, x)];
-        ok[k] = std::fabs(v) <= LARGEST;
-        value[k] = ok[k] ? v : 0.0f;
-        up[k] = ok[k] ? v : -NONE;
-        down[k] = ok[k] ? -v : -NONE;
-      }
-    const int wide = w + 1;
-    std::fill(across, across + 2 * (size_t)(h + 1) * wide, 0.0f);
-    const auto known = [](float change) { return std::fabs(change) <= LARGEST ? change : 0.0f; };
-    for (int y = 0; y < h; y++) {
-      const float *at_row = map_.nearness + at(y, 0), *above = at_row - (y > 0 ? width_ : 0);
-      float *to_across = across + (size_t)y * wide, *to_along = along + (size_t)y * wide;
-      for (int x = 1; x < w; x++) to_across[x] = known(at_row[x] - at_row[x - 1]);
-      for (int x = 0; x < w; x++) to_along[x] = known(at_row[x] - above[x]);
-    }
-    for (int y = 0; y < h; y++) {
-      const float *x0 = across + (size_t)y * wide, *x1 = x0 + 1, *y0 = along + (size_t)y * wide, *y1 = y0 + wide;
-      float *to_slope = slope + (size_t)y * w, *to_jump = jump + (size_t)y * w;
-      for (int x = 0; x < w; x++) {
-        const float ax0 = std::fabs(x0[x]), ax1 = std::fabs(x1[x]), ay0 = std::fabs(y0[x]), ay1 = std::fabs(y1[x]);
-        const float lx = ax0 < ax1 ? ax0 : ax1, ly = ay0 < ay1 ? ay0 : ay1, mx = ax0 < ax1 ? ax1 : ax0, my = ay0 < ay1 ? ay1 : ay0;
-        const float sx = x0[x] * x1[x] > 0 ? lx : 0.0f, sy = y0[x] * y1[x] > 0 ? ly : 0.0f, jx = mx - sx, jy = my - sy;
-        to_slope[x] = sx < sy ? sy : sx;
-        to_jump[x] = jx < jy ? jy : jx;
-      }
-    }
-    highest(up, a, rows, h, w, REACH);
-    highest(down, b, rows, h, w, REACH);
+    slopes(raw, slope, jump, is_wide ? ramps.grown(FLAT_REACH + 2) : beside);
+    highest<REACH>(up, high, rows, ramps);
+    highest<REACH>(down, low, rows, ramps);
+    each_vector(ramps, [&](int y, int x) {
+      const vec rise = load<vec>(slope.at(y, x)), span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x)), s = step_at(y, x);
+      const auto is_ramp = (rise > 0.1f * s) & (rise > SHALLOW * span) & (span > s) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
+      store(ramp.at(y, x), is_ramp ? all(1.0f) : vec{});
+    });
     // ramps no farther away than this reach into the inner part
-    const int top = inner.y0 - part.y0, left = inner.x0 - part.x0, bottom = top + inner.height, right = left + inner.width;
-    bool any = false;
-    for (int y = 0; y < h; y++) {
-      const size_t k = (size_t)y * w;
-      bool any_here = false;
-      const bool is_close = y >= top - RINGS && y < bottom + RINGS;
-      for (int x = 0; x < w; x++) {
-        const float span = a[k + x] + b[k + x], s = map_.steps ? map_.steps[at(y, x)] : map_.step;
-        const bool is_ramp = (slope[k + x] > 0.1f * s) & (slope[k + x] > SHALLOW * span) & (span > s) & (ok[k + x] != 0);
-        ramp[k + x] = is_ramp;
-        any_here |= is_ramp & (x >= left - RINGS) & (x < right + RINGS);
-      }
-      any |= any_here && is_close;
+    float any = 0;
+    for (int y = beside.y0; y < beside.bottom(); y++)
+      for (int x = beside.x0; x < beside.right(); x++) any = any < *ramp.at(y, x) ? *ramp.at(y, x) : any;
+    if (any > 0) {
+      if (!is_wide) return false;
+      end_ramps(up, down, slope, high, low, rows, ramp, ramps);
+      each_vector(beside, [&](int y, int x) {
+        const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
+        const auto is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (near + far > step_at(y, x));
+        store(ramp.at(y, x), is_ramp ? all(1.0f) : vec{});
+        store(up.at(y, x), is_ramp ? near : load<vec>(up.at(y, x)));
+        store(down.at(y, x), is_ramp ? far : load<vec>(down.at(y, x)));
+      });
     }
-    if (any && !wide_enough) return false;
-    if (any) {  // a ramp ends, a slope goes on
-      float *flat = plane(), *up_end = plane(), *down_end = plane();
-      mean(slope, flat, rows, h, w, 2);
-      for (size_t k = 0; k < size; k++) flat[k] = -flat[k];
-      highest(flat, a, rows, h, w, FLAT_REACH);
-      for (size_t k = 0; k < size; k++) ramp[k] &= -a[k] < 0.3f * slope[k];
-      // the surfaces at both ends of a ramp
-      memcpy(up_end, up, size * sizeof(float));
-      memcpy(down_end, down, size * sizeof(float));
-      for (int round = 0; round < RAMP_REACH; round++) {
-        highest(up_end, a, rows, h, w, 1);
-        highest(down_end, b, rows, h, w, 1);
-        for (size_t k = 0; k < size; k++) {
-          up_end[k] = ramp[k] ? a[k] : up_end[k];
-          down_end[k] = ramp[k] ? b[k] : down_end[k];
-        }
-      }
-      for (int y = 0; y < h; y++)
-        for (int x = 0; x < w; x++) {
-          const size_t k = (size_t)y * w + x;
-          ramp[k] &= up_end[k] + down_end[k] > step(at(y, x));
-          if (ramp[k]) {
-            up[k] = up_end[k];
-            down[k] = down_end[k];
-          }
-        }
-    } else {
-      memset(ramp, 0, size);
-    }
-    // those at both sides of a step
-    float *nears[RINGS], *fars[RINGS], *jumps[RINGS];
+    // the surfaces at both sides of a step
+    const Grid nears[RINGS] = {Grid(beside), Grid(beside), Grid(beside)}, fars[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
+               jumps[RINGS] = {Grid(beside), Grid(beside), Grid(beside)};
     for (int r = 0; r < RINGS; r++) {
-      nears[r] = plane();
-      fars[r] = plane();
-      jumps[r] = plane();
-      highest(r ? nears[r - 1] : up, nears[r], rows, h, w, 1);
-      highest(r ? fars[r - 1] : down, fars[r], rows, h, w, 1);
-      highest(r ? jumps[r - 1] : jump, jumps[r], rows, h, w, 1);
+      const Part part = inner.grown(RINGS - 1 - r);
+      highest_beside(r ? nears[r - 1] : up, nears[r], part);
+      highest_beside(r ? fars[r - 1] : down, fars[r], part);
+      highest_beside(r ? jumps[r - 1] : jump, jumps[r], part);
     }
-    const auto clamped = [&](int y, int x) {
-      return value[(size_t)std::min(std::max(y, 0), h - 1) * w + std::min(std::max(x, 0), w - 1)];
-    };
-    for (int y = top; y < bottom; y++)
-      for (int x = left; x < right; x++) {
-        const size_t i = at(y, x), k = (size_t)y * w + x;
-        const float s = step(i), least = std::max(0.6f * (nears[RINGS - 1][k] + fars[RINGS - 1][k]), s);
-        int ring = RINGS + 1;
-        float near = nears[RINGS - 1][k], far = fars[RINGS - 1][k];
-        for (int r = RINGS - 1; r >= 0; r--)
-          if (const float gap = nears[r][k] + fars[r][k]; gap > least && jumps[r][k] > ABRUPT * gap) {
-            ring = r + 1;
-            near = nears[r][k];
-            far = fars[r][k];
-          }
-        if (ramp[k]) {
-          near = up[k];
-          far = down[k];
+    const Part means = inner.grown(2);  // of 5 x 5, for what lies two pixels to each side
+    each_vector(inner.grown(4), [&](int y, int x) {
+      const vec v = load<vec>(raw.at(y, x));
+      store(slope.at(y, x), size_of(v) <= all(LARGEST) ? v : vec{});
+    });
+    sums<2>(slope, high, rows, means, 1.0f);
+
+    float near_row[AREA + LANES], far_row[AREA + LANES], witness_row[AREA + LANES], mark_row[AREA + LANES];
+    for (int y = inner.y0; y < inner.bottom(); y++) {
+      for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
+        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {};
+        vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), sure = all(SURE[RINGS + 1]), is_step = {};
+        const vec least = most(0.6f * (near + far), s);
+        for (int r = RINGS - 1; r >= 0; r--) {
+          const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
+          const auto here = (gap > least) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
+          near = here ? n : near;
+          far = here ? f : far;
+          sure = here ? all(SURE[r + 1]) : sure;
+          is_step = here ? all(1.0f) : is_step;
         }
-        far = -far;
-        near_[i] = near;
-        far_[i] = far;
-        ramp_[i] = ramp[k];
-        witness_[i] = ok[k] && !ramp[k] ? SURE[ring] : 0.0f;
-        edge_[i] = (ramp[k] || ring <= RINGS) && near - far > s && ok[k];
-        const float gap = std::max(near - far, 1e-12f), level = (value[k] - far) / gap;
-        if (ramp[k] && std::fabs(level - 0.5f) < 0.12f) {
-          const float *x0 = across + (size_t)y * wide + x, *y0 = along + (size_t)y * wide + x;
-          const float mx = x0[0] * x0[1] > 0 ? 0.5f * (x0[0] + x0[1]) : 0.0f, my = y0[0] * y0[wide] > 0 ? 0.5f * (y0[0] + y0[wide]) : 0.0f;
+        near = is_ramp > none ? load<vec>(up.at(y, x)) : near;
+        far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
+        const auto is_valid = size_of(v) <= all(LARGEST);
+        const auto is_edge = (is_ramp + is_step > none) & (near - far > s) & is_valid;
+        store(near_row + k, near);
+        store(far_row + k, far);
+        store(witness_row + k, is_valid & (is_ramp <= none) ? sure : none);
+        const vec mark = (is_edge ? all((float)EDGE) : none) + is_ramp * (float)RAMP + (2.0f * v > near + far ? all((float)NEAR) : none);
+        store(mark_row + k, is_edge | (is_ramp > none) ? mark : none);
+      }
+      const size_t row = (size_t)y * width_ + inner.x0;
+      memcpy(near_.data() + row, near_row, inner.width * sizeof(float));
+      memcpy(far_.data() + row, far_row, inner.width * sizeof(float));
+      memcpy(witness_.data() + row, witness_row, inner.width * sizeof(float));
+      uint8_t *marks = marks_.data() + row;
+      for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)mark_row[k];
+      for (int k = 0; k < inner.width; k++) {
+        if (!marks[k]) continue;
+        const int x = inner.x0 + k;
+        const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
+        const bool is_ramp = marks[k] & RAMP;
+        if (is_ramp && std::fabs(level - 0.5f) < 0.12f) {
+          const float x0 = valid(value[0] - value[-1]), x1 = valid(value[1] - value[0]);
+          const float y0 = valid(value[0] - value[-raw.pitch]), y1 = valid(value[raw.pitch] - value[0]);
+          const float mx = x0 * x1 > 0 ? 0.5f * (x0 + x1) : 0.0f, my = y0 * y1 > 0 ? 0.5f * (y0 + y1) : 0.0f;
           steepness += std::sqrt(mx * mx + my * my) / gap;
           middles++;
         }
-        if (!edge_[i]) continue;
-        float beside = 0, below = 0;  // differences of means of 5 x 5, two pixels to each side
-        for (int d = -2; d <= 2; d++)
-          for (int e = 0; e <= 4; e++) {
-            beside += clamped(y + d, x + e) - clamped(y + d, x - e);
-            below += clamped(y + e, x + d) - clamped(y - e, x + d);
-          }
-        const int direction = std::fabs(beside) > std::fabs(below) ? beside > 0 : 2 + (below > 0);
-        const int place = ramp[k] ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1)
-                                  : (level > 0.5f) * RINGS + std::min(ring, RINGS) - 1;
-        kind_[i] = (uint8_t)(place * 4 + direction);
+        if (!(marks[k] & EDGE)) continue;
+        const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
+        const int direction = std::fabs(right) > std::fabs(below) ? right > 0 : 2 + (below > 0);
+        int ring = 0;
+        while (ring < RINGS - 1 && witness_row[k] > SURE[ring + 1]) ring++;
+        const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
+        kind_[row + k] = (uint8_t)(place * 4 + direction);
       }
+    }
     return true;
   }
 
-  // Which of two surfaces pixels show, by their colour.
-  std::vector<Judgement> judge(const std::vector<int> &pixels) const {
-    std::vector<Judgement> judged(pixels.size());
-    float falloff[WINDOW];
-    for (int v = -REACH; v <= REACH; v++)
-      for (int u = -REACH; u <= REACH; u++) falloff[(v + REACH) * SIDE + u + REACH] = std::exp(-(float)(v * v + u * u) / 12.5f);
-    falloff[WINDOW / 2] = 0.0f;  // none is its own witness
-    const int chunk = 512;
-    parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
-      std::vector<float> colours(2 * ROOM * channels_), means(2 * channels_);
-      for (size_t k = (size_t)part * chunk; k < std::min(pixels.size(), (size_t)(part + 1) * chunk); k++)
-        judged[k] = judge_one(pixels[k], falloff, colours.data(), means.data());
+  // Steepness where it goes on from one side to the other, and by how much the change on one side exceeds it.
+  void slopes(const Grid &raw, const Grid &slope, const Grid &jump, const Part &part) const {
+    const auto known = [](vec change) { return size_of(change) <= all(LARGEST) ? change : vec{}; };
+    each_vector(part, [&](int y, int x) {
+      const float *at = raw.at(y, x);
+      const vec here = load<vec>(at);
+      const vec x0 = known(here - load<vec>(at - 1)), x1 = known(load<vec>(at + 1) - here);
+      const vec y0 = known(here - load<vec>(at - raw.pitch)), y1 = known(load<vec>(at + raw.pitch) - here);
+      const vec ax0 = size_of(x0), ax1 = size_of(x1), ay0 = size_of(y0), ay1 = size_of(y1);
+      const vec sx = x0 * x1 > vec{} ? least(ax0, ax1) : vec{}, sy = y0 * y1 > vec{} ? least(ay0, ay1) : vec{};
+      store(slope.at(y, x), most(sx, sy));
+      store(jump.at(y, x), most(most(ax0, ax1) - sx, most(ay0, ay1) - sy));
     });
-    return judged;
   }
 
-  Judgement judge_one(int i, const float *falloff, float *colours, float *means) const {
-    const int y = i / width_, x = i % width_, C = channels_;
-    const float near = near_[i], far = far_[i], per_gap = 1.0f / std::max(near - far, 1e-12f);
-    int counts[2] = {0, 0};
-    float weights[2][ROOM], values[2][ROOM], alike[2][ROOM], sums[2] = {0, 0};
-    for (int v = -REACH; v <= REACH; v++) {
-      const size_t row = (size_t)std::min(std::max(y + v, 0), height_ - 1) * width_;
-      const float *fall = falloff + (v + REACH) * SIDE + REACH;
-      for (int u = -REACH; u <= REACH; u++) {
-        const size_t q = row + std::min(std::max(x + u, 0), width_ - 1);
-        const float level = (given_[q] - far) * per_gap, weight = fall[u] * witness_[q];
-        const int side = level > 0.75f && level < 1.25f ? 0 : level < 0.25f && level > -0.25f ? 1 : 2;
-        if (side == 2 || !(weight > 0)) continue;
-        const int n = counts[side]++;
-        weights[side][n] = weight;
-        values[side][n] = given_[q];
-        for (int c = 0; c < C; c++) colours[(side * C + c) * ROOM + n] = colour_[q * C + c];
-        sums[side] += weight;
+  // The surfaces at both ends of ramps, near in `high` and far, negative, in `low`. A ramp ends, a slope goes on.
+  void end_ramps(const Grid &up, const Grid &down, const Grid &slope, const Grid &high, const Grid &low, const Grid &rows, const Grid &ramp,
+                 const Part &ramps) const {
+    const Part around = ramps.grown(FLAT_REACH), inside = in_frame(ramps);
+    go_on(slope, around.grown(2));
+    sums<2>(slope, high, rows, around, -1.0f / 25.0f);
+    go_on(high, around);
+    highest<FLAT_REACH>(high, low, rows, ramps);
+    struct Piece {
+      int y, x;
+      vec near, far;
+    };
+    std::vector<Piece> pieces;
+    for (int y = inside.y0; y < inside.bottom(); y++)
+      for (int x = ramps.x0; x < ramps.right(); x += LANES) {
+        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < 0.3f * load<vec>(slope.at(y, x))) ? all(1.0f) : vec{};
+        for (int i = 0; i < LANES; i++)
+          if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
+        store(ramp.at(y, x), is_ramp);
+        if (largest(is_ramp) > 0) pieces.push_back(Piece{y, x, is_ramp, is_ramp});
+      }
+    for (int y = ramps.y0; y < ramps.bottom(); y++) {
+      if (y < inside.y0 || y >= inside.bottom()) std::fill(ramp.at(y, ramps.x0), ramp.at(y, ramps.x0) + ramps.width, 0.0f);
+      for (int x = ramps.x0 - 1; x < ramps.right() + 1 + LANES; x += LANES) {
+        store(high.at(y, x), load<vec>(up.at(y, x)));
+        store(low.at(y, x), load<vec>(down.at(y, x)));
       }
     }
-    const bool known = sums[0] > 1e-3f && sums[1] > 1e-3f;
-    if (!known) return {0.0f, 1.0f, near, far};  // the neighbours tell
-    for (int side = 0; side < 2; side++)
-      for (int &n = counts[side]; n % LANES; n++) {  // witnesses of no weight, up to whole vectors
-        weights[side][n] = values[side][n] = 0.0f;
-        for (int c = 0; c < C; c++) colours[(side * C + c) * ROOM + n] = 0.0f;
+    for (const int y : {ramps.y0 - 1, ramps.bottom()}) {
+      memcpy(high.at(y, ramps.x0 - 1), up.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
+      memcpy(low.at(y, ramps.x0 - 1), down.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
+    }
+    for (int round = 0; round < RAMP_REACH; round++) {
+      for (Piece &b : pieces) {
+        const auto is_ramp = load<vec>(ramp.at(b.y, b.x)) > vec{};
+        b.near = is_ramp ? highest_beside(high.at(b.y, b.x), high.pitch) : load<vec>(high.at(b.y, b.x));
+        b.far = is_ramp ? highest_beside(low.at(b.y, b.x), low.pitch) : load<vec>(low.at(b.y, b.x));
       }
-    float spread = 0, contrast = 0, noise = 0, apart[2] = {0, 0};
-    for (int c = 0; c < C; c++) {
-      const float own = colour_[(size_t)i * C + c];
-      for (int side = 0; side < 2; side++) {
-        const float *colour = colours + (side * C + c) * ROOM, *weight = weights[side];
-        vec weighted{}, square{};
-        for (int n = 0; n < counts[side]; n += LANES) weighted += load<vec>(weight + n) * load<vec>(colour + n);
-        const float mean = sum(weighted) / (sums[side] + 1e-9f);
-        for (int n = 0; n < counts[side]; n += LANES) {
-          const vec stray = load<vec>(colour + n) - mean;
-          square += load<vec>(weight + n) * stray * stray;
+      for (const Piece &b : pieces) {
+        store(high.at(b.y, b.x), b.near);
+        store(low.at(b.y, b.x), b.far);
+      }
+    }
+  }
+
+  // Which of two surfaces pixels show, by their colour.
+  void judge(std::vector<Group> &groups) const {
+    std::vector<float> falloff(SIDE * ACROSS, 0.0f);
+    for (int v = -REACH; v <= REACH; v++)
+      for (int u = -REACH; u <= REACH; u++) falloff[(v + REACH) * ACROSS + u + REACH] = std::exp(-(float)(v * v + u * u) / 12.5f);
+    falloff[REACH * ACROSS + REACH] = 0.0f;  // none is its own witness
+    parallel((int)groups.size(), [&](int g) {
+      if (groups[g].pixels.empty()) return;
+      switch (channels_) {
+        case 1: return judge<1>(groups[g], falloff.data());
+        case 3: return judge<3>(groups[g], falloff.data());
+        case 4: return judge<4>(groups[g], falloff.data());
+        default: judge<0>(groups[g], falloff.data());
+      }
+    });
+  }
+
+  // Where a group's pixels lie.
+  template <typename Chosen>
+  Part bounds(const Group &group, const Chosen &chosen) const {
+    int top = height_, left = width_, bottom = 0, right = 0;
+    for (size_t k = 0; k < group.pixels.size(); k++)
+      if (chosen(k)) {
+        const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
+        top = std::min(top, y);
+        left = std::min(left, x);
+        bottom = std::max(bottom, y + 1);
+        right = std::max(right, x + 1);
+      }
+    return {top, left, bottom - top, right - left};
+  }
+  Part bounds(const Group &group) const {
+    return bounds(group, [](size_t) { return true; });
+  }
+
+  // Fills a grid's planes with square roots of light, and the last with the sum of their squares.
+  void take_colours(const Grid &grid) const {
+    float *to = grid.at(grid.y0, grid.x0), *squares = to + channels_ * grid.size;
+    std::fill(squares, squares + grid.size, 0.0f);
+    for (int c = 0; c < channels_; c++, to += grid.size) {
+      fetch(map_.light + c * area_, grid, to, colour);
+      for (size_t i = 0; i < grid.size; i++) squares[i] += to[i] * to[i];
+    }
+  }
+
+  // C: channels, or 0 for any number.
+  template <int C>
+  void judge(Group &group, const float *falloff) const {
+    const int channels = C ? C : channels_;
+    const Part around = bounds(group).grown(REACH);
+    const Grid given(around), witness(around), colour(around, channels + 1);
+    take_colours(colour);
+    fetch(map_.nearness, given, valid);
+    fetch(witness_.data(), witness, [](float v) { return v; });
+    std::vector<float> more(C ? 0 : 2 * channels * (LANES + 1) + channels);
+    for (size_t k = 0; k < group.pixels.size(); k++) {
+      const int i = group.pixels[k], y = i / width_, x = i % width_;
+      const float near = near_[i], far = far_[i], per_gap = 1.0f / std::max(near - far, 1e-12f);
+      const float *colour_at = colour.at(y, x), *square_at = colour_at + channels * colour.size - REACH * colour.pitch - REACH;
+      vec weights[2][SIDE * ACROSS / LANES], values[SIDE * ACROSS / LANES], apart[SIDE * ACROSS / LANES];
+      vec total[2] = {}, square[2] = {}, few[2][C ? C : 1] = {};
+      float own_few[C ? C : 1], mean_few[2][C ? C : 1];
+      float *own = C ? own_few : more.data();
+      float *means[2] = {C ? mean_few[0] : own + channels, C ? mean_few[1] : own + 2 * channels};
+      float *many = C ? nullptr : own + 3 * channels;  // sums of colours, in vectors
+      if (!C) std::fill(many, many + 2 * channels * LANES, 0.0f);
+      for (int c = 0; c < channels; c++) own[c] = colour_at[c * colour.size];
+      for (int v = 0, n = 0; v < SIDE; v++) {
+        const float *given_row = given.at(y + v - REACH, x - REACH), *witness_row = witness.at(y + v - REACH, x - REACH), *fall = falloff + v * ACROSS;
+        const size_t row = (size_t)(v - REACH) * colour.pitch;
+        for (int u = 0; u < ACROSS; u += LANES, n++) {
+          const vec value = load<vec>(given_row + u), level = (value - far) * per_gap, weight = load<vec>(fall + u) * load<vec>(witness_row + u);
+          const auto is_near = size_of(level - 1.0f) < all(0.25f), is_far = size_of(level) < all(0.25f);
+          const vec none = {}, w[2] = {is_near ? weight : none, is_far ? weight : none}, squared = load<vec>(square_at + v * colour.pitch + u);
+          vec stray = none;
+          for (int c = 0; c < channels; c++) {
+            const vec other = load<vec>(colour_at + c * colour.size + row + u - REACH), d = other - own[c];
+            stray += d * d;
+            for (int side = 0; side < 2; side++) {
+              if (C)
+                few[side][c] += w[side] * other;
+              else
+                store(many + (side * channels + c) * LANES, load<vec>(many + (side * channels + c) * LANES) + w[side] * other);
+            }
+          }
+          for (int side = 0; side < 2; side++) {
+            total[side] += w[side];
+            square[side] += w[side] * squared;
+            weights[side][n] = w[side];
+          }
+          values[n] = is_near | is_far ? value - near : none;
+          apart[n] = stray;
         }
-        spread += 0.5f * sum(square) / (sums[side] + 1e-9f);
-        means[side * C + c] = mean;
-        apart[side] += (own - mean) * (own - mean);
       }
-      const float both = means[c] + means[C + c], between = means[c] - means[C + c];
-      noise += both * both;
-      contrast += between * between;
+      const float sums[2] = {sum(total[0]), sum(total[1])};
+      Judgement &judged = group.judged[k];
+      judged = {0.0f, 1.0f, near, far, 0.0f};
+      if (!(sums[0] > 1e-3f && sums[1] > 1e-3f)) continue;  // the neighbours tell
+      float spread = 0, contrast = 0, noise = 0, from_mean[2] = {0, 0};
+      for (int side = 0; side < 2; side++) {
+        float of_mean = 0;
+        for (int c = 0; c < channels; c++) {
+          const float mean = sum(C ? few[side][c] : load<vec>(many + (side * channels + c) * LANES)) / sums[side];
+          means[side][c] = mean;
+          of_mean += mean * mean;
+          from_mean[side] += (own[c] - mean) * (own[c] - mean);
+        }
+        spread += 0.5f * std::max(sum(square[side]) / sums[side] - of_mean, 0.0f);
+      }
+      for (int c = 0; c < channels; c++) {
+        const float both = means[0][c] + means[1][c], between = means[0][c] - means[1][c];
+        noise += both * both;
+        contrast += between * between;
+      }
+      spread += 2.25e-4f * noise + 1e-12f;
+      const float per_spread = 1.0f / (0.3f * spread);
+      vec likely[2] = {}, share[2] = {}, value[2] = {};
+      for (int n = 0; n < SIDE * ACROSS / LANES; n++) {
+        const vec t = 1.0f + apart[n] * per_spread, alike = 1.0f / (t * t);
+        for (int side = 0; side < 2; side++) {
+          const vec part = weights[side][n] * (alike + 1e-3f);
+          likely[side] += weights[side][n] * alike;
+          share[side] += part;
+          value[side] += part * values[n];
+        }
+      }
+      float likelihood[2], surface[2];
+      for (int side = 0; side < 2; side++) {
+        const float t = 1.0f + from_mean[side] * per_spread;
+        likelihood[side] = sum(likely[side]) / sums[side] + 0.02f / (t * t) + 1e-9f;
+        surface[side] = near + sum(value[side]) / std::max(sum(share[side]), 1e-12f);
+      }
+      const float tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
+      judged = {clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), tells, surface[0], surface[1], 0.0f};
     }
-    spread += 2.25e-4f * noise + 1e-12f;
-    const float per_spread = 1.0f / (0.3f * spread);
-    float likelihood[2], surface[2];
-    for (int side = 0; side < 2; side++) {
-      const int count = counts[side];
-      float *like = alike[side];
-      std::fill(like, like + count, 0.0f);
-      for (int c = 0; c < C; c++) {
-        const float own = colour_[(size_t)i * C + c], *colour = colours + (side * C + c) * ROOM;
-        for (int n = 0; n < count; n++) like[n] += (colour[n] - own) * (colour[n] - own);
-      }
-      vec total{}, share{}, value{};
-      for (int n = 0; n < count; n += LANES) {
-        const vec t = 1.0f + load<vec>(like + n) * per_spread, l = 1.0f / (t * t);
-        const vec weight = load<vec>(weights[side] + n), part = weight * (l + 1e-3f);
-        total += weight * l;
-        share += part;
-        value += part * (load<vec>(values[side] + n) - near);
-      }
-      const float t = 1.0f + apart[side] * per_spread;
-      likelihood[side] = sum(total) / (sums[side] + 1e-9f) + 0.02f / (t * t) + 1e-9f;
-      surface[side] = near + sum(value) / std::max(sum(share), 1e-12f);
-    }
-    const float tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
-    return {clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), tells, surface[0], surface[1]};
   }
 
   // Neighbours of like colour decide together.
-  void decide(const std::vector<int> &pixels, std::vector<Judgement> &judged, std::vector<float> &evidence) {
-    const float unknown = std::nanf("");
-    Buffer<float> said(area_);
-    parallel(height_, [&](int y) { std::fill(said.data() + (size_t)y * width_, said.data() + (size_t)(y + 1) * width_, unknown); });
-    for (size_t k = 0; k < pixels.size(); k++) said[pixels[k]] = judged[k].score;
-    evidence.assign(pixels.size(), 0.0f);
-    const int chunk = 4096, C = channels_;
-    parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
-      for (size_t k = (size_t)part * chunk; k < std::min(pixels.size(), (size_t)(part + 1) * chunk); k++) {
-        const int i = pixels[k], y = i / width_, x = i % width_;
-        const float *own = colour_.data() + (size_t)i * C;
-        float light = 0, total = 0, sum = 0, strongest = 0;
-        for (int c = 0; c < C; c++) light += own[c] * own[c];
-        for (int v = -1; v <= 1; v++)
-          for (int u = -1; u <= 1; u++) {
-            const size_t q = (size_t)std::min(std::max(y + v, 0), height_ - 1) * width_ + std::min(std::max(x + u, 0), width_ - 1);
-            if (std::isnan(said[q])) continue;
-            float apart = 0;
-            for (int c = 0; c < C; c++) apart += (colour_[q * C + c] - own[c]) * (colour_[q * C + c] - own[c]);
-            const float alike = 1.0f / (1.0f + apart / (0.0225f * light + 1e-12f));
-            total += alike;
-            sum += alike * said[q];
-            strongest = std::max(strongest, std::fabs(said[q]));
-          }
-        judged[k].score = clamp(SHARPNESS * judged[k].tells * sum / std::max(total, 1e-12f), -6.0f, 6.0f);
-        evidence[k] = clamp01(2.0f * judged[k].tells * strongest - 1.0f);
-      }
+  void decide(std::vector<Group> &groups) {
+    parallel((int)groups.size(), [&](int g) {
+      for (size_t k = 0; k < groups[g].pixels.size(); k++) score_[groups[g].pixels[k]] = groups[g].judged[k].score;
+    });
+    parallel((int)groups.size(), [&](int g) {
+      if (!groups[g].pixels.empty()) decide(groups[g]);
+    });
+    parallel((int)groups.size(), [&](int g) {
+      for (size_t k = 0; k < groups[g].pixels.size(); k++) score_[groups[g].pixels[k]] = groups[g].judged[k].evidence;
     });
     // from the ends of a wide ramp only one of the surfaces is in sight
-    parallel(height_, [&](int y) { std::fill(said.data() + (size_t)y * width_, said.data() + (size_t)(y + 1) * width_, 0.0f); });
-    for (size_t k = 0; k < pixels.size(); k++) said[pixels[k]] = evidence[k];
-    parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
-      for (size_t k = (size_t)part * chunk; k < std::min(pixels.size(), (size_t)(part + 1) * chunk); k++) {
-        const int i = pixels[k], y = i / width_, x = i % width_;
-        for (int v = std::max(0, y - 3); v <= std::min(height_ - 1, y + 3); v++)
-          for (int u = std::max(0, x - 3); u <= std::min(width_ - 1, x + 3); u++)
-            evidence[k] = std::max(evidence[k], said[(size_t)v * width_ + u]);
+    parallel((int)groups.size(), [&](int g) {
+      Group &group = groups[g];
+      if (group.pixels.empty()) return;
+      const Part part = bounds(group);
+      const Part around = part.grown(3);
+      const Grid said(around), highest_said(part), rows(around);
+      take_listed(said, nullptr);
+      highest<3>(said, highest_said, rows, part);
+      for (size_t k = 0; k < group.pixels.size(); k++) {
+        const int i = group.pixels[k];
+        group.judged[k].evidence = *highest_said.at(i / width_, i % width_);
       }
     });
   }
 
-  // Whether what colours say agrees with the map where that is hardly in doubt.
-  bool is_related(const std::vector<int> &pixels, const std::vector<Judgement> &judged) const {
-    double total = 0, agreed = 0;
-    for (size_t k = 0; k < pixels.size(); k++) {
-      const size_t i = pixels[k];
-      const float score = judged[k].score, level = (given_[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f);
-      if (ramp_[i] ? std::fabs(level - 0.5f) <= 0.3f : kind_[i] / 4 % RINGS != RINGS - 1) continue;
-      const float weight = std::min(0.5f * std::fabs(score), 1.0f);
-      total += weight;
-      if ((score > 0) == (level > 0.5f)) agreed += weight;
+  // What listed pixels said, 0 elsewhere; and 1 at them, 0 elsewhere.
+  void take_listed(const Grid &said, const Grid *is_listed) const {
+    const int first = std::max(0, -said.x0), last = std::min(said.width, width_ - said.x0);
+    said.clear();
+    if (is_listed) is_listed->clear();
+    for (int y = said.y0; y < said.bottom(); y++) {
+      const ptrdiff_t from = (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + said.x0;
+      for (int x = first; x < last; x++)
+        if (marks_[from + x] & LISTED) {
+          said.at(y, said.x0)[x] = score_[from + x];
+          if (is_listed) is_listed->at(y, said.x0)[x] = 1.0f;
+        }
     }
+    go_on(said, said);
+    if (is_listed) go_on(*is_listed, *is_listed);
+  }
+
+  void decide(Group &group) const {
+    const Part part = bounds(group), around = part.grown(1);
+    const Grid said(around), is_listed(around), score(part), evidence(part), colour(around, channels_ + 1);
+    take_colours(colour);
+    take_listed(said, &is_listed);
+    each_vector(part, [&](int y, int x) {
+      if (!(sum(load<vec>(is_listed.at(y, x))) > 0)) return;
+      const float *own = colour.at(y, x);
+      const vec per_light = 1.0f / (0.0225f * load<vec>(own + channels_ * colour.size) + 1e-12f);
+      vec total{}, all_said{}, strongest{};
+      for (int v = -1; v <= 1; v++)
+        for (int u = -1; u <= 1; u++) {
+          const int off = v * colour.pitch + u;
+          vec apart{};
+          for (int c = 0; c < channels_; c++) {
+            const vec d = load<vec>(own + c * colour.size + off) - load<vec>(own + c * colour.size);
+            apart += d * d;
+          }
+          const vec alike = load<vec>(is_listed.at(y + v, x + u)) / (1.0f + apart * per_light), s = load<vec>(said.at(y + v, x + u));
+          total += alike;
+          all_said += alike * s;
+          strongest = most(strongest, size_of(s));
+        }
+      store(score.at(y, x), all_said / most(total, all(1e-12f)));
+      store(evidence.at(y, x), strongest);
+    });
+    for (size_t k = 0; k < group.pixels.size(); k++) {
+      const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
+      Judgement &judged = group.judged[k];
+      judged.score = clamp(SHARPNESS * judged.tells * *score.at(y, x), -6.0f, 6.0f);
+      judged.evidence = clamp01(2.0f * judged.tells * *evidence.at(y, x) - 1.0f);
+    }
+  }
+
+  // Whether what colours say agrees with the map where that is hardly in doubt.
+  bool is_related(const std::vector<Group> &groups) const {
+    double total = 0, agreed = 0;
+    for (const Group &group : groups)
+      for (size_t k = 0; k < group.pixels.size(); k++) {
+        const int i = group.pixels[k];
+        const float score = group.judged[k].score, level = (map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f);
+        if (marks_[i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : kind_[i] / 4 % RINGS != RINGS - 1) continue;
+        const float weight = std::min(0.5f * std::fabs(score), 1.0f);
+        total += weight;
+        if ((score > 0) == (level > 0.5f)) agreed += weight;
+      }
     return (agreed + 0.5f * PRIOR_COUNT) / (total + PRIOR_COUNT) > RELATED;
   }
 
   // Share of pixels that show the near surface, by kind.
-  void calibrate(const std::vector<int> &pixels, const std::vector<Judgement> &judged) {
+  void calibrate(const std::vector<Group> &groups) {
     std::vector<float> assumed(PLACES), start(PLACES);
     for (int p = 0; p < PLACES; p++) {
       assumed[p] = p < RINGS ? TRUSTED : p < 2 * RINGS ? 1.0f - TRUSTED : (p - 2 * RINGS + 0.5f) / LEVELS;
       start[p] = p < 2 * RINGS ? 0.5f : assumed[p];
     }
-    const std::vector<float> together = fit(pixels, judged, 4, start, assumed);
+    const std::vector<float> together = fit(groups, 4, start, assumed);
     std::vector<float> each(KINDS);
     for (int k = 0; k < KINDS; k++) each[k] = together[k / 4];
-    shares_ = fit(pixels, judged, 1, std::vector<float>(KINDS, 0.5f), each);
+    shares_ = fit(groups, 1, std::vector<float>(KINDS, 0.5f), each);
     // where the pixels beside a step are right those farther away are too
     for (int r = 1; r < RINGS; r++)
       for (int d = 0; d < 4; d++) {
@@ -613,20 +793,26 @@ class Repair {
       }
   }
 
-  std::vector<float> fit(const std::vector<int> &pixels, const std::vector<Judgement> &judged, int together, std::vector<float> share,
-                         const std::vector<float> &assumed) const {
+  std::vector<float> fit(const std::vector<Group> &groups, int together, std::vector<float> share, const std::vector<float> &assumed) const {
     const size_t count = share.size();
     std::vector<double> total(count, 0.0), found(count);
-    for (size_t k = 0; k < pixels.size(); k++) total[kind_[pixels[k]] / together] += std::min(0.5f * std::fabs(judged[k].score), 1.0f);
+    struct Witness {
+      int kind;
+      float weight, odds;
+    };
+    std::vector<Witness> witnesses;
+    for (const Group &group : groups)
+      for (size_t k = 0; k < group.pixels.size(); k++) {
+        const float score = group.judged[k].score, weight = std::min(0.5f * std::fabs(score), 1.0f);
+        const int kind = kind_[group.pixels[k]] / together;
+        total[kind] += weight;
+        if (weight > 0) witnesses.push_back({kind, weight, std::exp(-score)});
+      }
     for (int round = 0; round < ROUNDS; round++) {
       std::fill(found.begin(), found.end(), 0.0);
       std::vector<float> odds(count);
       for (size_t g = 0; g < count; g++) odds[g] = (1.0f - share[g]) / share[g];
-      for (size_t k = 0; k < pixels.size(); k++) {
-        const float score = judged[k].score, weight = std::min(0.5f * std::fabs(score), 1.0f);
-        const int group = kind_[pixels[k]] / together;
-        if (weight > 0) found[group] += weight / (1.0f + odds[group] * std::exp(-score));
-      }
+      for (const Witness &w : witnesses) found[w.kind] += w.weight / (1.0f + odds[w.kind] * w.odds);
       for (size_t g = 0; g < count; g++)
         share[g] = clamp((float)((found[g] + PRIOR_COUNT * assumed[g]) / (total[g] + PRIOR_COUNT)), 0.005f, 0.995f);
     }
@@ -638,146 +824,254 @@ class Repair {
     return (float)std::sqrt(std::min(std::max(width * width - 0.75, 0.25), 9.0));
   }
 
-  struct Line {
-    float least, difference, fit;
-  };
-
-  // Nearness around a pixel as a + b cover.
-  Line regress(const float *cover, int i) const {
-    const int y = i / width_, x = i % width_;
-    double weights = 0, mx = 0, my = 0, xx = 0, yy = 0, xy = 0;
-    const float own = given_[i];
-    for (int v = -REACH; v <= REACH; v++)
-      for (int u = -REACH; u <= REACH; u++) {
-        const size_t q = (size_t)std::min(std::max(y + v, 0), height_ - 1) * width_ + std::min(std::max(x + u, 0), width_ - 1);
-        const double weight = std::exp(-(v * v + u * u) / 18.0f), cx = cover[q], cy = given_[q] - own;
-        weights += weight;
-        mx += weight * cx;
-        my += weight * cy;
-        xx += weight * cx * cx;
-        yy += weight * cy * cy;
-        xy += weight * cx * cy;
-      }
-    mx /= weights;
-    my /= weights;
-    xx = xx / weights - mx * mx;
-    yy = yy / weights - my * my;
-    xy = std::max(xy / weights - mx * my, 0.0);
-    const double b = xy / std::max(xx, 1e-9), explained = xy * xy / std::max(xx * yy, 1e-12);
-    return {(float)(my - b * mx + own), (float)b, xx > 0.004 ? clamp01((float)((explained - 0.5) / 0.3)) : 0.0f};
-  }
-
-  void unmix(const std::vector<int> &pixels, const std::vector<uint8_t> &shows, float sigma, std::vector<Judgement> &judged) const {
-    Plane label(area_), blurred(area_), a(area_), b(area_), rows(area_);
-    whole(given_.data(), a.data(), rows.data(), 6, 1.0f);
-    whole(given_.data(), b.data(), rows.data(), 6, -1.0f);  // the lowest, negative
-    for (size_t i = 0; i < area_; i++) label[i] = edge_[i] ? is_near(i) : 2.0f * given_[i] > a[i] - b[i];
-    for (size_t k = 0; k < pixels.size(); k++) label[pixels[k]] = shows[k];
-    gaussian(label.data(), blurred.data(), rows.data(), sigma);
-    std::vector<uint8_t> thin[2];
-    for (int side = 0; side < 2; side++) {
-      thin[side].resize(pixels.size());
-      for (size_t i = 0; i < area_; i++) a[i] = !edge_[i] || (label[i] > 0) == (side == 0) ? -1.0f : 0.0f;
-      whole(a.data(), b.data(), rows.data(), 2, 1.0f);
-      for (size_t i = 0; i < area_; i++) b[i] = -b[i];
-      whole(b.data(), a.data(), rows.data(), 2, 1.0f);
-      for (size_t k = 0; k < pixels.size(); k++) thin[side][k] = (label[pixels[k]] > 0) == (side == 0) && !(a[pixels[k]] > 0);
-    }
-    whole(given_.data(), a.data(), rows.data(), 12, -1.0f);
-    const int chunk = 512;
-    parallel(ceil_div((int)pixels.size(), chunk), [&](int part) {
-      for (size_t k = (size_t)part * chunk; k < std::min(pixels.size(), (size_t)(part + 1) * chunk); k++) {
-        if (!thin[0][k] && !thin[1][k]) continue;
-        const Line line = regress(blurred.data(), pixels[k]);
-        float &near = judged[k].near, &far = judged[k].far;
-        const float gap = near - far;
-        if (thin[0][k])
-          near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
-        else
-          far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -a[pixels[k]])) - far, 0.0f);
+  // Marks the pixels that show the near surface.
+  void choose(std::vector<Group> &groups) {
+    float prior[KINDS];
+    for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
+    parallel((int)groups.size(), [&](int g) {
+      for (size_t k = 0; k < groups[g].pixels.size(); k++) {
+        const int i = groups[g].pixels[k];
+        const bool shows_near = groups[g].judged[k].score + prior[kind_[i]] > 0;
+        marks_[i] = (uint8_t)((marks_[i] & ~NEAR) | (shows_near ? NEAR : 0));
       }
     });
   }
 
+  void move(const std::vector<Group> &groups) const {
+    parallel((int)groups.size(), [&](int g) {
+      for (size_t k = 0; k < groups[g].pixels.size(); k++) {
+        const int i = groups[g].pixels[k];
+        const Judgement &judged = groups[g].judged[k];
+        const bool shows_near = marks_[i] & NEAR;
+        const float moved = marks_[i] & RAMP ? judged.evidence : (float)(shows_near != is_near(i));
+        if (moved > 0) map_.out[i] += moved * ((shows_near ? judged.near : judged.far) - map_.out[i]);
+      }
+    });
+  }
+
+  struct Line {
+    float least, difference, fit;
+  };
+
+  // Weights of a window, which sum to 1.
+  static std::vector<float> window() {
+    std::vector<float> weights(SIDE * ACROSS, 0.0f);
+    float total = 0;
+    for (int v = -REACH; v <= REACH; v++)
+      for (int u = -REACH; u <= REACH; u++) total += weights[(v + REACH) * ACROSS + u + REACH] = std::exp(-(v * v + u * u) / 18.0f);
+    for (float &weight : weights) weight /= total;
+    return weights;
+  }
+
+  // Nearness around a pixel as a + b cover.
+  static Line regress(const Grid &given, const Grid &cover, const float *weights, int y, int x) {
+    const float own = *given.at(y, x);
+    vec mx{}, my{}, xx{}, yy{}, xy{};
+    for (int v = 0; v < SIDE; v++)
+      for (int u = 0; u < ACROSS; u += LANES) {
+        const vec weight = load<vec>(weights + v * ACROSS + u), cx = load<vec>(cover.at(y + v - REACH, x + u - REACH));
+        const vec cy = load<vec>(given.at(y + v - REACH, x + u - REACH)) - own, wx = weight * cx, wy = weight * cy;
+        mx += wx;
+        my += wy;
+        xx += wx * cx;
+        yy += wy * cy;
+        xy += wx * cy;
+      }
+    const float mean_x = sum(mx), mean_y = sum(my);
+    const float of_x = std::max(sum(xx) - mean_x * mean_x, 0.0f), of_y = std::max(sum(yy) - mean_y * mean_y, 0.0f), both = std::max(sum(xy) - mean_x * mean_y, 0.0f);
+    const float b = both / std::max(of_x, 1e-9f), explained = both * both / std::max(of_x * of_y, 1e-12f);
+    return {mean_y - b * mean_x + own, b, of_x > 0.004f ? clamp01((explained - 0.5f) / 0.3f) : 0.0f};
+  }
+
+  // The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best.
+  void unmix(std::vector<Group> &groups, float sigma) const {
+    const std::vector<float> weights = window();
+    const int reach = blur_reach(sigma);
+    parallel((int)groups.size(), [&](int g) {
+      Group &group = groups[g];
+      if (group.pixels.empty()) return;
+      const std::vector<uint8_t> is_thin = thin(group);
+      const Part part = bounds(group, [&](size_t k) { return is_thin[k]; });
+      if (part.height <= 0) return;
+      const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
+      const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
+      fetch(map_.nearness, up, valid);
+      fetch(map_.nearness, given, valid);
+      for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
+      highest<SIDE_REACH>(up, high, rows, labelled);
+      highest<SIDE_REACH>(down, low, rows, labelled);
+      each_vector(labelled, [&](int y, int x) {
+        const auto is_near = 2.0f * load<vec>(up.at(y, x)) > load<vec>(high.at(y, x)) - load<vec>(low.at(y, x));
+        store(high.at(y, x), is_near ? all(1.0f) : vec{});
+      });
+      const Part inside = in_frame(labelled);
+      for (int y = inside.y0; y < inside.bottom(); y++) {
+        const uint8_t *marks = marks_.data() + (size_t)y * width_;
+        float *label = high.at(y, 0);
+        for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
+      }
+      go_on(high, labelled);
+      gaussian(high, blurred, rows, around, sigma);
+      for (size_t k = 0; k < group.pixels.size(); k++) {
+        if (!is_thin[k]) continue;
+        const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
+        const Line line = regress(given, blurred, weights.data(), y, x);
+        float &near = group.judged[k].near, &far = group.judged[k].far;
+        const float gap = near - far;
+        if (marks_[group.pixels[k]] & NEAR)
+          near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
+        else if (line.fit > 0)
+          far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
+      }
+    });
+  }
+
+  // Which of a group's pixels belong to a surface that no 5 x 5 pixels near them show whole.
+  std::vector<uint8_t> thin(const Group &group) const {
+    const Part part = bounds(group), around = part.grown(4);
+    const int pitch = around.width;
+    const size_t size = (size_t)around.height * pitch;
+    std::vector<uint8_t> memory(2 * size + 4 * pitch, 3);
+    uint8_t *shape = memory.data(), *rows = shape + size + 2 * pitch;  // a bit for each surface: near, far
+    const Part inside = in_frame(around);
+    for (int y = inside.y0; y < inside.bottom(); y++)
+      for (int x = inside.x0; x < inside.right(); x++) {
+        const uint8_t marks = marks_[(size_t)y * width_ + x];
+        shape[(y - around.y0) * pitch + x - around.x0] = marks & EDGE ? (marks & NEAR ? 1 : 2) : 3;
+      }
+    for (int y = 0; y < around.height; y++)
+      for (int x = 2; x < pitch - 2; x++) {
+        const uint8_t *p = shape + y * pitch + x;
+        rows[y * pitch + x] = p[-2] & p[-1] & p[0] & p[1] & p[2];
+      }
+    for (int y = 2; y < around.height - 2; y++)
+      for (int x = 2; x < pitch - 2; x++) {
+        const uint8_t *p = rows + y * pitch + x;
+        shape[y * pitch + x] = p[-2 * pitch] & p[-pitch] & p[0] & p[pitch] & p[2 * pitch];
+      }
+    for (int y = 0; y < around.height; y++)  // beyond the frame there is none
+      for (int x = 0; x < pitch; x++)
+        if (y + around.y0 < 0 || y + around.y0 >= height_ || x + around.x0 < 0 || x + around.x0 >= width_) shape[y * pitch + x] = 0;
+    for (int y = 2; y < around.height - 2; y++)
+      for (int x = 4; x < pitch - 4; x++) {
+        const uint8_t *p = shape + y * pitch + x;
+        rows[y * pitch + x] = p[-2] | p[-1] | p[0] | p[1] | p[2];
+      }
+    std::vector<uint8_t> found(group.pixels.size());
+    for (size_t k = 0; k < found.size(); k++) {
+      const int i = group.pixels[k];
+      const uint8_t *p = rows + (i / width_ - around.y0) * pitch + i % width_ - around.x0;
+      const uint8_t thick = p[-2 * pitch] | p[-pitch] | p[0] | p[pitch] | p[2 * pitch];
+      found[k] = !(thick & (marks_[i] & NEAR ? 1 : 2));
+    }
+    return found;
+  }
+
   // Lamps of a few pixels, whose nearness a soft map spreads around them.
-  void lift_lamps(float sigma) {
-    Plane brightest(area_), usual(area_), around(area_), a(area_), b(area_), rows(area_);
-    for (size_t i = 0; i < area_; i++) {
-      float most = 0;
-      for (int c = 0; c < channels_; c++) most = std::max(most, colour_[i * channels_ + c]);
-      a[i] = most;
-      brightest[i] = most * most;
-    }
-    mean(a.data(), usual.data(), rows.data(), height_, width_, REACH + 2);
-    whole(brightest.data(), around.data(), rows.data(), 2, 1.0f);
-    Plane cover(area_), blurred(area_);
-    for (size_t i = 0; i < area_; i++) {
-      usual[i] *= usual[i];
-      cover[i] = brightest[i] > 2.0f * usual[i] ? brightest[i] / std::max(around[i], 1e-30f) : 0.0f;
-    }
-    gaussian(cover.data(), blurred.data(), rows.data(), sigma);
-    whole(given_.data(), a.data(), rows.data(), REACH, 1.0f);
-    whole(given_.data(), b.data(), rows.data(), REACH, -1.0f);
-    parallel(height_, [&](int y) {
-      for (int x = 0; x < width_; x++) {
-        const size_t i = (size_t)y * width_ + x;
-        if (!(std::fabs(map_.nearness[i]) <= LARGEST) || brightest[i] <= 4.0f * usual[i] || brightest[i] <= 0.1f * around[i] || a[i] + b[i] <= 0.5f * step(i)) continue;
-        const Line line = regress(blurred.data(), (int)i);
+  void lift_lamps(float sigma) const {
+    const std::vector<float> weights = window();
+    const std::vector<Group> all_parts = tiles();
+    const int reach = blur_reach(sigma);
+    parallel((int)all_parts.size(), [&](int g) {
+      const Part &part = all_parts[g].part;
+      const Grid near(part.grown(REACH));
+      fetch(map_.nearness, near, valid);
+      vec high = all(-NONE), low = all(NONE);
+      each_vector(near, [&](int y, int x) {
+        high = most(high, load<vec>(near.at(y, x)));
+        low = least(low, load<vec>(near.at(y, x)));
+      });
+      if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * map_.step)) return;
+      const std::vector<int> lamps = lamps_of(part, near);
+      if (lamps.empty()) return;
+      const Group group{part, lamps, {}};
+      const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
+      const Grid bright(whole), usual(whole), rows(whole), peak(covered), blurred(around), given(around);
+      brightest(bright, usual, rows, covered);
+      highest<2>(bright, peak, rows, covered);
+      each_vector(covered, [&](int y, int x) {
+        const vec own = load<vec>(bright.at(y, x));
+        store(usual.at(y, x), own > 2.0f * load<vec>(usual.at(y, x)) ? own / most(load<vec>(peak.at(y, x)), all(1e-30f)) : vec{});
+      });
+      go_on(usual, covered);
+      gaussian(usual, blurred, rows, around, sigma);
+      fetch(map_.nearness, given, valid);
+      for (const int i : lamps) {
+        const Line line = regress(given, blurred, weights.data(), i / width_, i % width_);
         map_.out[i] += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - map_.out[i], 0.0f);
       }
     });
   }
 
-  // `highest` of a whole frame, of its values times a sign, by rows.
-  void whole(const float *in, float *out, float *rows, int reach, float sign) const {
-    parallel(height_, [&](int y) {
-      const float *from = in + (size_t)y * width_;
-      int length = width_ + 2 * reach;
-      Buffer<float> row(length);
-      std::fill(row.data(), row.data() + reach, -NONE);
-      for (int x = 0; x < width_; x++) row[reach + x] = sign * from[x];
-      std::fill(row.data() + reach + width_, row.data() + length, -NONE);
-      widen(reach, [&](int by) { raise(row.data(), row.data() + by, length -= by); });
-      memcpy(rows + (size_t)y * width_, row.data(), width_ * sizeof(float));
-    });
-    parallel(height_, [&](int y) {
-      float *to = out + (size_t)y * width_;
-      const int first = std::max(0, y - reach), last = std::min(height_ - 1, y + reach);
-      memcpy(to, rows + (size_t)first * width_, width_ * sizeof(float));
-      for (int v = first + 1; v <= last; v++) raise(to, rows + (size_t)v * width_, width_);
-    });
+  // The brightest channel of a grid's pixels, and in a part of it what is usual around.
+  void brightest(const Grid &bright, const Grid &usual, const Grid &rows, const Part &part) const {
+    bright.clear();
+    const Part &whole = bright;
+    const Grid light(whole);
+    for (int c = 0; c < channels_; c++) {
+      fetch(map_.light + c * area_, light, [](float v) { return (v <= LARGEST) & (v > 0) ? v : 0.0f; });
+      each_vector(bright, [&](int y, int x) { store(bright.at(y, x), most(load<vec>(bright.at(y, x)), load<vec>(light.at(y, x)))); });
+    }
+    for (size_t i = 0; i < light.size; i++) light.at(light.y0, light.x0)[i] = std::sqrt(bright.at(light.y0, light.x0)[i]);
+    sums<USUAL_REACH>(light, usual, rows, part, 1.0f / ((2 * USUAL_REACH + 1) * (2 * USUAL_REACH + 1)));
+    each_vector(part, [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
   }
 
-  void gaussian(const float *in, float *out, float *rows, float sigma) const {
-    float kernel[2 * BLUR_REACH + 1], sum = 0;
-    for (int d = -BLUR_REACH; d <= BLUR_REACH; d++) sum += kernel[d + BLUR_REACH] = std::exp(-(float)(d * d) / (2.0f * sigma * sigma));
-    for (float &k : kernel) k /= sum;
-    parallel(height_, [&](int y) {
-      const float *from = in + (size_t)y * width_;
-      Buffer<float> row(width_ + 2 * BLUR_REACH);
-      std::fill(row.data(), row.data() + BLUR_REACH, from[0]);
-      memcpy(row.data() + BLUR_REACH, from, width_ * sizeof(float));
-      std::fill(row.data() + BLUR_REACH + width_, row.data() + width_ + 2 * BLUR_REACH, from[width_ - 1]);
-      float *to = rows + (size_t)y * width_;
-      std::fill(to, to + width_, 0.0f);
-      for (int d = 0; d <= 2 * BLUR_REACH; d++)
-        for (int x = 0; x < width_; x++) to[x] += kernel[d] * row[x + d];
-    });
-    parallel(height_, [&](int y) {
-      float *to = out + (size_t)y * width_;
-      std::fill(to, to + width_, 0.0f);
-      for (int d = -BLUR_REACH; d <= BLUR_REACH; d++) {
-        const float *from = rows + (size_t)std::min(std::max(y + d, 0), height_ - 1) * width_;
-        for (int x = 0; x < width_; x++) to[x] += kernel[d + BLUR_REACH] * from[x];
+  // The pixels of lamps in a part; up: its nearness, and that of what is REACH around.
+  std::vector<int> lamps_of(const Part &part, const Grid &up) const {
+    const Part whole = part.grown(USUAL_REACH);
+    const Grid bright(whole), usual(part), rows(whole);
+    brightest(bright, usual, rows, part);
+    vec any{};
+    each_vector(part, [&](int y, int x) { any = most(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? all(1.0f) : vec{}); });
+    std::vector<int> found;
+    if (!(largest(any) > 0)) return found;
+    const Part &around = up;
+    const Grid down(around), high(part), low(part), peak(part);
+    fetch(map_.nearness, down, [](float v) { return -valid(v); });
+    highest<REACH>(up, high, rows, part);
+    highest<REACH>(down, low, rows, part);
+    highest<2>(bright, peak, rows, part);
+    for (int y = part.y0; y < part.bottom(); y++)
+      for (int x = part.x0; x < part.right(); x++) {
+        const size_t i = (size_t)y * width_ + x;
+        const float own = *bright.at(y, x);
+        if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) && *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
+          found.push_back((int)i);
       }
+    return found;
+  }
+
+  // How far a blur reaches: no farther than float32 can tell.
+  static int blur_reach(float sigma) { return std::min(BLUR_REACH, (int)std::ceil(6.0f * sigma)); }
+
+  // A part of a grid under a Gaussian; beyond the frame it goes on as it is at its border.
+  void gaussian(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float sigma) const {
+    const int reach = blur_reach(sigma);
+    float kernel[BLUR_REACH + 1], total = 0;
+    for (int d = -reach; d <= reach; d++) total += kernel[std::abs(d)] = std::exp(-(float)(d * d) / (2.0f * sigma * sigma));
+    for (int d = 0; d <= reach; d++) kernel[d] /= total;
+    each_vector({part.y0 - reach, part.x0, part.height + 2 * reach, part.width}, [&](int y, int x) {
+      const float *from = in.at(y, x);
+      vec spread = kernel[0] * load<vec>(from);
+      for (int d = 1; d <= reach; d++) spread += kernel[d] * (load<vec>(from - d) + load<vec>(from + d));
+      store(rows.at(y, x), spread);
     });
+    std::fill(out.at(out.y0, out.x0), out.at(out.y0, out.x0) + out.size, 0.0f);
+    each_vector(part, [&](int y, int x) {
+      const float *from = rows.at(y, x);
+      vec spread = kernel[0] * load<vec>(from);
+      for (int d = 1; d <= reach; d++) spread += kernel[d] * (load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch));
+      store(out.at(y, x), spread);
+    });
+    go_on(out, part);
   }
 
   const torchdof_map &map_;
   const int height_, width_, channels_;
   const size_t area_;
-  Buffer<float> given_, colour_, near_, far_, witness_;
-  Buffer<uint8_t> edge_, ramp_, kind_;
+  Buffer<float> near_, far_, witness_, score_;
+  Buffer<uint8_t> marks_, kind_;
   std::vector<float> shares_;
   double steepness_ = 0;
   int64_t middles_ = 0;

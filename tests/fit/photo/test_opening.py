@@ -1,0 +1,107 @@
+"""Blur that is not round: shapes drawn by an independent simulator, told apart and carried into tables."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import center_of_mass, shift
+
+from torchdof import BlurTable
+from torchdof.fit import Capture, Captures, fit_captures, fit_pair, highlight_psnr, natural_psnr
+from torchdof.fit import problems as p
+from torchdof.optics.aperture import Aperture
+from torchdof.optics.psf import pixel_kernels
+
+
+def kernel_of(fit):
+    tensors = {k: torch.as_tensor(v) for k, v in fit.kernel_params().items()}
+    family = fit.family if fit.aperture is None else "disc"
+    return pixel_kernels(family, tensors, None, None, fit.aperture).numpy()
+
+
+def centred(kernel):
+    """A kernel with its centre of mass in the middle: where a blur lies is the displacement's to say."""
+    y, x = center_of_mass(kernel)
+    moved = np.maximum(shift(kernel, (kernel.shape[0] // 2 - y, kernel.shape[0] // 2 - x), order=3), 0.0)
+    return moved / moved.sum()
+
+
+def size_of(kernel):
+    rows, columns = np.indices(kernel.shape)
+    y, x = center_of_mass(kernel)
+    return np.sqrt(2 * float((kernel * ((rows - y) ** 2 + (columns - x) ** 2)).sum()))
+
+
+def captured(simulator, kind, radius, seed=0, **camera):
+    """A pair without any warning expected of it, and the true kernel."""
+    kernel = simulator.shape(kind, radius)
+    return simulator.through(kernel, simulator.Simulator(**{"size": 65, "dot_radius": 8.0, **camera}), seed), kernel
+
+
+@pytest.mark.parametrize(
+    ("kind", "family", "natural", "look"),
+    [
+        ("hexagon", "polygon", 60, 22),
+        ("cat's eye", "image", 48, 15),
+        ("coma", "image", 47, 16),
+        ("mirror", "ring", 48, 13),
+    ],
+)
+def test_auto_takes_the_family_that_a_shape_needs(simulator, kind, family, natural, look):
+    pair, kernel = captured(simulator, kind, 7.5)
+    fit = fit_pair(*pair)
+    assert fit.family == family and (fit.aperture is None) == (family == "ring")
+    assert abs(fit.radius / size_of(kernel) - 1) < 0.02
+    found, true = centred(kernel_of(fit)), centred(kernel)
+    assert natural_psnr(found, true) > natural and highlight_psnr(found, true) > look
+    assert fit.residual_over_noise < 1.2 and ("round" in fit.why) == (family != "ring")
+
+
+def test_the_blades_of_a_polygon_are_counted_and_their_corners_found(simulator):
+    fit = fit_pair(*captured(simulator, "hexagon", 7.5)[0], "polygon")
+    assert fit.aperture.blades == 6 and fit.params["curvature"] < 0.3
+    # the simulator's corner is 11 degrees clockwise from the right, the aperture's counter-clockwise from the top
+    assert abs((fit.params["rotation_deg"] + 90 + 11 + 30) % 60 - 30) < 3
+    assert fit.stderr["rotation_deg"] < 3
+
+
+def test_a_disc_is_neither_a_polygon_nor_a_picture(simulator):
+    for seed in range(2):
+        pair = simulator.Simulator(size=61, dot_radius=8.0, bayer=seed == 1).pair("disc", {"radius": 7.0}, seed)
+        assert fit_pair(*pair).family == "disc"
+
+
+def test_what_could_not_be_told_from_a_disc_is_said(simulator):
+    pair, _ = captured(simulator, "heptagon", 4.0, dot_radius=5.0, snr_db=34, size=49)
+    fit = fit_pair(*pair)
+    assert fit.family == "disc" and "a hexagon would not have been told from it" in fit.why
+    pair = simulator.Simulator(size=49, dot_radius=5.0, snr_db=50).pair("disc", {"radius": 6.0})
+    assert "hexagon" not in fit_pair(*pair).why
+
+
+def test_an_opening_that_is_known_is_fitted_in_its_size_alone(simulator):
+    pair, kernel = captured(simulator, "hexagon", 5.0)
+    fit = fit_pair(*pair, "image", aperture=Aperture(6, 19.0))
+    assert list(fit.params) == ["radius"] and fit.params["radius"] == pytest.approx(5.0, rel=0.01)
+    assert fit.radius == pytest.approx(size_of(kernel), rel=0.01)
+    with pytest.raises(p.FitError, match="goes with family='image'"):
+        fit_pair(*pair, "disc", aperture=Aperture(6))
+    with pytest.raises(p.FitError, match="a profile over r, which 'polygon' has not"):
+        fit_pair(*pair, "polygon", model="ratio")
+
+
+def test_a_table_holds_the_opening_turned_by_half_in_front_of_the_focus(simulator, tmp_path):
+    pairs, kernels = [], []
+    for distance, radius in ((0.8, 5.5), (1.4, 5.5)):
+        kernel = simulator.shape("coma", radius)
+        kernels.append(kernel if distance > 1 else kernel[::-1, ::-1])
+        camera = simulator.Simulator(size=61, dot_radius=6.0, magnification=1 / distance)
+        pairs.append(Capture(*simulator.through(kernels[-1], camera, int(100 * distance)), distance))
+    result = fit_captures(Captures(tuple(pairs), focus_m=1.0, width_px=1000))
+    assert result.table.aperture.mask is not None and "image, for" in result.why
+    result.table.save(tmp_path / "coma.json")
+    assert (tmp_path / "coma.json").stat().st_size < 1e5
+    table = BlurTable.load(tmp_path / "coma.json")
+    shown = table.kernels(torch.tensor(result.coc_px, dtype=torch.float64), 1000)[:, 0].numpy()
+    for kernel, true, other in zip(shown, kernels, kernels[::-1], strict=True):
+        look = highlight_psnr(centred(kernel), centred(true))
+        assert look > 15 and look > highlight_psnr(centred(kernel), centred(other)) + 4
