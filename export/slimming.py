@@ -30,6 +30,8 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
     tidy: tuple[onnx_ir.passes.PassBase, ...] = (
         passes.ShapeInferencePass(),
         _Parts(),
+        _Cuts(),
+        _Averages(),
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -154,6 +156,56 @@ class _Parts(onnx_ir.passes.InPlacePass):
                 if part is not None:
                     node.outputs[0].replace_all_uses_with(part)
                     model.graph.remove(node, safe=True)
+        return onnx_ir.passes.PassResult(model, modified=True)
+
+
+class _Cuts(onnx_ir.passes.InPlacePass):
+    """A slice of a slice along another axis, as one: each would copy."""
+
+    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
+        """Replace in the graph."""
+        for node in list(model.graph):
+            whole = node.inputs[0] if node.op_type == "Slice" else None
+            first = None if whole is None else whole.producer()
+            if first is None or first.op_type != "Slice":
+                continue
+            axes = [onnx_ir.convenience.get_const_tensor(n.inputs[3]) for n in (first, node)]
+            if axes[0] is None or axes[1] is None or set(axes[0].numpy()) & set(axes[1].numpy()):
+                continue
+            tape = Tape()
+            pairs = list(zip(first.inputs, node.inputs, strict=True))[1:]
+            bounds = [tape.op("Concat", list(pair), {"axis": 0}) for pair in pairs]
+            cut = tape.op("Slice", [first.inputs[0], *bounds])
+            cut.type, cut.shape = node.outputs[0].type, node.outputs[0].shape
+            model.graph.insert_before(node, list(tape.nodes))
+            node.outputs[0].replace_all_uses_with(cut, replace_graph_outputs=True)
+            model.graph.remove(node, safe=True)
+        return onnx_ir.passes.PassResult(model, modified=True)
+
+
+class _Averages(onnx_ir.passes.InPlacePass):
+    """The mean of blocks before a convolution as a convolution, on which runtimes are several times as fast."""
+
+    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
+        """Replace in the graph."""
+        for node in list(model.graph):
+            following = [use.node for use in node.outputs[0].uses()] if node.op_type == "AveragePool" else []
+            if [n.op_type for n in following] != ["Pad"]:
+                continue
+            (pad,) = following
+            convolutions = [use.node for use in pad.outputs[0].uses() if use.node.op_type == "Conv"]
+            scale = node.attributes["kernel_shape"].as_ints()[0]
+            channels = convolutions[0].inputs[0].shape[1]  # type: ignore[union-attr, index]
+            weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
+            tape = Tape()
+            filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
+            kernel = _initializer(model.graph, weight, f"mean_of_{node.name}")
+            mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]})
+            mean.type, mean.shape = pad.outputs[0].type, pad.outputs[0].shape
+            model.graph.insert_before(pad, list(tape.nodes))
+            pad.outputs[0].replace_all_uses_with(mean)
+            model.graph.remove(pad, safe=True)
+            model.graph.remove(node, safe=True)
         return onnx_ir.passes.PassResult(model, modified=True)
 
 

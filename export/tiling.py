@@ -8,6 +8,7 @@ results. :mod:`torchdof.export.structure` makes a loop and branches of these.
 """
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -18,6 +19,8 @@ from torch import Tensor
 from torchdof.render.exporting import Graph, graph_context, where_needed
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Frame, Placed
+
+from .shifting import samples
 
 __all__ = ["CHOICE", "COLLECT", "DOMAIN", "WINDOW", "choose", "in_tiles", "side", "tile_by_tile"]
 
@@ -62,9 +65,9 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     behind = None if frame.behind is None else fields.pop()[inner]
     each = 2 if frame.surfaces[0].weight is None else 3
     surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
-    piece = Frame(
-        surfaces, frame.nodes, frame.ramps, behind, margin, (length, length), (length, length), frame.occlusion
-    )
+    size = (length, length)
+    held = _ranges(surfaces)
+    piece = _Tile(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion, ranges=held)
     tile = where_needed(
         lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0,
         render(piece, blurs),
@@ -77,10 +80,39 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     return image.reshape(batch, colours, *frame.area)[..., : frame.size[0], : frame.size[1]]
 
 
+_CELL = 4  # pixels for which one looks together what they hold
+
+
+def _ranges(surfaces: Sequence[Placed]) -> Tensor:
+    """The least of ``x`` and of ``-x`` in each cell of a window: ``[1, 2, surfaces, h, w]``."""
+    x = torch.cat([s.x for s in surfaces], 1)
+    return -functional.max_pool2d(torch.cat([-x, x], 1), _CELL, ceil_mode=True).unflatten(1, (2, -1))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Tile(Frame):
+    """A tile, of which it is asked often, and so of cells, what it holds; at most it then holds more than it does.
+
+    Args:
+        ranges: As :func:`_ranges` gives them.
+    """
+
+    ranges: Tensor
+
+    def any_between(self, low: float, high: float, halo: int) -> Tensor:
+        """As of any frame."""
+        start = (self.margin - halo) // _CELL
+        stop = [-(-(self.margin + n + halo) // _CELL) for n in self.area]
+        ranges = self.ranges[..., start : stop[0], start : stop[1]]
+        # the least lies below the upper end, and the largest above the lower one
+        beyond = ranges - ranges.new_tensor([high, -low])[:, None, None, None]
+        return beyond.amax(1).min() < 0
+
+
 @contextlib.contextmanager
 def in_tiles() -> Iterator[None]:
     """Within this context graphs that are exported render their frames tile by tile, and choose their work."""
-    token = graph_context.set(Graph(side, tile_by_tile, choose))
+    token = graph_context.set(Graph(side, tile_by_tile, samples, choose))
     try:
         yield
     finally:

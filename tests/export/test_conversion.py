@@ -61,7 +61,9 @@ def test_a_file_may_take_the_circle_of_confusion_and_a_single_channel(tmp_path: 
     dof = torchdof.DepthOfField(CAMERA, table, **{**SIMPLE, "max_coc_px": 3.0})
     with pytest.raises(ValueError, match="state it as width=1920"):
         to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1)
-    to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1, width=1920, opset=21)
+    told: list[str] = []
+    to_onnx(dof, tmp_path / "dof.onnx", inputs="coc_px", channels=1, width=1920, opset=21, progress=told.append)
+    assert told[:3] == ["tracing", "translating", "slimming"] and told[3:][0] == "verifying: one pixel"
     facts = describe(tmp_path / "dof.onnx")
     assert list(facts["inputs"]) == ["image", "coc_px"] and facts["width"] == 1920 and facts["opset"] == 21
     model = onnx.load(tmp_path / "dof.onnx")

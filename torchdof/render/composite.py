@@ -50,7 +50,8 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     # Beside light goes the share 1 - a that is left of what is behind, in sums of what is positive: behind bright light
     # the rounding of a difference would show. Where nothing is behind, a itself: what is divided by it in the end.
     def normalised(layers: Tensor) -> Picture:
-        light, weight, beyond = layers.tensor_split((colours, (colours + layers.shape[1]) // 2), 1)
+        each = (layers.shape[1] - colours) // 2
+        light, weight, beyond = layers.split([colours, each, each], 1)
         lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
         beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
         known = weight + beyond
@@ -63,7 +64,7 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
         return torch.addcmul(light, left, light_behind), share
 
     picture = _composite_layers(frame, blurs, scatter, composited, 1.0 if backed else 0.0, normalised)
-    light, left = picture.tensor_split((colours,), 1)
+    light, left = _parts(picture, colours)
     out = _mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
 
@@ -85,7 +86,7 @@ def accumulate(
 
     summed = _composite_layers(frame, blurs, scatter, added)[..., : frame.size[0], : frame.size[1]]
     if highlights is not None:
-        light, weight = summed.tensor_split((frame.colours,), 1)
+        light, weight = _parts(summed, frame.colours)
         summed = torch.cat([light + highlights, weight], 1)
     return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
 
@@ -132,10 +133,6 @@ def _composite_layers(
         none = light.new_zeros(light.shape[0], colours, height, width)
         return torch.cat([none, light.new_full((light.shape[0], each, height, width), empty)], 1)
 
-    def parts(values: Tensor) -> Picture:
-        light, weight = values.tensor_split((colours,), 1)
-        return light, weight
-
     picture = blank(*frame.area)
 
     # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
@@ -157,8 +154,8 @@ def _composite_layers(
             part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
             layers = _scattered(frame, blurs, scatter, group, normalised is not None)
-            light, weight = parts(layers) if normalised is None else normalised(layers)
-            front = parts(part)
+            light, weight = _parts(layers, colours) if normalised is None else normalised(layers)
+            front = _parts(part, colours)
             for i in reversed(range(len(group))):
                 front = composited((light[:, :, i], weight[:, :, i]), front)
             part = where_needed(_needed(frame, blurs, group), torch.cat(front, 1), part)
@@ -166,7 +163,9 @@ def _composite_layers(
             fine = upsampled(part, scale)
             fine = fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
             needed = _needed(frame, blurs, [k for group in groups for k in group])
-            part = where_needed(needed, torch.cat(composited(parts(fine), parts(picture)), 1), picture)
+            part = where_needed(
+                needed, torch.cat(composited(_parts(fine, colours), _parts(picture, colours)), 1), picture
+            )
         picture = part
     return picture
 
@@ -177,13 +176,14 @@ def _scattered(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: lis
     They are ``[B, C + 1 + 1, n, h, w]``, or ``[B, 3 C, n, h, w]`` where each colour has a kernel of its own.
     """
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
+    shares, scale = blurs[group[0]].shares, blurs[group[0]].scale
     layers = frame.layers(min(group), len(group), halo)
     terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1, -1) for term in layers[: 2 + visibility]], 1)
-    terms, kinds = downsampled(terms.flatten(1, 2), blurs[group[0]].scale), terms.shape[1]
-    kernels, shares = blurs[group[0]].kernel, blurs[group[0]].shares
-    if shares is not None:
-        scattered = field.scattered(shares, terms, kernels, half, blurs[group[0]].scale, frame.size)
-        return scattered.unflatten(1, (kinds, len(group)))
+    terms, kinds = downsampled(terms.flatten(1, 2), scale), terms.shape[1]
+    if shares is not None:  # one layer
+        scattered = field.scattered(shares, terms, blurs[group[0]].kernel, half, scale, frame.size)
+        return scattered.unflatten(1, (kinds, 1))
+    kernels = blurs[group[0]].kernel
     if len(group) > 1 or each > 1:
         padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in sorted(group)]
         kernels = torch.cat(padded).repeat(kinds // each, 1, 1)
@@ -197,7 +197,13 @@ def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[
     return functools.partial(frame.any_between, ends[min(layers)], ends[max(layers) + 2], halo)
 
 
+def _parts(values: Tensor, colours: int) -> Picture:
+    """Light, and the channels after it."""
+    light, weight = values.split([colours, values.shape[1] - colours], 1)
+    return light, weight
+
+
 def _mean(summed: Tensor, colours: int) -> Tensor:
     """Light over its weight; 0 where nothing is known."""
-    light, weight = summed.tensor_split((colours,), 1)
+    light, weight = _parts(summed, colours)
     return light / torch.where(weight > _LEAST, weight, torch.inf)

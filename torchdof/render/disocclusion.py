@@ -4,12 +4,16 @@ Where a foreground blurs, what is behind it shows through, and no pixel of the i
 with a weight so small that it speaks only where nothing visible does.
 """
 
+from collections.abc import Iterable
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import pixels
 from .downsampling import downsampled
+from .exporting import exported_graph
 from .matting import NEVER_PX
 
 __all__ = ["BEHIND_STEP", "HIDDEN_WEIGHT", "behind_pixels", "behind_size", "fill_hidden"]
@@ -26,37 +30,21 @@ _CERTAIN = 0.01  # votes from which on a hidden sample has all of its weight, or
 BEHIND_STEP = 2**_FINE_LEVELS
 """Light behind both surfaces is known at every so many pixels, counted from the image's centre."""
 
+Samples = Iterable[tuple[Tensor, Tensor]]
+"""Samples around places, ``[P, C + 2]`` or maps ``[B, C + 2, h, w]``, and their shares of the linear mean of them."""
 
-class _Level:
+
+class _Level(NamedTuple):
     """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
 
     ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
     pixel looks so far, and wholly from twice of it.
     """
 
-    def __init__(self, values: Tensor, size: tuple[int, int], step: int, vote: float | None, least_px: float) -> None:
-        self.height, self.width = values.shape[-2:]
-        self.size = size  # of the image
-        self.flat, self.light = values.movedim(1, -1).flatten(0, 2), values[:, :-2]  # a place's numbers lie together
-        self.step, self.vote, self.least_px = step, vote, least_px
-
-    def behind(self, item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor) -> tuple[Tensor, Tensor]:
-        """Light and coc ``[P, C + 1]`` behind places ``[P]`` of the image, and their weight, 0 where nothing is.
-
-        Interpolated linearly among those of the four samples around that lie behind; plain interpolation would mix in
-        the foreground's own colour.
-        """
-        row = _place(row, self.size[0], self.height, self.step)
-        column = _place(column, self.size[1], self.width, self.step)
-        summed, total = torch.zeros_like(coc_px)[:, None], torch.zeros_like(coc_px)
-        corners, down, right = pixels.corners(item, row, column, self.height, self.width)
-        corner_weights = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
-        for corner, corner_weight in zip(corners, corner_weights, strict=True):
-            sample = self.flat.index_select(0, corner)
-            weight = corner_weight * sample[:, -1] * _is_behind(sample[:, -2] - coc_px)
-            summed, total = summed + sample[:, :-1] * weight[:, None], total + weight
-        total = torch.where(total > 1e-4, total, 0.0)
-        return summed / total.clamp_min(1e-4)[:, None], total
+    values: Tensor
+    step: int
+    vote: float | None
+    least_px: float
 
 
 def _is_behind(distance_px: Tensor) -> Tensor:
@@ -162,60 +150,58 @@ def fill_hidden(
     for _ in range(1, levels):
         pyramid.append(_farthest(*pyramid[-1]))
     size = (height, width)
-    searched = [_Level(torch.cat(level, 1), size, 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
+    searched = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
 
     # what coarse levels show behind cells is one level of such cells; and the farthest of all is behind both surfaces
-    may_hide = _may_hide(coc_px, [far_coc for _, far_coc, _ in pyramid])
+    size = (height, width)
     wanted = (coc_px.abs() > 0.5) & (other_weight < HIDDEN_WEIGHT)
+    # a graph looks at all pixels, others only where they may find something
+    may_hide = wanted if exported_graph() else _may_hide(coc_px, [far_coc for _, far_coc, _ in pyramid])
     cell_rows, cell_columns = whole[0] // BEHIND_STEP, whole[1] // BEHIND_STEP
     nearest = -_largest(-coc_px, cell_rows, cell_columns, BEHIND_STEP)
     cells = torch.cat([may_hide, wanted], 1).to(coc_px.dtype)
-    cells = pixels.indices(_largest(cells, cell_rows, cell_columns, BEHIND_STEP).amin(1, keepdim=True) > 0)
-    item, row, column = pixels.places(cells, cell_rows, cell_columns)
-    row = (row - _centre(cell_rows, coc_px)) * BEHIND_STEP + _centre(height, coc_px)
-    column = (column - _centre(cell_columns, coc_px)) * BEHIND_STEP + _centre(width, coc_px)
-    cell_places = (item, row, column, pixels.pick(nearest, cells)[0])
-    total, seen = _search(searched, *cell_places, farthest=True)
-    shown = pixels.indices(total > 0)
-    behind = pixels.put(searched[_FINE_LEVELS - 1].light, cells[shown], seen[:, :-1].index_select(0, shown).t())
+    cells = _largest(cells, cell_rows, cell_columns, BEHIND_STEP).amin(1, keepdim=True) > 0
+    seen, total = _seen(searched, nearest, cells, size, BEHIND_STEP, farthest=True)
+    behind = torch.where(total > 0, seen[:, :-1], searched[_FINE_LEVELS - 1].values[:, :-2])
     if levels > _FINE_LEVELS:
-        total, seen = _search(searched[_FINE_LEVELS:], *cell_places)
-        values = nearest.new_zeros(nearest.shape[0], seen.shape[1] + 1, *nearest.shape[-2:])
-        values = pixels.put(values, cells, torch.cat([seen, total[:, None]], 1).t())
-        searched = [*searched[:_FINE_LEVELS], _Level(values, size, BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)]
+        coarse = torch.cat(_seen(searched[_FINE_LEVELS:], nearest, cells, size, BEHIND_STEP), 1)
+        searched = [*searched[:_FINE_LEVELS], _Level(coarse, BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)]
 
     # each pixel behind which these levels show something gets it as its second sample
-    hiding = pixels.indices(may_hide & wanted)
-    total, seen = _search(searched, *pixels.places(hiding, height, width), pixels.pick(coc_px, hiding)[0])
-    shown = pixels.indices(total > 0)
-    hiding, seen = hiding[shown], seen.index_select(0, shown).t()
-    return (
-        pixels.put(other_light, hiding, seen[:-1]),
-        pixels.put(other_coc_px, hiding, seen[-1]),
-        pixels.put(other_weight, hiding, HIDDEN_WEIGHT * (total[shown] / _CERTAIN).clamp(max=1.0)),
-        behind,
-    )
+    seen, total = _seen(searched, coc_px, may_hide & wanted, size)
+    weight = HIDDEN_WEIGHT * (total / _CERTAIN).clamp(max=1.0)
+    hidden, visible = (seen[:, :-1], seen[:, -1:], weight), (other_light, other_coc_px, other_weight)
+    light, coc_px, weight = (torch.where(total > 0, *pair) for pair in zip(hidden, visible, strict=True))
+    return light, coc_px, weight, behind
 
 
 def _first_level(
     light: Tensor, coc_px: Tensor, weight: Tensor, height: int, width: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The first step of the pyramid, from the pixels: at every second pixel from the centre, of those around it."""
-    rows, row_share = _window(coc_px.shape[-2], height, 2, coc_px.device)
-    columns, column_share = _window(coc_px.shape[-1], width, 2, coc_px.device)
-
-    def around(values: Tensor) -> Tensor:  # [B, C, height, width, 9]
-        values = values.index_select(-2, rows.flatten()).index_select(-1, columns.flatten())
-        return values.unflatten(-1, (-1, 3)).unflatten(-3, (-1, 3)).transpose(-3, -2).flatten(-2)
-
-    share = (row_share[:, None, :, None] * column_share[:, None]).flatten(-2).to(coc_px.dtype)  # [height, width, 9]
-    coc_around = around(coc_px)
-    farthest = coc_around.amax(-1, keepdim=True)
-    counts = around(weight) * (1.0 - _is_behind(farthest - coc_around)) * (share / 4.0)
-    total = counts.sum(-1)
+    shares, ends = [], []
+    for dim, samples in ((-1, width), (-2, height)):
+        size = coc_px.shape[dim]
+        shares.append(_window(size, samples, 2, coc_px.device)[1].to(coc_px.dtype))
+        before = (2 * samples - size + 1) // 2
+        ends += [before, 2 * samples + 2 - size - before]
+    values = functional.pad(torch.cat([light, coc_px, weight], 1), ends, mode="replicate")
+    planes = functional.pixel_unshuffle(values, 2).unflatten(1, (-1, 4))  # [B, C + 2, 4, height + 1, width + 1]
+    around = []
+    for row in range(3):
+        for column in range(3):
+            plane = planes[:, :, row % 2 * 2 + column % 2, row // 2 :, column // 2 :]
+            share = shares[1][:, row, None] * shares[0][:, column]
+            around.append((plane[..., :height, :width], share / 4.0))
+    # on an axis of even size the last of three has no share
+    farthest = torch.stack([torch.where(share > 0, v[:, -2:-1], -NEVER_PX) for v, share in around]).amax(0)
+    summed = values.new_zeros(())
+    for pixel, share in around:
+        counts = pixel[:, -1:] * (1.0 - _is_behind(farthest - pixel[:, -2:-1])) * share
+        summed = summed + torch.cat([pixel[:, :-1] * counts, counts], 1)
+    total = summed[:, -1:]
     known = total.clamp_min(1e-9)
-    coc_px = torch.where(total > 0, (coc_around * counts).sum(-1) / known, -NEVER_PX)
-    return (around(light) * counts).sum(-1) / known, coc_px, total
+    return summed[:, :-2] / known, torch.where(total > 0, summed[:, -2:-1] / known, -NEVER_PX), total
 
 
 def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -242,26 +228,61 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
     return may_hide
 
 
-def _search(
-    levels: list[_Level], item: Tensor, row: Tensor, column: Tensor, coc_px: Tensor, farthest: bool = False
+def _seen(
+    levels: list[_Level], coc_px: Tensor, mask: Tensor, size: tuple[int, int], step: int = 1, farthest: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """What levels show behind surfaces at some places: the sum of their votes, and light and coc ``[P, C + 1]``.
+    """What levels show behind the surfaces of a map: light and coc ``[B, C + 1, h, w]``, and the sum of their votes.
 
-    With ``farthest``, of two surfaces only the farther one counts.
+    The map, signed coc ``[B, 1, h, w]``, is that of an image of a size at every ``step``-th pixel; there is nothing
+    outside of a mask. With ``farthest``, of two surfaces only the farther one counts.
     """
-    total = torch.zeros_like(coc_px)
-    seen = coc_px.new_zeros(1, levels[0].flat.shape[1] - 1)
-    for level in levels:
-        behind, weight = level.behind(item, row, column, coc_px)
+    height, width = coc_px.shape[-2:]
+    graph = exported_graph()
+    if graph is not None:
+        maps = [graph.samples(level.values, (height, width), level.step / step) for level in levels]
+        seen, total = _search(levels, maps, coc_px, farthest)
+        return seen, total * mask.to(total.dtype)
+    places = pixels.indices(mask)
+    item, row, column = pixels.places(places, height, width)
+    row = (row - _centre(height, coc_px)) * step + _centre(size[0], coc_px)
+    column = (column - _centre(width, coc_px)) * step + _centre(size[1], coc_px)
+    lists = [_samples(level, item, row, column, size) for level in levels]
+    seen, total = _search(levels, lists, pixels.pick(coc_px, places).t(), farthest)
+    batch, channels = coc_px.shape[0], levels[0].values.shape[1]
+    values = pixels.put(coc_px.new_zeros(batch, channels, height, width), places, torch.cat([seen, total], 1).t())
+    return values[:, :-1], values[:, -1:]
+
+
+def _search(levels: list[_Level], samples: list[Samples], coc_px: Tensor, farthest: bool) -> tuple[Tensor, Tensor]:
+    """:func:`_seen` of places ``[P, 1]`` or of whole maps, given the samples of each level around each of them."""
+    total, seen = torch.zeros_like(coc_px), coc_px.new_zeros(levels[0].values.shape[1], *(1,) * (coc_px.ndim - 2))
+    for level, around in zip(levels, samples, strict=True):
+        # of the samples only those that lie behind: plain interpolation would mix in the foreground's own colour
+        behind, weight = torch.zeros_like(coc_px), torch.zeros_like(coc_px)
+        for sample, share in around:
+            part = share * sample[:, -1:] * _is_behind(sample[:, -2:-1] - coc_px)
+            behind, weight = behind + sample * part, weight + part
+        weight = torch.where(weight > 1e-4, weight, 0.0)
+        behind = behind / weight.clamp_min(1e-4)
         looked = (coc_px.abs() / level.least_px - 1.0).clamp(0.0, 1.0)
         vote = looked * (weight if level.vote is None else level.vote * (weight / _SURE).clamp(max=1.0))
         if farthest:
-            apart = behind[:, -1] - seen[:, -1]
+            apart = (behind - seen)[:, -2:-1]
             vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
             total = total * (1.0 - (looked * weight / _CERTAIN).clamp(max=1.0) * _is_behind(apart))
         total = total + vote
-        seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))[:, None]
-    return total, seen
+        seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
+    return seen[:, :-1], total
+
+
+def _samples(level: _Level, item: Tensor, row: Tensor, column: Tensor, size: tuple[int, int]) -> Samples:
+    """The four samples of a level around places ``[P]`` of an image of a size, and their shares of the linear mean."""
+    height, width = level.values.shape[-2:]
+    row, column = _place(row, size[0], height, level.step), _place(column, size[1], width, level.step)
+    flat = level.values.movedim(1, -1).flatten(0, 2)  # a place's numbers lie together
+    corners, down, right = pixels.corners(item, row, column, height, width)
+    shares = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
+    return ((flat.index_select(0, corner), share[:, None]) for corner, share in zip(corners, shares, strict=True))
 
 
 def _least_px(level: int) -> float:

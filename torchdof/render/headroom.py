@@ -40,5 +40,6 @@ def has_room(scale: Tensor) -> bool:
 def _excess(light: Tensor, power: int) -> Tensor:
     """How many times each item's light must be halved, ``[B, 1, 1, 1]``: whole numbers."""
     steps = (math.frexp(torch.finfo(light.dtype).max)[1] - _SUMMED) // power  # in float32 28, or 112
-    peak = torch.nan_to_num(light.detach().abs(), nan=0.0, posinf=0.0).amax((1, 2, 3), keepdim=True)
+    level = light.detach().abs()
+    peak = torch.where(torch.isfinite(level), level, 0.0).amax((1, 2, 3), keepdim=True)
     return (peak / 2.0**steps).clamp_min(1.0).log2().ceil()

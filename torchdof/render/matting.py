@@ -111,7 +111,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     unexplained = colour - own_weight * own_mean - weight * other_mean
     moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
     item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
-    range_of_image = light.flatten(2).aminmax(dim=2)  # bounded: 0 of something infinite would be no number
+    range_of_image = light.amin((2, 3)), light.amax((2, 3))  # bounded: 0 of something infinite would be no number
     least, most = ((extreme[item].t() / brightest).clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in range_of_image)
     moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
     moved = torch.minimum(moved.maximum(weight * least), weight * most)
