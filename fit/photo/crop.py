@@ -30,6 +30,7 @@ class Capture:
         white: level of clipping in both, or None where it is not known.
         exposure: of `blurred` over `sharp`, as stated, or None.
         position_px: the dot's place (x, y) in the sharp frame, from the frame's centre.
+        colours: red, green and blue of `sharp` and of `blurred`, `[3, H, W]` each; None fits their mean alone.
     """
 
     sharp: Array
@@ -39,6 +40,7 @@ class Capture:
     white: float | None = None
     exposure: float | None = None
     position_px: tuple[float, float] = (0.0, 0.0)
+    colours: tuple[Array, Array] | None = None
 
 
 def cut_pairs(
@@ -51,23 +53,29 @@ def cut_pairs(
     white: float | None,
     exposure: float | None,
     middle: tuple[float, float],
+    colours: tuple[Array, Array] | None = None,
 ) -> list[Capture]:
-    """Find the dot, or the dots of a grid, in two frames and cut the windows around each; `middle` is the frame's."""
+    """Find the dot, or the dots of a grid, in two frames and cut the windows around each.
+
+    `middle` is the frame's; `colours` are red, green and blue of either frame, to be cut alike.
+    """
     if dots == "one":
         chosen = [(find_dot(still, file=files[0]), find_dot(moved, file=files[1]))]
     else:
         chosen = _matched(still, moved, magnification, middle, files)
         chosen = chosen[:1] if dots == "centre" else chosen
+    half_width = [_half_width(still, moved, first, second, files) for first, second in chosen]
     return [
         Capture(
-            *_windows(still, moved, first, second, files),
+            *(_one_dot(p, d, half, f) for p, d, f in zip((still, moved), (first, second), files, strict=True)),
             distance_m=distance,
             files=files,
             white=white,
             exposure=exposure,
             position_px=(round(first.x - middle[0], 2), round(first.y - middle[1], 2)),
+            colours=None if colours is None else (_cut(colours[0], first, half), _cut(colours[1], second, half)),
         )
-        for first, second in chosen
+        for (first, second), half in zip(chosen, half_width, strict=True)
     ]
 
 
@@ -92,8 +100,8 @@ def _matched(
     return pairs
 
 
-def _windows(still: Array, moved: Array, first: Dot, second: Dot, files: tuple[str, str]) -> tuple[Array, Array]:
-    """The same odd square around either dot, wide enough for the blur."""
+def _half_width(still: Array, moved: Array, first: Dot, second: Dot, files: tuple[str, str]) -> int:
+    """Half the side of an odd square around either dot, wide enough for the blur."""
     needed = max(first.reach, second.reach) + 2
     half = int(math.ceil(_MARGIN * needed)) + 8
     half_width = min(min(_pixels_to_edge(still, first), _pixels_to_edge(moved, second)), half)
@@ -104,19 +112,26 @@ def _windows(still: Array, moved: Array, first: Dot, second: Dot, files: tuple[s
             file=files[worse],
             number=needed,
         )
-    cut = []
-    for picture, dot, file in ((still, first, files[0]), (moved, second, files[1])):
-        x, y = int(round(dot.x)), int(round(dot.y))
-        window = picture[y - half_width : y + half_width + 1, x - half_width : x + half_width + 1].copy()
-        inside = find_dots(window, file=file)
-        if len(inside) > 1:
-            raise SeveralDotsError(
-                f"{len(inside)} dots in a window of {window.shape[0]} px: print the dots farther apart than their blur",
-                file=file,
-                number=float(len(inside)),
-            )
-        cut.append(window)
-    return cut[0], cut[1]
+    return half_width
+
+
+def _one_dot(picture: Array, dot: Dot, half_width: int, file: str) -> Array:
+    """The window around a dot, or a refusal where another one lies in it."""
+    window = _cut(picture, dot, half_width)
+    inside = find_dots(window, file=file)
+    if len(inside) > 1:
+        raise SeveralDotsError(
+            f"{len(inside)} dots in a window of {window.shape[0]} px: print the dots farther apart than their blur",
+            file=file,
+            number=float(len(inside)),
+        )
+    return window
+
+
+def _cut(picture: Array, dot: Dot, half_width: int) -> Array:
+    """The window around a dot in a picture `[..., H, W]`."""
+    x, y = int(round(dot.x)), int(round(dot.y))
+    return picture[..., y - half_width : y + half_width + 1, x - half_width : x + half_width + 1].copy()
 
 
 def _pixels_to_edge(picture: Array, dot: Dot) -> int:

@@ -17,9 +17,11 @@ from .manifest import Capture
 from .opening import common_opening, turned
 from .pair import fit_pair
 
-__all__ = ["fit_distances", "fit_one", "fit_openings"]
+__all__ = ["KNOTS", "fit_distances", "fit_one", "fit_openings"]
 
-_KNOTS = 33
+KNOTS = 33
+"""Values of a free profile, the same at all distances."""
+
 _SWEEPS = 2
 
 
@@ -80,7 +82,7 @@ def fit_one(
         white=pair.white,
         start=start,
         prior=prior,
-        knots=_KNOTS if family == "radial" else None,
+        knots=KNOTS if family == "radial" else None,
         reach=reach,
         aperture=aperture,
         files=pair.files,

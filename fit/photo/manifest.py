@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -20,10 +20,12 @@ from torchdof.validation import show
 from ..problems import CameraWarning, DistanceError, FitError, ManifestError, NonFiniteError, warn
 from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
+from .mosaic import PATTERNS, demosaiced
 
 __all__ = ["Capture", "Captures", "read_captures", "read_pair"]
 
 MANIFEST = "capture.toml"
+Colours = Literal["mean", "each"]
 _RANGES = {  # beyond any camera's
     "focus_m": (1e-5, 1e6),
     "distance_m": (1e-5, 1e6),
@@ -92,7 +94,11 @@ class Captures:
 
 
 def read_captures(
-    folder: str | os.PathLike[str], *, dots: Dots | None = None, root: str | os.PathLike[str] | None = None
+    folder: str | os.PathLike[str],
+    *,
+    dots: Dots | None = None,
+    colours: Colours | None = None,
+    root: str | os.PathLike[str] | None = None,
 ) -> list[Captures]:
     """Read a folder of photographs described by its `capture.toml`.
 
@@ -108,6 +114,8 @@ def read_captures(
     dark = "dark.png"           # optional: lens cap on, same exposure
     exposure_s = 0.02           # optional: of the sharp picture
     dots = "one"                # or "centre", "each" for a grid of dots
+    colours = "mean"            # or "each": red, green and blue by themselves, a kernel a colour in the table
+    bayer = "RGGB"              # optional: the pictures are a sensor's mosaic, one colour a pixel, linear
     name = "my lens at f/2.8"   # optional
 
     [[shot]]                    # by increasing distance
@@ -119,6 +127,7 @@ def read_captures(
     Args:
         folder: with the manifest and the pictures, or the manifest's path.
         dots: instead of the manifest's "dots".
+        colours: instead of the manifest's "colours".
         root: folder that the manifest and every picture must lie in, links followed, for a service that reads
             manifests of strangers. None reads whatever they name, `../` and absolute paths among it.
 
@@ -154,6 +163,12 @@ def read_captures(
     chosen = dots or fields.get("dots", "one")
     if chosen not in ("one", "centre", "each"):
         raise ManifestError(f"dots must be 'one', 'centre' or 'each', got {chosen!r}", file=where)
+    wanted = colours or fields.get("colours", "mean")
+    if wanted not in ("mean", "each"):
+        raise ManifestError(f"colours must be 'mean' or 'each', got {wanted!r}", file=where)
+    pattern = fields.get("bayer")
+    if pattern not in (None, *PATTERNS):
+        raise ManifestError(f"bayer must be one of {', '.join(PATTERNS)}, got {show(pattern)}", file=where)
     dark = _text(fields, "dark", where)
     sharp = base / _text(fields, "sharp", where, needed=True)  # type: ignore[operator]
     files = [base / _text(shot, "file", where, needed=True) for shot in shots]  # type: ignore[operator]
@@ -161,12 +176,15 @@ def read_captures(
         for file in [sharp, *files, *([] if dark is None else [base / dark])]:
             _inside(file, root, where)
     crop = _crop(fields, where)
-    darkness = None if dark is None else _read(base / dark, transfer, crop=crop).light
-    first = _read(sharp, transfer, darkness, crop)
+    darkness = None if dark is None else _read(base / dark, transfer, None, crop, pattern)
+    first = _read(sharp, transfer, darkness, crop, pattern)
+    if wanted == "each" and first.colours.shape[0] != 3:
+        got = f"got {first.colours.shape[0]}"
+        raise ManifestError(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', {got}", file=where)
     still, exposed = first.light, _optional(fields, "exposure_s", where)
     columns: list[list[Capture]] = []
     for shot, distance, file in zip(shots, distances, files, strict=True):
-        moved = _read(file, transfer, darkness, crop)
+        moved = _read(file, transfer, darkness, crop, pattern)
         if moved.light.shape != still.shape:
             raise ManifestError(f"{file.name} is {size_of(moved.light)}, {sharp.name} is {size_of(still)}", file=where)
         _check_same_camera(first.facts, moved.facts, sharp.name, str(file))
@@ -182,6 +200,7 @@ def read_captures(
                 first.white,
                 None if exposed is None or second is None else second / exposed,
                 first.middle,
+                (first.colours, moved.colours) if wanted == "each" else None,
             )
         )
     camera = {name: _optional(fields, name, where) for name in ("focal_length_mm", "f_number", "sensor_width_mm")}
@@ -241,7 +260,7 @@ def read_pair(
 
 _FIELDS = (
     "focus_m", "sharp", "shot", "focal_length_mm", "f_number", "sensor_width_mm", "transfer", "dark", "exposure_s",
-    "dots", "name", "full_width_px", "crop",
+    "dots", "name", "full_width_px", "crop", "colours", "bayer",
 )  # fmt: skip
 
 
@@ -313,6 +332,7 @@ class _Photograph:
 
     Attributes:
         light: `[H, W]`.
+        colours: `[C, H, W]`, whose mean it is.
         white: the level at which it is clipped, or None.
         width_px: of the whole picture.
         middle: (x, y) of the whole picture's centre in px of `light`.
@@ -321,6 +341,7 @@ class _Photograph:
     """
 
     light: Array
+    colours: Array
     white: float | None
     width_px: int
     middle: tuple[float, float]
@@ -329,11 +350,20 @@ class _Photograph:
 
 
 def _read(
-    path: Path, transfer: Any, dark: Array | None = None, crop: tuple[int, int, int, int] | None = None
+    path: Path,
+    transfer: Any,
+    dark: _Photograph | None = None,
+    crop: tuple[int, int, int, int] | None = None,
+    pattern: str | None = None,
 ) -> _Photograph:
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
     pixels = pixels[[i for i, name in enumerate(picture.channels) if name != "A"]]
+    if pattern is not None:
+        if len(pixels) != 1:
+            got = f"got {len(pixels)} colours"
+            raise ManifestError(f"bayer = {pattern!r} is for pictures with one colour a pixel, {got}", file=str(path))
+        pixels = demosaiced(pixels[0], pattern)
     height, width = pixels.shape[1:]
     middle = ((width - 1) / 2, (height - 1) / 2)
     if crop is not None:
@@ -346,21 +376,21 @@ def _read(
     if bad:
         raise NonFiniteError(f"{bad} values are NaN or infinite", file=str(path), number=float(bad))
     white = 1.0 if picture.sample in ("8", "16") else None
-    # one clipped colour clips the mean
-    clipped = (pixels >= 1.0 - 1e-6).any(axis=0) if white else None
-    light = pixels.mean(axis=0)
+    high = pixels >= 1.0 - 1e-6
     if dark is not None:
-        if dark.shape != light.shape:
-            raise FitError(f"the dark frame is {size_of(dark)}, the picture {size_of(light)}", file=str(path))
-        light = light - dark
-    if clipped is not None:
-        light[clipped] = white
+        if dark.colours.shape != pixels.shape:
+            raise FitError(f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}", file=str(path))
+        pixels = pixels - dark.colours
+    light = pixels.mean(axis=0)
+    if white is not None:
+        pixels[high] = white
+        light[high.any(axis=0)] = white  # one clipped colour clips the mean
     facts = camera_facts(picture.metadata, width)
     if height > width and "sensor_width_mm" in facts:  # turned upright: EXIF speaks of the longer side
         facts["sensor_width_mm"] *= width / height
     original = original_width(picture.metadata)
     taken = original if original is not None and original > width else None
-    return _Photograph(light, white, width, middle, facts, taken)
+    return _Photograph(light, pixels, white, width, middle, facts, taken)
 
 
 def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | None:

@@ -38,7 +38,7 @@ SourceKind = Literal["auto", "image", "dot"]
 _SMALLEST_WINDOW = 15
 _AS_GOOD = 2e-3
 _GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
-_FINE, _SMOOTH_PX = 0.5, 4.0  # share of fine noise and radius of a blur, from either of which on noise is seen
+_FINE = 0.5  # share of fine noise from which on its level can be judged
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
 
@@ -167,8 +167,8 @@ def fit_pair(
     fit = describe(pair, solution, why)
     # a family that was chosen for being cheap is not to blame for what the freest kernel explains
     check_fit(pair, solution, fit, files, fit if freest is solution else describe(pair, freest, ""))
-    # what demosaicing leaves at a hard edge is no noise, and a blur takes it away
-    if edge is not None and linear and (pair.fine_share > _FINE or fit.radius > _SMOOTH_PX):
+    # what demosaicing leaves at an edge is louder than what it leaves of the noise
+    if edge is not None and linear and pair.fine_share > _FINE:
         check_noise(pair, solution, edge.level, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])

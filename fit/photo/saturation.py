@@ -16,15 +16,17 @@ _MOST = 0.6  # share of the dot's pixels beyond which what is left does not fix 
 def plateau(picture: Array, dot: Dot) -> float | None:
     """The level at which a picture is clipped, or None.
 
-    A clipped picture has many pixels at exactly its highest level, although its noise is larger than the distance
-    between its levels. Without noise a flat top is only a flat top.
+    A clipped picture has many pixels at exactly its highest level, more than one level lower, although its noise is
+    larger than the distance between its levels. Without noise a flat top is only a flat top.
     """
     top = float(picture.max())
     above = picture[picture > dot.background + 0.5 * dot.peak]
     at_top = int(np.sum(above == top))
     if at_top < 5 or at_top < 0.02 * above.size:
         return None
-    levels = np.unique(above)
+    levels, counts = np.unique(above, return_counts=True)
+    if levels.size > 1 and counts[-1] <= counts[-2]:
+        return None  # the tail of the noise, in the few levels of a file
     spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
     return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
 

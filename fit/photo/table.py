@@ -18,6 +18,7 @@ from torchdof.validation import show
 from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
 from ..result import Array, BlurFit
 from .agreement import check_agreement, frame_width, promised_px
+from .colours import Colour, fit_colours
 from .distances import fit_distances, fit_one, fit_openings
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
@@ -39,6 +40,8 @@ class TableFit:
         coc_px: signed circle of confusion of each, px of the frame.
         why: how the family was chosen.
         scale: where the circles of confusion come from: "camera" or "measured".
+        colours: red, green and blue by themselves, where the captures have colours: the table then holds a kernel for
+            each, and `fits` are those of their mean.
         coc_per_dioptre_px: the circle of confusion over 1/focus - 1/distance [1/m], px of the frame.
     """
 
@@ -48,6 +51,7 @@ class TableFit:
     why: str
     scale: str
     coc_per_dioptre_px: float
+    colours: tuple[Colour, ...] = ()
 
 
 def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **options: Any) -> BlurTable:
@@ -160,15 +164,11 @@ def fit_captures(
     captures = replace(captures, width_px=frame_width(captures, radius_px))
     check_agreement(captures, radius_px)
     coc_px, scale = _keys(captures, radius_px, scale_of)
-    if family == "radial":
-        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
-        radius = np.array([float(f.params["radius"]) for f in ordered])
-        values = np.stack([np.asarray(f.params["values"]) for f in ordered]) * radius[:, None] ** 2
-        params = {"values": values, "radius": radius}
-    elif family in OPENINGS:
-        params = {"radius": np.array([float(f.params["radius"]) for f in ordered])}
-    else:
-        params = {n: np.array([float(f.params[n]) for f in ordered]) for n in FAMILIES[family]}
+    params, colours = _params(ordered, family), tuple[Colour, ...]()
+    if all(pair.colours is not None for pair in pairs):
+        colours = fit_colours(pairs, ordered, captures.focus_m, family, opening)
+        each = [_params(colour.fits, family) for colour in colours]
+        params = {n: np.stack([p[n] for p in each]) for n in params}
     if len(pairs) == 1:
         text = (
             f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
@@ -176,13 +176,26 @@ def fit_captures(
         )
         warn(SingleDistanceWarning(text, file=pairs[0].files[1], number=pairs[0].distance_m))
     return TableFit(
-        table=_table(captures, ordered, coc_px, params, family, opening, scale, command, why),
+        table=_table(captures, ordered, coc_px, params, family, opening, scale, command, why, colours),
         fits=tuple(ordered),
         coc_px=tuple(coc_px),
         why=why,
         scale=scale,
         coc_per_dioptre_px=coc_px[0] / (1 / captures.focus_m - 1 / pairs[0].distance_m),
+        colours=colours,
     )
+
+
+def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
+    """Parameters of a table of these fits by name, px: `[N]`, and `values` `[N, P]`."""
+    radius = np.array([float(f.params.get("radius", 0.0)) for f in fits])
+    if family == "radial":
+        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
+        values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
+        return {"values": values, "radius": radius}
+    if family in OPENINGS:
+        return {"radius": radius}
+    return {n: np.array([float(f.params[n]) for f in fits]) for n in FAMILIES[family]}
 
 
 def _first_fits(
@@ -237,6 +250,7 @@ def _table(
     scale: str,
     command: str,
     why: str,
+    colours: tuple[Colour, ...],
 ) -> BlurTable:
     """The blur table of the fits, in mm of the sensor where its width is known, with its provenance."""
     sensor = captures.sensor_width_mm
@@ -254,6 +268,11 @@ def _table(
         "asymmetry": [round(f.asymmetry, 4) for f in fits],
         **dict(captures.notes),
     }
+    if colours:
+        provenance["colours"] = [c.name for c in colours]
+        shifts = [c.focus_shift_dioptres for c in colours]
+        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
+        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
     for name in ("focal_length_mm", "f_number", "sensor_width_mm"):
         if getattr(captures, name) is not None:
             provenance[name] = getattr(captures, name)

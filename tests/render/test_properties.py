@@ -39,6 +39,12 @@ class Scene:
         options = {k: turn(v).contiguous() if isinstance(v, Tensor) else v for k, v in self.options.items()}
         return Scene(self.seed, turn(self.image).contiguous(), turn(self.coc_px).contiguous(), options)
 
+    def exposed(self, times: float) -> "Scene":
+        options = dict(self.options)
+        if "background" in options:
+            options["background"] = options["background"] * times
+        return Scene(self.seed, self.image * times, self.coc_px, options)
+
 
 def beside_the_edge_of_focus(coc_px: Tensor) -> Tensor:
     """What is in focus passes through, and what is blurred by a hair more does not: no scene is on that edge."""
@@ -74,7 +80,7 @@ def random_scene(seed: int, ways: Sequence[str], lamps: bool = True, multiple: i
     elif kind == "blocks":
         image = blocks(uniform(1, colours, height // 5 + 1, width // 5 + 1), 5)
     elif kind == "edges":
-        image = 0.05 + 0.9 * (image < 0.5)
+        image = 0.05 + 0.9 * (image < 0.5).double()
 
     kind = draw.choice(["planes", "planes", "discs", "smooth", "slope", "noise", "checkerboard", "step"])
     if kind == "planes":
@@ -170,6 +176,17 @@ def test_ordinary_light_stays_within_its_range(seeds: range, tolerance: float, d
         light = torch.stack([scene.image, scene.options.get("background", scene.image)])
         out = scene.blurred(dtype, tolerance)
         assert float(light.min()) - 1e-3 <= float(out.min()) and float(out.max()) <= float(light.max()) + 1e-3, seed
+
+
+@seeds(12)
+def test_exposure_decides_nothing(seeds: range, dtype: torch.dtype) -> None:
+    for seed in seeds:
+        scene = random_scene(seed, ["deep", "background", "accumulated"])
+        picture = scene.blurred(dtype, 1 / 255)
+        for times in (1e-6, 1e6):
+            difference = scene.exposed(times).blurred(dtype, 1 / 255) / times - picture
+            most = 1e-9 if dtype == torch.float64 else 4e-4
+            assert float(difference.abs().max()) < most * max(1.0, float(scene.image.max())), f"scene {seed}"
 
 
 @seeds(12)

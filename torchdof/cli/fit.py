@@ -54,6 +54,13 @@ def fit(
             rich_help_panel=_CAPTURE,
         ),
     ] = "manifest",
+    colours: Annotated[
+        Literal["manifest", "mean", "each"],
+        typer.Option(
+            help="Fit the mean of the colours; or each, which makes a table with a kernel a colour.",
+            rich_help_panel=_CAPTURE,
+        ),
+    ] = "manifest",
     target: Annotated[
         Path | None,
         typer.Option(help="Write the target to print (PDF), and nothing else.", rich_help_panel=_TARGET),
@@ -147,7 +154,12 @@ def fit(
             facts = _facts(photographs.captures, result, messages)
             typer.echo(json_line({"out": str(out), **facts, "advice": list(photographs.advice)}))
         return
-    capture_sets = read_captures(str(captures), dots=None if dots == "manifest" else dots, root=root)
+    capture_sets = read_captures(
+        str(captures),
+        dots=None if dots == "manifest" else dots,
+        colours=None if colours == "manifest" else colours,
+        root=root,
+    )
     first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
     for i, capture_set in enumerate(capture_sets):
         table_file = out if len(capture_sets) == 1 else out.with_name(f"{out.stem}_{i:02d}.json")
@@ -271,8 +283,25 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
         + ("from focal length and f-number" if result.scale == "camera" else "measured, the thin lens in between"),
         highlight=False,
     )
+    if result.colours:
+        _tell_colours(captures, result, console)
     for message in messages:
         console.print(f"warning: {message}", style="yellow", markup=False, highlight=False)
+
+
+def _tell_colours(captures: Captures, result: TableFit, console: Console) -> None:
+    """Prints what differs between the colours: the size of their blur, their focus, and where they lie."""
+    shown = Table(title="colours, beside green", title_justify="left")
+    for column in ("", "focus m", *(f"radius px at {pair.distance_m:g} m" for pair in captures), "lateral px in focus"):
+        shown.add_column(column, justify="right")
+    for colour in result.colours:
+        shift, (x, y) = colour.focus_shift_dioptres, colour.lateral_px[0]
+        vergence = 1 / captures.focus_m + shift
+        focus = "" if math.isnan(shift) else f"{1 / vergence:.4g}" if vergence > 0 else "beyond infinity"
+        radii = [f"{f.radius:.2f} ± {f.radius_stderr:.2g}" for f in colour.fits]
+        shown.add_row(colour.name, focus, *radii, f"({x:+.2f}, {y:+.2f})")
+    console.print(shown)
+    console.print("the table holds a kernel a colour; lateral colour is no blur, and not in it", highlight=False)
 
 
 def _facts(captures: Captures, result: TableFit, messages: list[str]) -> dict[str, Any]:
@@ -290,7 +319,16 @@ def _facts(captures: Captures, result: TableFit, messages: list[str]) -> dict[st
         for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True)
     ]
     chosen = {"name": captures.name, "family": result.table.family, "why": result.why, "scale": result.scale}
-    return {**chosen, "focus_m": captures.focus_m, "fits": fits, "warnings": messages}
+    colours = [
+        {
+            "name": colour.name,
+            "radius_px": [f.radius for f in colour.fits],
+            "focus_shift_dioptres": colour.focus_shift_dioptres,
+            "lateral_px": colour.lateral_px,
+        }
+        for colour in result.colours
+    ]
+    return {**chosen, "focus_m": captures.focus_m, "fits": fits, "colours": colours, "warnings": messages}
 
 
 def _lens_summary(table: BlurTable, console: Console) -> None:

@@ -267,6 +267,9 @@ def test_unclipped_captures_do_not_warn(simulator):
         simulator.Simulator(level=0.7, bits=8, snr_db=60, black=0.02),
     ):
         fit_pair(*camera.pair("gaussian", {"sigma": 3.0}), "gaussian")
+    # of twelve, the draw in which the highest of a JPEG's few levels had ten pixels
+    pair = simulator.Simulator(jpeg=90, level=0.7, black=0.02, size=91).pair("disc", {"radius": 6.0}, 3)
+    fit_pair(*pair, "disc")
 
 
 def test_a_sharp_picture_out_of_focus_is_said_and_deconvolved(simulator):

@@ -1,0 +1,95 @@
+"""A kernel a colour from one capture: lateral and longitudinal colour told apart, against a simulated lens."""
+
+import numpy as np
+import pytest
+
+from torchdof import BlurTable
+from torchdof.fit import Capture, Captures, fit_captures, read_captures
+from torchdof.fit import problems as p
+from torchdof.fit.photo.mosaic import PATTERNS, demosaiced
+
+PER_DIOPTRE, FOCUS = 24.0, (-0.04, 0.0, 0.05)  # px a dioptre, and how much nearer each colour is focused, 1/m
+SIDE = ((0.5, -0.2), (0.0, 0.0), (-0.3, 0.4))  # px by which each colour lies beside green
+DISTANCES = (0.75, 1.4)
+
+
+def frames(simulator, distance, seed, size=61):
+    """Red, green and blue of a dot `[3, H, W]`, each with its own focus and place."""
+    rng, m = np.random.default_rng(seed), 1 / distance
+    seen = []
+    for focus, (x, y) in zip(FOCUS, SIDE, strict=True):
+        dot = simulator.draw_dot(size, 7.0 * m, (x * m, y * m))
+        radius = abs(PER_DIOPTRE * (1 - 1 / distance + focus))
+        seen.append(
+            (simulator.blur(dot, "disc", {"radius": radius}) if radius else dot) + rng.normal(0, 0.005, dot.shape)
+        )
+    return np.stack(seen)
+
+
+def captures(simulator, distances=DISTANCES, record=lambda seen: seen):
+    still = record(frames(simulator, 1.0, 0))
+    pairs = []
+    for distance in distances:
+        moved = record(frames(simulator, distance, round(100 * distance)))
+        pairs.append(Capture(still.mean(0), moved.mean(0), distance, colours=(still, moved)))
+    return Captures(tuple(pairs), focus_m=1.0, width_px=1000)
+
+
+def check(result, distances, tolerance):
+    """Blur and place of each colour against the truth: radii to a share, places to three times as many px."""
+    for colour, focus, side in zip(result.colours, FOCUS, SIDE, strict=True):
+        true = [abs(PER_DIOPTRE * (1 - 1 / d + focus)) for d in distances]
+        assert [f.params["radius"] for f in colour.fits] == pytest.approx(true, rel=tolerance)
+        places = [side, *[(side[0] / d, side[1] / d) for d in distances]]
+        assert np.allclose(colour.lateral_px, places, atol=3 * tolerance)
+
+
+def test_lateral_and_longitudinal_colour_are_told_apart(simulator, tmp_path):
+    result = fit_captures(captures(simulator), "disc")
+    check(result, DISTANCES, 0.012)
+    assert [c.focus_shift_dioptres for c in result.colours] == pytest.approx(FOCUS, abs=0.003)
+    result.table.save(tmp_path / "colours.json")
+    table = BlurTable.load(tmp_path / "colours.json")
+    assert table.channels == 3 and table.provenance["colours"] == ["red", "green", "blue"]
+    nodes = 1000 * table.node_params["radius"].numpy()
+    assert nodes[0, 1] < nodes[1, 1] < nodes[2, 1] and nodes[0, 0] > nodes[1, 0] > nodes[2, 0]
+    assert table.provenance["lateral_px"][0][0] == pytest.approx(SIDE[0], abs=0.05)
+
+
+@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.SingleDistanceWarning")
+def test_a_mosaic_tells_the_same_as_three_colours(simulator):
+    def through_mosaic(seen):
+        mosaic = seen[1].copy()
+        mosaic[::2, ::2], mosaic[1::2, 1::2] = seen[0, ::2, ::2], seen[2, 1::2, 1::2]
+        return demosaiced(mosaic, "RGGB")
+
+    check(fit_captures(captures(simulator, [1.4], through_mosaic), "disc", smooth=False), [1.4], 0.03)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_demosaicing_keeps_planes(pattern):
+    rows, columns = np.indices((8, 10))
+    planes = np.stack([0.1 * columns + 0.2, 0.1 * rows + 0.3, 0.05 * (rows + columns)])
+    mosaic = np.zeros((8, 10))
+    for i, name in enumerate(pattern):
+        mosaic[i // 2 :: 2, i % 2 :: 2] = planes["RGB".index(name)][i // 2 :: 2, i % 2 :: 2]
+    assert np.allclose(demosaiced(mosaic, pattern)[:, 2:-2, 2:-2], planes[:, 2:-2, 2:-2])
+
+
+def test_a_folder_is_read_by_colour(simulator, tmp_path):
+    camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
+    simulator.write_captures(tmp_path, camera, 0.5, [0.8], lambda d: ("disc", {"radius": 6.0}), width=120, height=90)
+    (pair,) = read_captures(tmp_path, colours="each")[0]
+    still, moved = pair.colours
+    assert still.shape == moved.shape == (3, *pair.sharp.shape)
+    assert np.allclose(still.mean(0), pair.sharp) and np.allclose(moved.mean(0), pair.blurred)
+    assert read_captures(tmp_path)[0].pairs[0].colours is None
+    manifest = (tmp_path / "capture.toml").read_text()
+    for line, match in (
+        ('bayer = "RGBG"', "bayer must be one of RGGB, BGGR"),
+        ('bayer = "RGGB"', "is for pictures with one colour a pixel, got 3 colours"),
+        ('colours = "all"', "colours must be 'mean' or 'each'"),
+    ):
+        (tmp_path / "capture.toml").write_text(f"{line}\n{manifest}")
+        with pytest.raises(p.ManifestError, match=match):
+            read_captures(tmp_path)
