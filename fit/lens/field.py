@@ -130,16 +130,11 @@ def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, 
 
 
 def coc_nodes(near_mm: float, far_mm: float, count: int) -> list[float]:
-    """Signed coc from the nearest to the farthest, closer to each other near focus; so many on the longer side.
+    """Signed coc from the nearest to the farthest, closer to each other near focus; so many on either side.
 
     Example:
         >>> [round(coc, 3) for coc in coc_nodes(-0.4, 0.1, 2)]
-        [-0.4, -0.141, 0.0, 0.1]
+        [-0.4, -0.141, 0.0, 0.035, 0.1]
     """
-    longest = max(-near_mm, far_mm)
-    steps = [longest * (i / count) ** _GROWING for i in range(1, count + 1)]
-    sides = []
-    for end in (-near_mm, far_mm):
-        inner = [c for c in steps if c < end * (1.0 - 0.5 / count)]
-        sides.append([*inner, end] if end > 0 else [])
-    return [*(-c for c in reversed(sides[0])), 0.0, *sides[1]]
+    steps = [(i / count) ** _GROWING for i in range(1, count + 1)]
+    return [*(near_mm * step for step in reversed(steps)), 0.0, *(far_mm * step for step in steps if far_mm > 0)]

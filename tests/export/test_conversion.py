@@ -115,8 +115,9 @@ def test_weights_lie_beside_their_convolutions(layered: Any) -> None:
         for node in graph.node:
             if node.op_type == "Conv":
                 weight = made[node.input[1]]
-                assert weight.op_type in ("Constant", "Gather") and len(node.input) == 2
-                assert weight.op_type == "Constant" or all(made[n].op_type == "Constant" for n in weight.input)
+                sources = [weight] if weight.op_type != "Gather" else [made[name] for name in weight.input]
+                assert all(source.op_type in ("Constant", "ConstantOfShape") for source in sources)
+                assert len(node.input) == 2
 
 
 @pytest.mark.parametrize(

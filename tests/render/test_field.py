@@ -111,7 +111,7 @@ def lopsided(channels: int = 1) -> BlurTable:
     coc, radius = torch.tensor([-0.5, -0.2, 0.0, 0.3, 0.6]), torch.tensor([0.0, 8.0, 18.0])
     size = (coc[:, None].abs() + 0.01) * (1.0 - 0.02 * radius)
     box = torch.stack([0.02 * radius * size, size, (1.0 + 0.03 * radius) * size], -1)
-    u, v = torch.linspace(-1, 1, 24)[:, None], torch.linspace(0, 1, 12)
+    u, v = torch.linspace(-1, 1, 96)[:, None], torch.linspace(0, 1, 48)
     inside = (torch.hypot(u, v) < 1.0) * (1.0 + 0.05 * radius[:, None, None] * (u + 1.0))
     light = torch.stack([inside * (1.0 + 0.3 * c * u) for c in range(channels)])[:, None].expand(-1, 5, -1, -1, -1)
     params = {"radius": coc.abs().expand(channels, -1)}
@@ -133,8 +133,8 @@ def test_a_spot_lies_outwards_of_its_place_and_is_turned_with_it(y: float, x: fl
     u, v = (step[:, None] * y + step * x) / distance, (step[:, None] * x - step * y) / distance
     assert table.field is not None
     box, light = table.field.spots(coc_px / per_mm, number(distance)[None])
-    along = (box[0, 0] + box[0, 1] * ((torch.arange(24, dtype=torch.float64) + 0.5) / 12 - 1.0)) * per_mm
-    across = (torch.arange(12, dtype=torch.float64) + 0.5) / 12 * box[0, 2] * per_mm
+    along = (box[0, 0] + box[0, 1] * ((torch.arange(96, dtype=torch.float64) + 0.5) / 48 - 1.0)) * per_mm
+    across = (torch.arange(48, dtype=torch.float64) + 0.5) / 48 * box[0, 2] * per_mm
     of_u, of_v = light[0, 0].sum(-1), light[0, 0].sum(0)
     mean = float((of_u * along).sum())
     assert float(kernel.sum()) == pytest.approx(1.0, abs=1e-12)

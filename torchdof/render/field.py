@@ -147,9 +147,9 @@ def _made(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int], fi
     sides = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64) * boxes[:, 2:]
     whole = torch.cat([light.flip(-1), light], -1)  # [C, distances, U, 2 V]
     area = cells.prod(-1)[:, None, None]
-    # a sample sees as much of it as makes one pixel with what linear interpolation adds
+    # a sample sees as much of it as makes one pixel with what light gathered in cells and linear interpolation add
     samples = around[:, 1:] / torch.tensor([rows, columns])
-    pixel = (1.0 - 2.0 * samples.square()).clamp_min(_LEAST_SEEN**2).sqrt()
+    pixel = (1.0 - 2.0 * samples.square() - 3.0 * cells.square()).clamp_min(_LEAST_SEEN**2).sqrt()
     values = _overlaps(along, ends, pixel[:, 0]) @ (whole / area)
     values = values @ _overlaps(across, sides, pixel[:, 1]).transpose(-2, -1)
     return values / values.amax((0, 2, 3), keepdim=True), around
