@@ -67,7 +67,8 @@ def cut_pairs(
     half_width = [_half_width(still, moved, first, second, files) for first, second in chosen]
     return [
         Capture(
-            *(_one_dot(p, d, half, f) for p, d, f in zip((still, moved), (first, second), files, strict=True)),
+            sharp=_one_dot(still, first, half, files[0]),
+            blurred=_one_dot(moved, second, half, files[1]),
             distance_m=distance,
             files=files,
             white=white,

@@ -170,7 +170,9 @@ class Forward:
         """The lens's opening with the parameters that belong to it."""
         if self.opening is None:
             raise AssertionError("kernels that are not round are those of an opening")
-        return replace(self.opening, **{n: v for n, v in params.items() if n != "radius"})
+        known = self.opening
+        turn, curvature = params.get("rotation_deg", known.rotation_deg), params.get("curvature", known.curvature)
+        return replace(known, rotation_deg=turn, curvature=curvature)
 
     def _size_of_opening(self) -> float:
         """Radius of the uniform disc with the opening's second moment, over the radius of the circle around it."""
