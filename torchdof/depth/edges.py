@@ -160,7 +160,10 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels)
-    shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0]) > -_LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
+    shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
+    if auto:  # else steps that prove right are asked as well, and would be moved
+        shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
+    shows_near = shows_near > 0
 
     # and what is so thin that a ramp swallowed part of its depth
     sigma, length = _blur_of(given, valid, edges)

@@ -819,6 +819,7 @@ class Repair {
 
   // Marks the pixels that show the near surface; returns how many pixels of it at each edge the map has as far ones.
   float choose(std::vector<Group> &groups) {
+    const float lean = map_.automatic ? LEAN : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<double> lost(groups.size(), 0.0);
@@ -826,7 +827,7 @@ class Repair {
       for (size_t k = 0; k < groups[g].pixels.size(); k++) {
         const int i = groups[g].pixels[k];
         const float score = groups[g].judged[k].score;
-        const bool shows_near = score + prior[kind_[i]] > -LEAN * clamp01(std::fabs(score) - 1.0f);
+        const bool shows_near = score + prior[kind_[i]] > -lean * clamp01(std::fabs(score) - 1.0f);
         marks_[i] = (uint8_t)((marks_[i] & ~NEAR) | (shows_near ? NEAR : 0));
       }
       const Part &part = groups[g].part;
