@@ -39,6 +39,18 @@ def test_the_picture_shows_kernels_in_front_above_and_behind_below(
         assert (left > right) != behind  # the triangle's corner points left behind focus
 
 
+def test_tables_that_depend_on_the_place_show_kernels_from_the_middle_to_the_corner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    told = run("disc", "--vignetting", "0.6", "-o", "kernels.png")
+    assert "vignetting 0.6" in told
+    picture = read_image("kernels.png").pixels[0, 0]
+    rows = picture[34 + 5 * 120 + 2 : 34 + 6 * 120, 8 : 8 + 4 * 118]
+    lit = [float((part > 0.1).sum()) for part in rows.split(118, 1)]
+    assert lit[0] > 1.1 * lit[1] > 1.2 * lit[2] > 1.2 * lit[3]
+
+
 def test_json_tells_programs_the_same() -> None:
     facts = json.loads(run("double_gauss_50mm_f2", "--json"))
     assert (facts["table"], facts["family"], facts["nodes"], facts["unit"]) == (

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 from torchdof import BlurTable
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
+from torchdof.reference.lens_views import lens_views_by_coc
 
 COC, RADIUS = torch.tensor([-2.0, 0.5, 1.0]), torch.tensor([0.0, 10.0, 20.0])
 
@@ -98,6 +99,8 @@ def test_bad_files_are_refused_by_name(change: dict[str, Any], message: str) -> 
 
 
 def test_what_goes_with_no_field_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="one spot all over the frame"):
+        lens_views_by_coc(torch.rand(1, 3, 8, 8), torch.ones(1, 1, 8, 8), table=table())
     with pytest.raises(ValueError, match="has its own opening"):
         table().with_aperture(Aperture(blades=5))
     with pytest.raises(ValueError, match="must state its unit"):

@@ -1,5 +1,6 @@
 """``torchdof tables``: which blur tables there are, and pictures of their kernels."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,8 @@ from torch import Tensor
 from ..io.sheet import write_sheet
 from ..optics import table_file
 from ..optics.blur_table import BlurTable
-from .arguments import ApertureImage, AsJson, Blades, Curvature, Rotation, Squeeze
+from ..render.field import layer_shares, own_kernels, placed
+from .arguments import ApertureImage, AsJson, Blades, Curvature, Rotation, Squeeze, Vignetting
 from .printed import json_line
 from .settings import load_aperture, load_table
 
@@ -21,6 +23,7 @@ _WIDTH = 1920  # px of the image that kernels are shown for
 _COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)
 _CELL = (120, 230)  # rows and columns of a kernel's picture, as wide as a caption
 _ZOOM = 2  # picture's pixels a pixel
+_PLACES = (0.0, 0.4, 0.7, 0.95)  # of the way from the middle of the frame to its corner
 
 
 def tables(
@@ -37,18 +40,21 @@ def tables(
     curvature: Curvature = 0.0,
     squeeze: Squeeze = 1.0,
     aperture: ApertureImage = None,
+    vignetting: Vignetting = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """List blur tables, and draw their kernels.
 
     The picture has a column for each table and a row for each signed blur radius, from 24 pixels in front of the focus
-    plane to 24 behind it, in an image of 1920 pixels. Each kernel is as bright as its brightest pixel allows.
+    plane to 24 behind it, in an image of 1920 pixels. Each kernel is as bright as its brightest pixel allows. Of a
+    table whose kernels depend on the place it has four columns, from the middle of a frame of 3:2 to its lower right
+    corner.
 
         torchdof tables -o tables.png
 
         torchdof tables disc my_lens.json --blades 7 --rotation 15 -o seven_blades.png
     """
-    opening = load_aperture(blades, rotation, curvature, squeeze, aperture)
+    opening = load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)
     panels = {}
     for name in names or ["disc", "gaussian", *table_file.shipped()]:
         table = load_table(name, opening)
@@ -58,6 +64,8 @@ def tables(
             panels[Path(name).stem] = _column(table)
     if out is None:
         return
+    widest = max(panel.shape[-1] for panel in panels.values())
+    panels = {name: functional.pad(panel, (0, widest - panel.shape[-1])) for name, panel in panels.items()}
     write_sheet(out, panels, caption=34)
     if not as_json:
         radii = ", ".join(f"{coc:g}" for coc in _COC_PX)
@@ -74,6 +82,7 @@ def _facts(name: str, table: BlurTable) -> dict[str, Any]:
         "unit": table.unit,
         "colours": table.channels,
         "aperture": None if table.aperture is None else repr(table.aperture),
+        "field": None if table.field is None else repr(table.field),
         "source": str(table.provenance.get("source", "")).partition(";")[0],
     }
 
@@ -88,15 +97,33 @@ def _line(facts: dict[str, Any]) -> str:
         parts.append(f"{facts['colours']} colours")
     if facts["aperture"]:
         parts.append(facts["aperture"])
+    if facts["field"]:
+        parts.append(facts["field"])
     return f"{facts['table']:24s} {'; '.join(parts)}" + (f" ({facts['source']})" if facts["source"] else "")
 
 
 def _column(table: BlurTable) -> Tensor:
-    """Kernels of a table below each other, ``[1, 3, rows, columns]`` in linear light."""
+    """Kernels of a table below each other, ``[1, 3, rows, columns]`` in linear light; beside each other over places."""
     size = _CELL[0] // _ZOOM // 2 * 2 - 1
-    kernels = table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()  # [n, 1 or C, size, size]
-    kernels = kernels / kernels.amax((1, 2, 3), keepdim=True)
-    shown = kernels[:, :3] if kernels.shape[1] >= 3 else kernels[:, :1].expand(-1, 3, -1, -1)
+    places = _PLACES if table.depends_on_place else (0.0,)
+    columns = [_kernels(table, place, size) for place in places]  # [n, 1 or C, size, size]
+    shown = torch.cat([k / k.amax((1, 2, 3), keepdim=True) for k in columns], -1)
+    shown = shown[:, :3] if shown.shape[1] >= 3 else shown[:, :1].expand(-1, 3, -1, -1)
     shown = functional.interpolate(shown, scale_factor=float(_ZOOM), mode="nearest")
-    below, beside = _CELL[0] - shown.shape[-1], _CELL[1] - shown.shape[-1]
+    below, beside = _CELL[0] - shown.shape[-2], max(0, _CELL[1] - shown.shape[-1])
     return functional.pad(shown, (beside // 2, beside - beside // 2, below, 0)).transpose(0, 1).flatten(1, 2)[None]
+
+
+def _kernels(table: BlurTable, place: float, size: int) -> Tensor:
+    """Kernels ``[n, 1 or C, size, size]`` at a part of the way from the middle of the frame to its corner."""
+    if not table.depends_on_place:
+        return table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()
+    frame = (round(_WIDTH / 1.5), _WIDTH)
+    y, x = (torch.tensor([place * side / math.hypot(*frame)]) for side in frame)
+    kernels = []
+    for coc in _COC_PX:
+        own = own_kernels(table, torch.tensor([coc]), _WIDTH, window=size).float()
+        shares = layer_shares(table, coc, 1, frame).to(own)
+        kernel = placed(own, [(shares, own.new_ones(()))], y, x)[0]
+        kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))
+    return torch.stack(kernels)

@@ -133,6 +133,8 @@ def lens_views_by_coc(
     table = BlurTable.disc() if table is None else table
     if table.aperture is not None:
         raise ValueError(f"many views are taken through a round lens, got {table!r}; take with_aperture(None) of it")
+    if table.field is not None:
+        raise ValueError(f"many views have one spot all over the frame, got {table!r}; take replace(field=None) of it")
     validation.image_and_coc(image, coc_px, table.channels, values=True)
     if isinstance(views, bool) or not isinstance(views, int) or views < 1:
         raise ValueError(f"views must be a whole number of points on the lens, at least 1, got {views!r}")

@@ -114,7 +114,8 @@ def ray_shares(table: BlurTable, coc_px: Sequence[float], size: tuple[int, int])
     radii = sorted(math.copysign(_RAY_STEP**step, -1.0 if near else 1.0) for near, step in steps)
     keys = [("ray", table.fingerprint(), radius, 1, size) for radius in radii]
     made = _shares.get_all(keys, lambda missing: [_made(table, key[2], 1, size, _FINE[1]) for key in missing])
-    return [Shares(*parts, radius, _squeeze(table)) for parts, radius in zip(made, radii, strict=True)]
+    squeeze = _squeeze(table)
+    return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(made, radii, strict=True)]
 
 
 def _squeeze(table: BlurTable) -> float | Tensor:
@@ -207,7 +208,7 @@ def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x
     of_place = []
     for each, _ in shares:
         of_place.append(torch.lerp(each.boxes[low], each.boxes[low + 1], near[:, None]))  # [n, 3]
-    box = sum(part.reshape(-1, 1) * box for (_, part), box in zip(shares, of_place, strict=True))
+    box = torch.stack([part.reshape(-1, 1) * box for (_, part), box in zip(shares, of_place, strict=True)]).sum(0)
     grid = torch.stack([2.0 * v / box[:, 2:, None] - 1.0, (u - box[:, :1, None]) / box[:, 1:2, None]], -1)
     share = kernel.new_zeros(())
     for each, part in shares:
