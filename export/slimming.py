@@ -169,7 +169,8 @@ class _Cuts(onnx_ir.passes.InPlacePass):
             first = None if whole is None else whole.producer()
             if first is None or first.op_type != "Slice":
                 continue
-            axes = [onnx_ir.convenience.get_const_tensor(n.inputs[3]) for n in (first, node)]
+            along: list[Any] = [first.inputs[3], node.inputs[3]]
+            axes = [onnx_ir.convenience.get_const_tensor(value) for value in along]
             if axes[0] is None or axes[1] is None or set(axes[0].numpy()) & set(axes[1].numpy()):
                 continue
             tape = Tape()
@@ -193,9 +194,9 @@ class _Averages(onnx_ir.passes.InPlacePass):
             if [n.op_type for n in following] != ["Pad"]:
                 continue
             (pad,) = following
-            convolutions = [use.node for use in pad.outputs[0].uses() if use.node.op_type == "Conv"]
             scale = node.attributes["kernel_shape"].as_ints()[0]
-            channels = convolutions[0].inputs[0].shape[1]  # type: ignore[union-attr, index]
+            filled_shape: Any = pad.outputs[0].shape
+            channels = int(filled_shape[1])
             weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
             tape = Tape()
             filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
