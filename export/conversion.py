@@ -4,7 +4,7 @@ import contextlib
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ def to_onnx(
     channels: int = 3,
     width: int | None = None,
     opset: int = OPSET,
+    progress: Callable[[str], object] = lambda _: None,
 ) -> Verification:
     """Write a module as one ONNX file, verified against the module.
 
@@ -60,6 +61,7 @@ def to_onnx(
         width: For a table with lengths in millimetres or fractions of the width: the image width whose kernels the file
             holds. A radius in pixels then has this kernel at any width.
         opset: ONNX operator set, 20 or newer.
+        progress: Is called with what begins: tracing, translating, slimming, then verifying each case.
 
     Returns:
         The comparison with the module; ``print`` shows it as a table.
@@ -85,20 +87,24 @@ def to_onnx(
     if not path.parent.is_dir():
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
     portable = Portable(dof, inputs, width)
-    model = onnx_ir.to_proto(broadcast(slim(_translate(portable, channels, opset)), portable.inputs))
+    progress("tracing")
+    program = trace(portable, channels)
+    progress("translating")
+    graph = _translate(program, portable.inputs, opset)
+    progress("slimming")
+    model = onnx_ir.to_proto(broadcast(slim(graph), portable.inputs))
     label(model, dof, portable, channels, opset)
     with whole_file(path) as part:
         onnx.save_model(model, part, format="protobuf")
-        return verify(part, dof)
+        return verify(part, dof, progress=progress)
 
 
-def _translate(portable: Portable, channels: int, opset: int) -> onnx_ir.Model:
+def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -> onnx_ir.Model:
     """The module as an ONNX graph, as torch.onnx gives it: not yet slimmed."""
-    program = trace(portable, channels)
     # torch.onnx would trace all of it once more, to take apart operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
     frame = {0: "B", 2: "H", 3: "W"}
-    names = INPUTS[portable.inputs]
+    names = INPUTS[inputs]
     shapes = (frame, frame, *(({0: "B"}, {0: "B"}),) * (len(names) > 2))
     with _quiet():
         converted = torch.onnx.export(

@@ -91,15 +91,12 @@ class _Pinned(BlurTable):
     """A table whose kernels are those of one image width, whatever the width of the image at hand."""
 
     def __init__(self, table: BlurTable, width: int) -> None:
-        fields = table.to_dict()
-        fields = {
-            k: v for k, v in fields.items() if k not in ("schema", "version", "family", "coc", "params", "aperture")
-        }
-        super().__init__(table.family, table.coc, table.node_params, **fields, aperture=table.aperture)
-        self._scale = super()._px_per_unit(width)
+        names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture", "field")
+        super().__init__(table.family, table.coc, table.node_params, **{name: getattr(table, name) for name in names})
+        self._scale = super().px_per_unit(width)
         self.unit = "relative"  # to the plan: not tied to the width
 
-    def _px_per_unit(self, width: float) -> float:
+    def px_per_unit(self, width: float) -> float:
         # the plan tells the width of a coarser layer as a part of 1: there the same lengths have fewer pixels
         return getattr(self, "_scale", 1.0) * min(width, 1.0)
 

@@ -199,8 +199,9 @@ class _Averages(onnx_ir.passes.InPlacePass):
             weight = np.full((channels, 1, scale, scale), scale**-2.0, np.float32)
             tape = Tape()
             filled = tape.op("Pad", [node.inputs[0], *pad.inputs[1:]])
-            kernel = _initializer(model.graph, weight, f"mean_of_{node.name}")
-            mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]})
+            name = f"mean_{node.outputs[0].name}"
+            kernel = _initializer(model.graph, weight, f"{name}_weight")
+            mean = tape.op("Conv", [filled, kernel], {"group": channels, "strides": [scale, scale]}, name=name)
             mean.type, mean.shape = pad.outputs[0].type, pad.outputs[0].shape
             model.graph.insert_before(pad, list(tape.nodes))
             pad.outputs[0].replace_all_uses_with(mean)

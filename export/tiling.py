@@ -8,7 +8,6 @@ results. :mod:`torchdof.export.structure` makes a loop and branches of these.
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -65,9 +64,8 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     behind = None if frame.behind is None else fields.pop()[inner]
     each = 2 if frame.surfaces[0].weight is None else 3
     surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
-    piece = Frame(
-        surfaces, frame.nodes, frame.ramps, behind, margin, (length, length), (length, length), frame.occlusion
-    )
+    size = (length, length)
+    piece = Frame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
     tile = where_needed(
         lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0,
         render(piece, blurs),
@@ -78,35 +76,6 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     pieces = _operator(COLLECT, [tile], (batch * rows * columns, colours, length, length))
     image = pieces.reshape(batch, rows, columns, colours, length, length).permute(0, 3, 1, 4, 2, 5)
     return image.reshape(batch, colours, *frame.area)[..., : frame.size[0], : frame.size[1]]
-
-
-_CELL = 4  # pixels for which one looks together what they hold
-
-
-def _ranges(surfaces: Sequence[Placed]) -> Tensor:
-    """The least of ``x`` and of ``-x`` in each cell of a window: ``[1, 2, surfaces, h, w]``."""
-    x = torch.cat([s.x for s in surfaces], 1)
-    return -functional.max_pool2d(torch.cat([-x, x], 1), _CELL, ceil_mode=True).unflatten(1, (2, -1))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Tile(Frame):
-    """A tile, of which it is asked often, and so of cells, what it holds; at most it then holds more than it does.
-
-    Args:
-        ranges: As :func:`_ranges` gives them.
-    """
-
-    ranges: Tensor
-
-    def any_between(self, low: float, high: float, halo: int) -> Tensor:
-        """As of any frame."""
-        start = (self.margin - halo) // _CELL
-        stop = [-(-(self.margin + n + halo) // _CELL) for n in self.area]
-        ranges = self.ranges[..., start : stop[0], start : stop[1]]
-        # the least lies below the upper end, and the largest above the lower one
-        beyond = ranges - ranges.new_tensor([high, -low])[:, None, None, None]
-        return beyond.amax(1).amin() < 0
 
 
 @contextlib.contextmanager

@@ -87,7 +87,7 @@ class Options:
             raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
         if self.method == "fold" and self.table.depends_on_place:
             raise ValueError(
-                "method='fold' has one kernel a blur radius; take 'layered', or a table without vignetting"
+                "method='fold' has one kernel a blur radius; take 'layered', or a table without vignetting or field"
             )
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")

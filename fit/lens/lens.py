@@ -17,7 +17,7 @@ import numpy as np
 from torchdof.validation import show
 
 from ..result import Array
-from . import prescription
+from . import prescription, zmx
 from .glass import C_UM, D_UM, F_UM, G_UM, Glass
 from .surface import Shape
 
@@ -153,7 +153,7 @@ class Lens:
 
     @classmethod
     def read(cls, source: str | os.PathLike[str]) -> Lens:
-        """Read a prescription from a file, or a shipped one by its name.
+        """Read a prescription or a Zemax file (.zmx), or a shipped prescription by its name.
 
         Args:
             source: Path of a file, or a name: ``"double_gauss_50mm"``, ``"wide_22mm"``, ``"telephoto_250mm"``.
@@ -171,7 +171,10 @@ class Lens:
             shipped = ", ".join(sorted(p.stem for p in _SHIPPED.glob("*.txt")))
             raise FileNotFoundError(f"no lens {str(source)!r}: neither a file nor one of the shipped ({shipped})")
         try:
-            columns, stop, comment = prescription.parse(path.read_text(encoding="utf-8"))
+            if path.suffix.lower() == ".zmx":
+                columns, stop, comment = zmx.parse(zmx.text_of(path))
+            else:
+                columns, stop, comment = prescription.parse(path.read_text(encoding="utf-8"))
             return cls(**columns, stop=stop, name=path.stem, source=comment)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error

@@ -15,6 +15,7 @@ from torchdof.optics.psf import FAMILIES
 from torchdof.validation import number, show, whole
 
 from ..result import Array
+from .field import coc_nodes, trace_field
 from .lens import Lens
 from .nodes import Tracer, fit_radial, fit_shapes, place_nodes
 from .spot import Focus, Reference, Spot, focus_sensor, point_spread
@@ -38,6 +39,9 @@ def trace_table(
     sensor_width_mm: float = 36.0,
     width_px: int = 1920,
     rays: int | None = None,
+    field: Sequence[float] | None = None,
+    field_nodes: int = 12,
+    field_rays: int = 160_000,
     name: str | None = None,
 ) -> BlurTable:
     """Blur table of a lens, traced at many distances on both sides of focus.
@@ -70,6 +74,11 @@ def trace_table(
         sensor_width_mm: Width of the sensor.
         width_px: Width of the images the fit is made for: details far below their pixels do not count.
         rays: Rays a spot; None is 2,000 on the axis, where a fan is enough, and 50,000 off it.
+        field: Distances in mm from the middle of the frame, increasing from 0, at which spots are traced as they are,
+            for a table whose kernels depend on the place (:class:`torchdof.optics.field.Field`): a full frame of
+            36 x 24 mm wants those to 21.6 mm. None traces the axis alone.
+        field_nodes: Blurs at which these are traced on either side of focus.
+        field_rays: Rays of each of these spots.
         name: Name of the table; None is the lens's with the f-number.
 
     Returns:
@@ -91,6 +100,7 @@ def trace_table(
     number("field_mm", field_mm, -1e6, 1e6)
     if nodes is not None and nodes < (5 if math.isfinite(focus_m) else 3):
         raise ValueError(f"nodes must be at least 5 (3 for a focus at infinity), got {nodes}")
+    _check_field(field, field_mm, field_nodes, field_rays)
     number("sensor_width_mm", sensor_width_mm, 0, 1e9)
     number("width_px", width_px, 0, 1e9, unit="pixels")
     if wavelengths_um is not None and not lens.dispersive:
@@ -110,11 +120,14 @@ def trace_table(
         f"width_px={width_px}, rays={count}"
     )
 
-    def spot(wavelength_um: float | None, coc: float) -> Spot:
+    def distance(coc: float) -> float:
         dioptres = 1.0 / focus_m - coc / _coc_per_dioptre(focal, f_number, focus_m)
+        return 1.0 / dioptres if dioptres > 1e-9 else math.inf
+
+    def spot(wavelength_um: float | None, coc: float) -> Spot:
         return point_spread(
             stopped,
-            1.0 / dioptres if dioptres > 1e-9 else math.inf,
+            distance(coc),
             sensor,
             field_mm=field_mm,
             rays=count,
@@ -132,6 +145,11 @@ def trace_table(
         if wavelength is not None:
             tracer = Tracer(partial(spot, wavelength), points, pixel)
         fitted.append(fit_radial(tracer, places) if family == "radial" else fit_shapes(tracer, places, family))
+    across = None
+    if field is not None:
+        blurs = coc_nodes(near, far, field_nodes)
+        across = trace_field(stopped, sensor, distance, blurs, field, wavelengths_um, field_rays, reference)
+        call += f", field={tuple(field)}, field_nodes={field_nodes}, field_rays={field_rays}"
     params = {key: [_rounded(channel[0][key]) for channel in fitted] for key in FAMILIES[family]}
     residual = np.sqrt(np.mean([channel[1] ** 2 for channel in fitted], axis=0))
     provenance = {
@@ -161,6 +179,7 @@ def trace_table(
         name=f"{lens.name}_f{f_number:g}" if name is None else name,
         provenance=provenance,
         residual=_rounded(residual),
+        field=across,
     )
 
 
@@ -192,6 +211,21 @@ def _check(
         raise ValueError(f"wavelengths_um must be a list of wavelengths in micrometres, got {show(wavelengths)}")
     for value in wavelengths:
         number("wavelengths_um", value, 0.299, 1.201, unit="micrometres")
+
+
+def _check_field(field: Any, field_mm: float, nodes: Any, rays: Any) -> None:
+    """Refuse distances across the field that make no sense."""
+    whole("field_nodes", nodes, 2, 100)
+    whole("field_rays", rays, 1000, 10**7)
+    if field is None:
+        return
+    if field_mm:
+        raise ValueError(f"field_mm averages one place, field traces several: give one of them, got {field_mm} mm too")
+    if not isinstance(field, list | tuple) or len(field) < 2 or field[0] != 0:
+        raise ValueError(f"field must be distances in mm from the middle of the frame, from 0 on, got {show(field)}")
+    for low, high in zip(field, field[1:], strict=False):
+        if not number("field", high, 0, 1e6, unit="mm") > low:
+            raise ValueError(f"field must be increasing distances in mm, got {show(field)}")
 
 
 def signed_coc_mm(z_m: float, focal_length_mm: float, f_number: float, focus_m: float) -> float:

@@ -305,7 +305,10 @@ class Forward:
         deviation = np.sqrt(factor * np.maximum(gaussian_filter(full**2, 2.0) / share, 0.0))
         near = self.used & (self.distance <= self.data_dot.reach + 2)
         scaled = full / np.maximum(deviation, 1e-12 * self.unit)
-        return deviation.ravel()[self.flat], correlation_of(scaled, near)
+        # few pixels show how far neighbours go together; the paper's many show more, where its noise is alike
+        found = correlation_of(scaled, near)
+        correlation = self.noise_correlation if self.noise_correlation.sum() > found.sum() else found
+        return deviation.ravel()[self.flat], correlation
 
     def noise_times(self, columns: Array, deviation: Array, correlation: Array) -> Array:
         """Covariance of the pixels' noise times columns `[pixels used, p]`."""

@@ -1,45 +1,31 @@
 """Photographs of the printed target as they come from a camera or phone; they tell distances, focus and tone curve.
 
-The square's size gives each distance, the sharpest picture is the one in focus, EXIF knows the lens. The light of the
-dot, in units of the white paper beside it, must be its printed area however it is blurred: what a tone curve changes
-about that gives the curve away, and it is undone.
+The square's size gives each distance, the sharpest picture is the one in focus, EXIF knows the lens; a tone curve gives
+itself away (`tone`) and is undone.
 """
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-import torch
-
+from torchdof.io import foreign
 from torchdof.io.images import read_image
 from torchdof.io.metadata import camera_facts
-from torchdof.io.transfer import decode, encode
 
 from ..problems import DotNotFoundError, FitError, ManifestError
 from ..result import Array
 from .crop import Capture
 from .manifest import Captures
 from .target import DOT_MM, SQUARE_MM, Target, find_target
+from .tone import WINDOW, tone_curve, untoned
 
 __all__ = ["Photograph", "Photographs", "read_photographs"]
 
 _READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
-_FOREIGN = {
-    ".heic": "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)",
-    ".dng": "develop it to linear 16-bit TIFF (dcraw -4 -T, or a converter's linear profile) and copy its EXIF",
-}
-_FOREIGN |= {".heif": _FOREIGN[".heic"], ".avif": _FOREIGN[".heic"]}
-_FOREIGN |= dict.fromkeys((".cr2", ".cr3", ".nef", ".arw", ".raf"), _FOREIGN[".dng"])
-_WINDOW = 0.36  # half the dot's window, of the square's side
 _SAME_PLACE = 0.03  # as a share of the distance
-_PRINTED = 0.01  # how exactly the dot's light can be known
-_BENT = (0.15, 0.3)  # expected size of a and b
-_CERTAIN = 9.0  # drop of chi squared that calls for a tone curve
 _CURVED = 0.05  # least bend of a tone curve that is worth saying
 
 
@@ -92,10 +78,11 @@ def read_photographs(folder: str | os.PathLike[str], *, square_mm: float = SQUAR
         FitError: fewer than two photographs show the target, or no EXIF tells the lens.
         OSError: a picture is damaged.
     """
-    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *_FOREIGN))
+    files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *foreign.SUFFIXES))
     for path in files:
-        if path.suffix.lower() in _FOREIGN:
-            raise FitError(f"{path.suffix} is not read here: {_FOREIGN[path.suffix.lower()]}", file=str(path))
+        unread = foreign.refusal(path)
+        if unread is not None:
+            raise FitError(unread, file=str(path))
     if len(files) < 2:
         raise ManifestError(
             "there is neither a capture.toml nor two photographs (.jpg .png .tif .exr) of the target that "
@@ -126,13 +113,18 @@ def read_photographs(folder: str | os.PathLike[str], *, square_mm: float = SQUAR
             f"EXIF does not tell {', '.join(missing)}: share the originals, or describe them in a capture.toml",
             file=str(folder),
         )
-    tone = _tone_curve(pictures, square_mm) if integers and len(pictures) >= 4 else (0.0, 0.0)
+    tone = (
+        tone_curve([(p.light, p.target) for p in pictures], square_mm)
+        if integers and len(pictures) >= 4
+        else (0.0, 0.0)
+    )
     if max(map(abs, tone)) > _CURVED:
         pictures = [replace(p, light=untoned(p.light, tone)) for p in pictures]
         pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
         advice.append(
-            f"a tone curve was found by the light of the dot and undone (a = {tone[0]:+.2f}, b = {tone[1]:+.2f}): raw "
-            "pictures need no such guess"
+            "a tone curve was found by the light of the dot and the edges of the square, and undone (a = "
+            f"{tone[0]:+.2f}, b = {tone[1]:+.2f}); blurs of a few px may still be 5 % off, raw pictures need no such "
+            "guess"
         )
     else:
         tone = (0.0, 0.0)
@@ -169,18 +161,8 @@ def read_photographs(folder: str | os.PathLike[str], *, square_mm: float = SQUAR
     return Photographs(captures, tuple(pictures), tone, tuple(advice))
 
 
-def untoned(light: Array, tone: tuple[float, float]) -> Array:
-    """Light with a tone curve undone: on the encoded level e, `e + a e (1 - e) + b e (1 - e) (1 - 2 e)`.
-
-    An S-curve `e - t e (1 - e) (1 - 2 e)`, which is `(1 - t) e + t e^2 (3 - 2 e)`, is undone by b near t.
-    """
-    e = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None], "srgb", False, False)
-    e = e + e * (1 - e) * (tone[0] + tone[1] * (1 - 2 * e))
-    return np.asarray(decode(e.clamp(0.0, 1.0), "srgb", False, False)[0, 0].numpy())
-
-
 def _pair(sharp: Photograph, blurred: Photograph, folder: str) -> Capture:
-    half = int(_WINDOW * min(sharp.target.side_px, blurred.target.side_px))
+    half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
     cut = [
         p.light[round(t.y) - half : round(t.y) + half + 1, round(t.x) - half : round(t.x) + half + 1]
         for p, t in ((sharp, sharp.target), (blurred, blurred.target))
@@ -195,39 +177,6 @@ def _sharpness(light: Array, target: Target) -> float:
     half, y, x = int(0.06 * target.side_px) + 4, round(target.y), round(target.x)
     around = light[y - half : y + half + 1, x - half : x + half + 1]
     return float(gaussian_gradient_magnitude(around, 0.7).max() / (target.white - target.black))
-
-
-def _tone_curve(pictures: Sequence[Photograph], square_mm: float) -> tuple[float, float]:
-    """The tone curve under which every dot sends the light of its printed area; none where noise would explain it."""
-    from scipy.optimize import least_squares
-
-    dots = []
-    for p in pictures:
-        half = int(_WINDOW * p.target.side_px)
-        y, x = round(p.target.y), round(p.target.x)
-        window = p.light[y - half : y + half + 1, x - half : x + half + 1]
-        distance = np.hypot(*(np.indices(window.shape) - half))
-        inside, around = distance < 0.12 * p.target.side_px, (distance > 0.2 * p.target.side_px) & (distance < half)
-        area = math.pi * (DOT_MM / 2 * p.target.side_px / square_mm) ** 2
-        # a demosaiced pixel's noise goes together in about nine neighbours
-        noise = 3 * float(window[around].std()) * math.sqrt(inside.sum()) / (p.target.white * area)
-        dots.append((window, inside, around, p.target.white, area, math.hypot(noise, _PRINTED)))
-
-    def misfit(values: Array) -> Array:
-        tone, found = (float(values[0]), float(values[1])), []
-        for window, inside, around, white, area, error in dots:
-            level = untoned(window, tone)
-            black, paper = float(level[around].mean()), float(untoned(np.array([[white]]), tone)[0, 0])
-            light = float((level - black)[inside].sum()) / (paper - black) / area
-            found.append((math.log(max(light, 1e-3)) - values[2]) / error)
-        return np.array([*found, values[0] / _BENT[0], values[1] / _BENT[1]])
-
-    bounds = ([-0.8, -0.8, -1.0], [0.8, 0.8, 1.0])
-    solution = least_squares(misfit, [0.0, 0.0, 0.0], bounds=bounds, x_scale=0.1)
-    straight = least_squares(lambda v: misfit(np.array([0.0, 0.0, v[0]])), [0.0])
-    if 2 * (straight.cost - solution.cost) < _CERTAIN:
-        return 0.0, 0.0
-    return float(solution.x[0]), float(solution.x[1])
 
 
 def _advice(pictures: Sequence[Photograph], sharp: str, focus_m: float) -> list[str]:

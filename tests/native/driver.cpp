@@ -205,6 +205,8 @@ void check_edges(unsigned seed) {
     if (torchdof_repair_edges(&map) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
   };
   repair(1, alone);
+  for (size_t i = 0; i < pixels; i++)
+    if (std::isfinite(nearness[i]) && !std::isfinite(alone[i])) fail("a repaired edge is no number", int(seed));
   std::vector<std::thread> callers;
   for (int threads : {2, 5})
     callers.emplace_back([&, threads] {

@@ -16,6 +16,7 @@ from torch.autograd import forward_ad
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, native
 from torchdof.optics.aperture import Aperture
+from torchdof.optics.field import Field
 from torchdof.render.plan import Plan
 from torchdof.render.scatter import fold
 
@@ -163,6 +164,20 @@ def test_engines_agree_on_lopsided_kernels_with_highlights(occlusion: bool, tabl
         image, coc = torch.rand(1, 3, 70, 90), random_map(kind, (1, 70, 90), radius)
         image[..., 20:65:9, 15:80:13] *= 1000.0
         assert_same_picture(by_both(Scene(image, coc, {"table": table, "occlusion": occlusion}).blurred), image)
+
+
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_engines_agree_on_spots_across_the_field(occlusion: bool, by_both: Any) -> None:
+    coc, radius = torch.tensor([-0.9, -0.3, 0.2, 0.7]), torch.tensor([0.0, 1.5, 3.5])
+    dice = torch.Generator().manual_seed(3)
+    light = torch.rand(3, 4, 3, 16, 8, generator=dice)
+    box = (torch.rand(4, 3, 3, generator=dice) + 0.5) * coc.abs()[:, None, None]
+    lens: dict[str, Any] = {"unit": "mm", "sensor_width_mm": 6.0, "field": Field(coc, radius, box, light)}
+    table = BlurTable("disc", coc, {"radius": coc.abs().expand(3, -1)}, **lens)
+    for kind, reach in (("smooth", 12.0), ("planes", 5.0)):
+        image, coc_px = torch.rand(1, 3, 70, 90), random_map(kind, (1, 70, 90), reach)
+        image[..., 20:65:9, 15:80:13] *= 1000.0
+        assert_same_picture(by_both(Scene(image, coc_px, {"table": table, "occlusion": occlusion}).blurred), image)
 
 
 @pytest.mark.parametrize("table", SHAPED, ids=str)

@@ -175,7 +175,7 @@ def test_a_table_with_an_aperture_comes_back_from_its_file(tmp_path: Path) -> No
         coc = torch.tensor([-6.0, 6.0])
         assert_close(loaded.kernels(coc, 900), table.kernels(coc, 900), rtol=0, atol=0)
     written = json.loads((tmp_path / "lens.json").read_text())
-    assert written["version"] == 2 and written["aperture"]["blades"] == 7
+    assert written["version"] == 3 and written["aperture"]["blades"] == 7
     state = DepthOfField(Camera(), LOPSIDED[0]).state_dict()
     restored = DepthOfField(Camera())
     restored.load_state_dict(state)

@@ -26,7 +26,7 @@ def example(**changes: Any) -> dict[str, Any]:
     """A whole table as stored, with fields changed; a field set to None is left out."""
     data: dict[str, Any] = {
         "schema": "torchdof/blur-table",
-        "version": 2,
+        "version": 3,
         "name": "lens",
         "family": "ring",
         "unit": "mm",
@@ -283,8 +283,8 @@ NOT_FINITE = [1.0, math.nan, 2.0]
     [
         ({"schema": None}, "schema must be 'torchdof/blur-table', got None"),
         ({"schema": "lut"}, "schema must be 'torchdof/blur-table', got 'lut'"),
-        ({"version": 3}, "version must be 1 or 2, got 3; update torchdof"),
-        ({"version": None}, "version must be 1 or 2, got None"),
+        ({"version": 4}, "version must be 1 or 2 or 3, got 4; update torchdof"),
+        ({"version": None}, "version must be 1 or 2 or 3, got None"),
         ({"family": None}, "family is missing"),
         ({"unit": None}, "unit is missing"),
         ({"coc": None}, "coc is missing"),

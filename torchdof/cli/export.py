@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import torch
 import typer
 from rich.console import Console
 
@@ -103,8 +102,8 @@ def export(
         max_coc_px=max_coc,
         check=False,
     )
-    with Console(stderr=True).status(f"tracing and verifying with {torch.get_num_threads()} threads"):
-        report = to_onnx(dof, out, inputs=inputs, channels=channels, width=width, opset=opset)
+    with Console(stderr=True).status("tracing") as status:
+        report = to_onnx(dof, out, inputs=inputs, channels=channels, width=width, opset=opset, progress=status.update)
     print(json_line({"out": str(out), **dataclasses.asdict(report)}) if as_json else f"{report}\nwrote {out}")
 
 

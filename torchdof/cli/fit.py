@@ -78,7 +78,7 @@ def fit(
     ] = None,
     lens: Annotated[
         str | None,
-        typer.Option(help="Prescription: a file, or the name of a shipped one.", rich_help_panel=_LENS),
+        typer.Option(help="Prescription or Zemax file (.zmx), or the name of a shipped lens.", rich_help_panel=_LENS),
     ] = None,
     f_number: Annotated[float, typer.Option(help="Aperture of the lens.", rich_help_panel=_LENS)] = 2.0,
     focus_m: Annotated[float, typer.Option(help="Focus distance in metres; inf allowed.", rich_help_panel=_LENS)] = 2.0,

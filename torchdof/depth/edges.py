@@ -11,7 +11,6 @@ Everything is computed in a measure of nearness that is linear in 1 / depth: the
 resampling and estimators do to an edge is an average.
 """
 
-import math
 from typing import Literal, NamedTuple
 
 import torch
@@ -40,8 +39,12 @@ _ROUNDS = 10
 _SHARPNESS = 1.6  # how much surer colours are than their likelihoods say, which count witnesses on the wrong side
 _MOST = 4.0  # times its own step, a thin structure stands out at most
 _BLUR_REACH = 9
+_MIDDLE_HALF = 1.47  # standard deviations that the middle half of a blurred step is wide; 1.35 if its ends were known
+_BETTER = 0.5  # part of what a shape leaves unexplained that its blur explains, where it is blurred
+_LEAN = 2.0  # by how much likelier the far surface must be, as a logarithm: foreground left behind is seen more
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
-_EXACT = 0.05  # share of wrong pixels up to which a map's steps count as exact
+_EXACT = 0.025  # share of wrong pixels up to which a map's steps count as exact
+_DOUBTFUL = 0.05  # share of wrong pixels of a kind from which on each of them is asked
 _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
 _RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
 _SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
@@ -59,7 +62,6 @@ class _Edges(NamedTuple):
     ring: Tensor  # how many pixels from a step: 1 is beside it; one more than there are: none is near
     is_edge: Tensor
     direction: Tensor  # towards the near surface: left, right, up or down
-    steepness: Tensor  # change of nearness by pixel on a ramp
 
 
 def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> Tensor:
@@ -155,22 +157,24 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     # which surface the doubtful pixels show
     doubtful = edges.is_edge
     if auto:
-        doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _EXACT)
+        doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels)
-    shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0]) > 0
+    shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0]) > -_LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
 
     # and what is so thin that a ramp swallowed part of its depth
-    sigma = _blur_of(given, edges)
+    sigma, length = _blur_of(given, valid, edges)
     label = torch.where(edges.is_edge, is_near, 2.0 * given > _highest(given, 6) - _highest(-given, 6))
     label = pixels.put(label.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
-    near, far = _unmix(given, edges, label, sigma, edge_pixels, near, far)
+    level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
+    lost_px = torch.where(edges.is_edge, label - level, 0.0).sum((1, 2, 3), keepdim=True) / length
+    near, far = _unmix(given, edges, label, sigma, lost_px, edge_pixels, near, far)
 
     own = pixels.pick(given, edge_pixels)[0]
     is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
     moved = torch.where(is_ramp, evidence, (shows_near != pixels.pick(is_near, edge_pixels)[0]).to(given.dtype))
     out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))
-    return torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma), nearness)
+    return torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma, lost_px), nearness)
 
 
 # How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
@@ -187,7 +191,7 @@ def _(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     """Ramps and steps, and the two surfaces that meet there."""
     high, low = torch.where(valid, nearness, -_NEVER), torch.where(valid, -nearness, -_NEVER)
-    slope, steepness, jump = _slopes(nearness, valid)
+    slope, jump = _slopes(nearness, valid)
     span = _highest(high, _REACH) + _highest(low, _REACH)
     # a ramp ends, a slope goes on
     flattest = -_highest(-_mean(slope, 2), 8)
@@ -216,7 +220,7 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
     right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
     direction = torch.where(right.abs() > down.abs(), (right > 0).long(), 2 + (down > 0).long())
-    return _Edges(near, far, is_ramp, ring, is_edge, direction, steepness)
+    return _Edges(near, far, is_ramp, ring, is_edge, direction)
 
 
 def _kind(nearness: Tensor, edges: _Edges) -> Tensor:
@@ -348,13 +352,19 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
     return torch.cat([far.cummin(1).values, near.cummax(1).values, ramp], 1).flatten()
 
 
-def _blur_of(nearness: Tensor, edges: _Edges) -> Tensor:
-    """Standard deviation in pixels of the blur that made ramps of an item's steps, ``[B, 1, 1, 1]``."""
+def _blur_of(nearness: Tensor, valid: Tensor, edges: _Edges) -> tuple[Tensor, Tensor]:
+    """Standard deviation in pixels of the blur that made ramps of an item's steps, and the steps' length in pixels.
+
+    Both ``[B, 1, 1, 1]``. The length is the sum of gradients; ramps are as wide as they are longer in pixels than it.
+    """
     gap = (edges.near - edges.far).clamp_min(1e-12)
-    middle = edges.is_ramp & (((nearness - edges.far) / gap - 0.5).abs() < 0.12)
-    steepness = torch.where(middle, edges.steepness / gap, 0.0).sum((1, 2, 3), keepdim=True)
-    width = middle.sum((1, 2, 3), keepdim=True) / (math.sqrt(2 * math.pi) * steepness).clamp_min(1e-12)
-    return (width**2 - 0.75).clamp(0.25, 9.0).sqrt()  # differences of pixels widen it
+    beside = functional.pad(_changes(nearness, valid, -1), (0, 1))
+    below = functional.pad(_changes(nearness, valid, -2), (0, 0, 0, 1))
+    climb = torch.where(edges.is_edge, torch.hypot(beside, below) / gap, 0.0)
+    length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    middle = edges.is_edge & (((nearness - edges.far) / gap - 0.5).abs() < 0.25)
+    sigma = middle.sum((1, 2, 3), keepdim=True) / (_MIDDLE_HALF * length)
+    return sigma.clamp(0.2, 3.0), length
 
 
 def _unmix(
@@ -362,6 +372,7 @@ def _unmix(
     edges: _Edges,
     label: Tensor,
     sigma: Tensor,
+    lost_px: Tensor,
     edge_pixels: Tensor,
     near: Tensor,
     far: Tensor,
@@ -369,6 +380,7 @@ def _unmix(
     """The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best."""
     blurred = _blurred(label, sigma)
     gap = near - far
+    item = edge_pixels // label[0].numel()
     for is_near in (True, False):
         shape = label if is_near else 1.0 - label
         whole = torch.where(edges.is_edge, shape, 1.0)
@@ -376,7 +388,8 @@ def _unmix(
         thin = pixels.pick(edges.is_edge & (shape > 0) & ~thick, edge_pixels)[0]
         chosen = thin.nonzero()[:, 0]
         at = edge_pixels[chosen]
-        least, difference, fit = _regress(nearness, blurred, at)
+        least, difference, fit = _regress(nearness, label, blurred, at)
+        fit = fit * _is_lost(lost_px if is_near else -lost_px)[item[chosen]]
         if is_near:
             most = far[chosen] + _MOST * gap[chosen]
             gain = fit * (torch.minimum(least + difference, most) - near[chosen]).clamp_min(0.0)
@@ -390,7 +403,13 @@ def _unmix(
 
 
 def _lift_lamps(
-    light: Tensor, nearness: Tensor, repaired: Tensor, step: Tensor, is_soft: Tensor, sigma: Tensor
+    light: Tensor,
+    nearness: Tensor,
+    repaired: Tensor,
+    step: Tensor,
+    is_soft: Tensor,
+    sigma: Tensor,
+    lost_px: Tensor,
 ) -> Tensor:
     """Lamps of a few pixels, whose nearness a soft map spreads around them, as near as what is spread amounts to."""
     brightest = light.amax(1, keepdim=True)
@@ -400,45 +419,63 @@ def _lift_lamps(
     is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & is_soft
     cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
     lamp_pixels = pixels.indices(is_lamp)
-    behind, difference, fit = _regress(nearness, _blurred(cover, sigma), lamp_pixels)
+    behind, difference, fit = _regress(nearness, cover, _blurred(cover, sigma), lamp_pixels)
+    fit = fit * _is_lost(lost_px)[lamp_pixels // nearness[0].numel()]
     own = pixels.pick(repaired, lamp_pixels)[0]
     gain = fit * (behind + difference.clamp_min(0.0) - own).clamp_min(0.0)
     return pixels.put(repaired, lamp_pixels, own + gain)
 
 
-def _regress(nearness: Tensor, cover: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Nearness around pixels ``[P]`` as ``a + b cover``: a, b, and how well that fits, 0 to 1."""
+def _is_lost(lost_px: Tensor) -> Tensor:
+    """How far thin structures can have lost nearness, 0 to 1, ``[B]``: none where the map's surfaces are too large."""
+    return (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
+
+
+def _regress(nearness: Tensor, shape: Tensor, blurred: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Nearness around pixels ``[P]`` as ``a + b blurred``: a, b, and how well that fits, 0 to 1.
+
+    It must explain what the shape does not that is not blurred.
+    """
     window = pixels.around(chosen, nearness, _REACH)
     offsets = torch.arange(-_REACH, _REACH + 1, device=nearness.device, dtype=nearness.dtype)
     weight = torch.exp(-(offsets[:, None] ** 2 + offsets**2) / 18.0).flatten()[:, None]
     weight = weight / weight.sum()
-    y, x = pixels.pick(nearness, window)[0], pixels.pick(cover, window)[0]
-    mean_x, mean_y = (weight * x).sum(0), (weight * y).sum(0)
-    xx, yy = (weight * (x - mean_x) ** 2).sum(0), (weight * (y - mean_y) ** 2).sum(0)
-    xy = (weight * (x - mean_x) * (y - mean_y)).sum(0).clamp_min(0.0)
-    b = xy / xx.clamp_min(1e-9)
-    explained = xy**2 / (xx * yy).clamp_min(1e-12)
-    fit = torch.where(xx > 0.004, ((explained - 0.5) / 0.3).clamp(0.0, 1.0), 0.0)
+    y = pixels.pick(nearness, window)[0]
+    mean_y = (weight * y).sum(0)
+    yy = (weight * (y - mean_y) ** 2).sum(0)
+    results = []
+    for cover in (blurred, shape):
+        x = pixels.pick(cover, window)[0]
+        mean_x = (weight * x).sum(0)
+        xx = (weight * (x - mean_x) ** 2).sum(0)
+        xy = (weight * (x - mean_x) * (y - mean_y)).sum(0).clamp_min(0.0)
+        results.append((xx, xy / xx.clamp_min(1e-9), mean_x, xy**2 / (xx * yy).clamp_min(1e-12)))
+    (xx, b, mean_x, explained), (*_, unblurred) = results
+    better = ((explained - unblurred) / (_BETTER * (1.0 - unblurred)).clamp_min(1e-6)).clamp(0.0, 1.0)
+    fit = torch.where(xx > 0.004, ((explained - 0.5) / 0.3).clamp(0.0, 1.0) * better, 0.0)
     return mean_y - b * mean_x, b, fit
 
 
-def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _slopes(nearness: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """Steepness by pixel where it goes on from one side to the other, 0 elsewhere and beside what is unknown.
 
-    The lesser of both sides, in the steeper of the two axes; and the mean of both, of both axes together. Third, by how
-    much the change on one side exceeds that slope.
+    The lesser of both sides, in the steeper of the two axes; and by how much the change on one side exceeds that.
     """
-    least, mean, jump = [], [], []
+    least, jump = [], []
     for dim in (-1, -2):
-        known = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
-        change = torch.where(known, nearness.diff(dim=dim), 0.0)
+        change = _changes(nearness, valid, dim)
         none = torch.zeros_like(nearness.narrow(dim, 0, 1))
         before, after = torch.cat([none, change], dim), torch.cat([change, none], dim)
         goes_on = before * after > 0
         least.append(torch.where(goes_on, torch.minimum(before.abs(), after.abs()), 0.0))
-        mean.append(torch.where(goes_on, 0.5 * (before + after), 0.0))
         jump.append(torch.maximum(before.abs(), after.abs()) - least[-1])
-    return torch.maximum(*least), torch.hypot(*mean), torch.maximum(*jump)
+    return torch.maximum(*least), torch.maximum(*jump)
+
+
+def _changes(nearness: Tensor, valid: Tensor, dim: int) -> Tensor:
+    """From each pixel to the next one, 0 where one of them is unknown."""
+    known = valid.narrow(dim, 1, valid.shape[dim] - 1) & valid.narrow(dim, 0, valid.shape[dim] - 1)
+    return torch.where(known, nearness.diff(dim=dim), 0.0)
 
 
 def _highest(values: Tensor, reach: int) -> Tensor:

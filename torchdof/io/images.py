@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ..validation import real_tensor
+from . import foreign
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
 from .decode import PixelType, existing, first_line, read_array, read_parts
@@ -73,7 +74,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     """Reads an image into linear light.
 
     Args:
-        path: An EXR, PNG, TIFF, JPEG, HDR or PFM file.
+        path: An EXR, PNG, TIFF, JPEG, HDR or PFM file; HEIC and raw files where OpenImageIO was built to read them.
         transfer: "linear" or "srgb"; None takes "srgb" for integers and "linear" for floats, whatever the file's tags
             say.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
@@ -93,7 +94,10 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         ...     round(float(read_image(folder + "/grey.png").pixels.mean()), 3)  # 8 bits, sRGB
         0.216
     """
-    path = existing(path, _SUFFIXES, "an image")
+    unread = foreign.refusal(path)
+    if unread is not None:
+        raise ValueError(f"{path}: {unread}")
+    path = existing(path, (*_SUFFIXES, *foreign.readable()), "an image")
     if transfer not in (None, "linear", "srgb"):
         raise ValueError(f"transfer must be 'linear' or 'srgb', got {transfer!r}")
     parts = read_parts(path)

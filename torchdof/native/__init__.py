@@ -13,7 +13,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -40,9 +40,38 @@ HALF_LARGEST = 64
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 1  # of ``src/api.h``
+_REVISION = 2  # of ``src/api.h``
 
 _Floats = ctypes.POINTER(ctypes.c_float)
+
+
+class FieldShares(Protocol):
+    """What the field lets through of kernels of a radius: :class:`torchdof.render.field.Shares`."""
+
+    @property
+    def values(self) -> Tensor:
+        """Shares ``[1 or C, distances, rows, columns]``."""
+
+    @property
+    def boxes(self) -> Tensor:
+        """Where these lie, ``[distances, 3]``."""
+
+    @property
+    def coc_px(self) -> float:
+        """The radius, signed."""
+
+
+class _Shares(ctypes.Structure):
+    """``torchdof_shares`` of ``src/api.h``."""
+
+    _fields_ = [  # noqa: RUF012
+        ("values", ctypes.c_void_p),
+        ("boxes", ctypes.c_void_p),
+        ("radius", ctypes.c_float),
+        ("colours", ctypes.c_int32),
+        ("rows", ctypes.c_int32),
+        ("columns", ctypes.c_int32),
+    ]
 
 
 class _Scene(ctypes.Structure):
@@ -68,9 +97,8 @@ class _Scene(ctypes.Structure):
         ("halves", ctypes.POINTER(ctypes.c_int32)),
         ("kernel_colours", ctypes.c_int32),
         ("kernels", ctypes.c_void_p),
-        ("radii", ctypes.POINTER(ctypes.c_float)),
-        ("front", ctypes.c_float),
-        ("rear", ctypes.c_float),
+        ("shares", ctypes.POINTER(_Shares)),
+        ("distances", ctypes.c_int32),
         ("squeeze", ctypes.c_float),
         ("threads", ctypes.c_int32),
         ("cancelled", ctypes.POINTER(ctypes.c_int32)),
@@ -149,8 +177,8 @@ def render(
     masked: bool,
     highlights: bool,
     crisp_px: float,
-    radii: Sequence[float],
-    rims: tuple[float, float],
+    shares: Sequence[FieldShares],
+    ray_shares: Callable[[list[int]], Sequence[FieldShares]],
     squeeze: float,
 ) -> Tensor:
     """Depth of field of one item, on as many threads as PyTorch uses.
@@ -166,8 +194,9 @@ def render(
         masked: Values may be NaN or infinite; such pixels pass through.
         highlights: Highlights are splatted ray by ray where layers would not do.
         crisp_px: Blur from which on layers soften highlights.
-        radii: Signed coc of each layer in its own pixels; 0 where kernels do not depend on the place.
-        rims: How far the lens's front and rear rim move before the opening in the corners of the frame, in its radii.
+        shares: What the field lets through of each layer's kernel, float32 and contiguous; none where kernels are alike
+            everywhere.
+        ray_shares: The same of kernels of highlights, for their radii; by growing radius.
         squeeze: Height of the blur over its width.
 
     Returns:
@@ -205,8 +234,8 @@ def render(
         (ctypes.c_int32 * len(nodes))(*(kernel.shape[-1] // 2 for kernel in kernels)),
         colours,
         bank.data_ptr(),
-        (ctypes.c_float * len(nodes))(*radii),
-        *rims,
+        _shares(shares) if shares else None,
+        shares[0].values.shape[1] if shares else 0,
         squeeze,
         torch.get_num_threads(),
         ctypes.pointer(cancelled),
@@ -221,7 +250,9 @@ def render(
             count = engine.torchdof_radii(job, ctypes.byref(steps))
             rays = [psf.contiguous() for psf in psfs(steps[:count])] if count else []
             halves = (ctypes.c_int32 * max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
-            _check(engine.torchdof_finish(job, _pointers(rays), halves, out.data_ptr()))
+            spots = ray_shares(steps[:count]) if count and shares else []
+            of_rays = _shares(spots) if spots else None
+            _check(engine.torchdof_finish(job, _pointers(rays), halves, of_rays, len(spots), out.data_ptr()))
         finally:
             engine.torchdof_free(job)
 
@@ -319,6 +350,14 @@ def _check(status: int) -> None:
         raise KeyboardInterrupt
 
 
+def _shares(shares: Sequence[FieldShares]) -> Any:
+    made = []
+    for each in shares:
+        colours, _, rows, columns = each.values.shape
+        made.append(_Shares(each.values.data_ptr(), each.boxes.data_ptr(), each.coc_px, colours, rows, columns))
+    return (_Shares * len(made))(*made)
+
+
 def _pointers(tensors: Sequence[Tensor | None]) -> Any:
     return (ctypes.c_void_p * max(1, len(tensors)))(*(None if t is None else t.data_ptr() for t in tensors))
 
@@ -360,7 +399,14 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_begin.argtypes = [ctypes.POINTER(_Scene), ctypes.POINTER(pointer)]
     library.torchdof_radii.argtypes = [pointer, ctypes.POINTER(ctypes.POINTER(ctypes.c_int32))]
     library.torchdof_radii.restype = ctypes.c_int64
-    library.torchdof_finish.argtypes = [pointer, ctypes.POINTER(pointer), ctypes.POINTER(ctypes.c_int32), pointer]
+    library.torchdof_finish.argtypes = [
+        pointer,
+        ctypes.POINTER(pointer),
+        ctypes.POINTER(ctypes.c_int32),
+        ctypes.POINTER(_Shares),
+        ctypes.c_int32,
+        pointer,
+    ]
     library.torchdof_free.argtypes = [pointer]
     library.torchdof_free.restype = None
     library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]

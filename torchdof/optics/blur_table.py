@@ -12,6 +12,7 @@ from torch import Tensor
 from ..validation import WHOLE_NUMBERS, floating, number, pixels_wide, real_tensor, show
 from . import psf, table_file
 from .aperture import Aperture, Number
+from .field import Field
 
 __all__ = ["BlurTable"]
 
@@ -20,6 +21,7 @@ _MOST_NODES = 4096
 _COC_RANGE = (1e-9, 1e6)
 _WIDEST = 1e4  # times the circle of confusion; a blur that is not of the focus shows at small ones
 _STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
+_SEEN_PX = 1.5  # around a spot, in which pixels see some of it
 _RIM_POWER = 4.0  # of the radius, with which a rim grows
 _FADE_IN = 4.0  # times as fast as a disc's blur, whose moved light is the square of its radius in pixels
 _TRIED_AT_ONCE = 64
@@ -49,6 +51,9 @@ class BlurTable:
         residual: Relative residual of the fit at each node ``[N]``.
         aperture: What the lens's opening is where it is not round (:class:`torchdof.optics.aperture.Aperture`): the
             family is multiplied by it, and turned by half in front of the focus plane.
+        field: What the lens does across the frame, where that was traced or measured
+            (:class:`torchdof.optics.field.Field`): pictures are then made of its spots, and the parameters tell those
+            of the middle of the frame. A table with a field has no aperture of its own.
 
     Raises:
         ValueError: If a field is not as described; the message names it.
@@ -75,6 +80,7 @@ class BlurTable:
         provenance: Mapping[str, Any] | None = None,
         residual: Sequence[float] | Tensor | None = None,
         aperture: Aperture | None = None,
+        field: Field | None = None,
     ) -> None:
         if not isinstance(family, str) or family not in psf.FAMILIES:
             raise ValueError(f"family must be one of {', '.join(psf.FAMILIES)}, got {show(family)}")
@@ -113,6 +119,7 @@ class BlurTable:
         if aperture is not None and not isinstance(aperture, Aperture):
             raise ValueError(f"aperture must be an Aperture or None, got {show(aperture)}")
         self.aperture = aperture
+        self.field = self._check_field(field)
         self._fingerprint: str | None = None
         self._sides = {sign: self._side(sign) for sign in (-1, 1)}
         for sign in (-1, 1):
@@ -230,7 +237,7 @@ class BlurTable:
             ValueError: If one is not as described there.
             TypeError: If a name is unknown.
         """
-        names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture")
+        names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture", "field")
         kept = {"family": self.family, "coc": self.coc, "params": self._params}
         return BlurTable(**{**kept, **{name: getattr(self, name) for name in names}, **changes})
 
@@ -242,7 +249,7 @@ class BlurTable:
     @property
     def depends_on_place(self) -> bool:
         """Whether kernels are others towards the corners of the frame."""
-        return self.aperture is not None and self.aperture.depends_on_place
+        return self.field is not None or (self.aperture is not None and self.aperture.depends_on_place)
 
     @property
     def requires_grad(self) -> bool:
@@ -257,9 +264,10 @@ class BlurTable:
             True
         """
         if self._fingerprint is None:
-            facts: list[Any] = [self.family, self.unit, self.sensor_width_mm, self._px_per_unit(1.0), self.coc.tolist()]
+            facts: list[Any] = [self.family, self.unit, self.sensor_width_mm, self.px_per_unit(1.0), self.coc.tolist()]
             facts += [(name, value.tolist()) for name, value in self._params.items()]
             facts.append(None if self.aperture is None else self.aperture.to_dict())
+            facts.append(None if self.field is None else self.field.fingerprint())
             self._fingerprint = hashlib.sha256(repr(facts).encode()).hexdigest()
         return self._fingerprint
 
@@ -285,7 +293,7 @@ class BlurTable:
             Continuous in ``coc_px`` and differentiable wherever it lies between nodes.
         """
         pixels_wide(width)
-        scale = self._px_per_unit(width)
+        scale = self.px_per_unit(width)
         signed = real_tensor("coc_px", coc_px, "[...] in pixels").to(torch.float64) / scale
         near, far = (self._side_params(sign, signed.abs()) for sign in (-1, 1))
         mixed = {}
@@ -343,7 +351,18 @@ class BlurTable:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
         number("coc_px", coc_px, unit="pixels")
         signed = torch.tensor([-abs(coc_px), abs(coc_px)], dtype=torch.float64)
-        return psf.support(self.family, self.params(signed, width), self.aperture)
+        reach = psf.support(self.family, self.params(signed, width), self.aperture)
+        if self.field is None:
+            return reach
+        per_unit = self.px_per_unit(width)
+        return max(reach, float(self.field.reach(signed / per_unit).max()) * per_unit + _SEEN_PX)
+
+    def finest_px(self, coc_px: float, width: float) -> float:
+        """Radius in pixels, at most ``|coc_px|``, of the disc about as fine as the finest kernel of a signed coc."""
+        if self.field is not None:
+            per_unit = self.px_per_unit(width)
+            return min(abs(coc_px), self.field.finest(coc_px / per_unit) * per_unit)
+        return abs(coc_px) if self.aperture is None else abs(coc_px) * self.aperture.finest
 
     def blur_texture(self, coc_px: float, width: int, size: int | None = None) -> Tensor:
         """The paper's blur texture: the fitted profile f(r), strength N included, at the pixels' centres.
@@ -377,7 +396,7 @@ class BlurTable:
             texture = texture * (shares if signed >= 0 else shares.flip(-2, -1))
         if self.strength is None:
             return texture
-        nearest = (self.coc - signed / self._px_per_unit(width)).abs().argmin()
+        nearest = (self.coc - signed / self.px_per_unit(width)).abs().argmin()
         return texture * self.strength[nearest]
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -423,6 +442,7 @@ class BlurTable:
             "residual": None if self.residual is None else self.residual.tolist(),
             "provenance": self.provenance,
             "aperture": None if self.aperture is None else self.aperture.to_dict(),
+            "field": None if self.field is None else self.field.to_dict(),
         }
         return table_file.stamped({k: v for k, v in fields.items() if v is not None})
 
@@ -436,15 +456,24 @@ class BlurTable:
         fields = table_file.fields_of(data)
         if fields.get("aperture") is not None:
             fields["aperture"] = Aperture.from_dict(fields["aperture"])
+        if fields.get("field") is not None:
+            fields["field"] = Field.from_dict(fields["field"])
         return cls(**fields)
 
     def __repr__(self) -> str:
         nodes = f"{len(self.coc)} node{'s' if len(self.coc) > 1 else ''}"
         colours = f", {self.channels} channels" if self.channels > 1 else ""
         opening = "" if self.aperture is None else f", {self.aperture!r}"
+        opening += "" if self.field is None else f", {self.field!r}"
         return f"BlurTable({self.name or 'unnamed'!r}, {self.family}, {nodes}{colours}{opening})"
 
-    def _px_per_unit(self, width: float) -> float:
+    def px_per_unit(self, width: float) -> float:
+        """Pixels of an image of a width in pixels that the table's unit is long; 1 for ``"relative"``.
+
+        Example:
+            >>> BlurTable("disc", [0.01], {"radius": [0.01]}, unit="fraction").px_per_unit(1920)
+            1920.0
+        """
         if self.unit == "relative":
             return 1.0
         return float(width) if self.sensor_width_mm is None else width / self.sensor_width_mm
@@ -479,10 +508,23 @@ class BlurTable:
             checked[name] = value.expand(channels, *value.shape[1:]).contiguous()
         return checked
 
+    def _check_field(self, field: Any) -> Field | None:
+        if field is None:
+            return None
+        if not isinstance(field, Field):
+            raise ValueError(f"field must be a Field or None, got {show(field)}")
+        if self.aperture is not None:
+            raise ValueError(f"a table with a field has its own opening, got {self.aperture!r} too; leave one out")
+        if self.unit == "relative":
+            raise ValueError("a table with a field must state its unit as 'fraction' (of the image's width) or 'mm'")
+        if field.channels != self.channels:
+            raise ValueError(f"field must have {self.channels} channels, as params have, got {field.channels}")
+        return field
+
     def _try_kernels(self) -> None:
         """Refuse parameters whose kernels, at the nodes, between and beyond them, are no numbers or no lens's."""
         low, high = _COC_RANGE
-        per_px, widest = self._px_per_unit(1.0), 0.0
+        per_px, widest = self.px_per_unit(1.0), 0.0
         for side in (self.coc[self.coc < 0], self.coc[self.coc > 0]):
             largest = float(side.abs().max()) if len(side) else low
             if not low <= largest <= high:

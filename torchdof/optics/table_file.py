@@ -12,12 +12,13 @@ from ..validation import show
 __all__ = ["fields_of", "find", "read", "shipped", "stamped", "write"]
 
 SCHEMA = "torchdof/blur-table"
-VERSION = 2
-READABLE = (1, 2)  # the first knows no aperture
+VERSION = 3
+READABLE = (1, 2, 3)  # the first knows no aperture, the second no field
 _SHIPPED = Path(__file__).parent / "tables"
 _REQUIRED = ("family", "unit", "coc", "params")
-_KNOWN = {*_REQUIRED, "schema", "version", "name", "sensor_width_mm", "strength", "residual", "provenance", "aperture"}
-_KINDS = {"family": str, "unit": str, "params": dict, "name": str, "provenance": dict, "aperture": dict}
+_OPTIONAL = ("name", "sensor_width_mm", "strength", "residual", "provenance", "aperture", "field")
+_KNOWN = {*_REQUIRED, *_OPTIONAL, "schema", "version"}
+_KINDS = {"family": str, "unit": str, "params": dict, "name": str, "provenance": dict, "aperture": dict, "field": dict}
 
 
 def find(source: str | os.PathLike[str]) -> Path:

@@ -13,6 +13,7 @@ from ..optics.kernel_cache import KernelCache
 from ..options import Options
 from ..validation import is_traced
 from . import headroom
+from .field import Shares, ray_shares
 from .plan import KERNELS_PER_PX, Blur, Plan, kernels_for
 
 __all__ = ["picture"]
@@ -76,7 +77,7 @@ def _render(
     """One item ``[C, H, W]``."""
     height, width = surfaces[0][0].shape[-2:]
     aperture = options.table.aperture or Aperture()
-    front, rear = aperture.rims
+    like = torch.empty(0)
     render = functools.partial(
         native.render,
         kind=kind,
@@ -88,8 +89,8 @@ def _render(
         masked=kind != "stack" and not options.check,
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
-        radii=[0.0 if blur.cats_eye is None else blur.cats_eye.coc_px for blur in blurs],
-        rims=(2.0 * front, 2.0 * rear),
+        shares=[blur.shares.to(like) for blur in blurs if blur.shares is not None],
+        ray_shares=functools.partial(_ray_shares, options.table, (int(height), int(width))),
         squeeze=float(aperture.squeeze),
     )
     if kind != "background":
@@ -99,6 +100,11 @@ def _render(
             pass
     scale = float(headroom.factor(*(light[None] for light, _, _ in surfaces[:2])))
     return render([(light * scale, coc, weight) for light, coc, weight in surfaces]) / scale
+
+
+def _ray_shares(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -> list[Shares]:
+    """What the field lets through of kernels of highlights whose coc is so many steps."""
+    return [s.to(torch.empty(0)) for s in ray_shares(table, [step / KERNELS_PER_PX for step in steps], size)]
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:

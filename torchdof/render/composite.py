@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from . import field
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
 from .exporting import where_needed
@@ -136,7 +137,7 @@ def _composite_layers(
 
     # neighbouring layers of one coarser resolution are composited at it: on one side of focus, lest others lie between;
     # those whose kernels are of like size are scattered by one convolution, as many as fill its channels
-    uniform = each == 1 and blurs[0].cats_eye is None
+    uniform = each == 1 and blurs[0].shares is None
     most = CHANNELS // (colours + (2 if normalised else 1)) if uniform else 1
     runs: dict[tuple[int, bool], list[list[int]]] = {}
     for k in order:
@@ -175,16 +176,18 @@ def _scattered(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: lis
     They are ``[B, C + 1 + 1, n, h, w]``, or ``[B, 3 C, n, h, w]`` where each colour has a kernel of its own.
     """
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
+    shares, scale = blurs[group[0]].shares, blurs[group[0]].scale
     layers = frame.layers(min(group), len(group), halo)
     terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1, -1) for term in layers[: 2 + visibility]], 1)
-    terms, kinds = downsampled(terms.flatten(1, 2), blurs[group[0]].scale), terms.shape[1]
+    terms, kinds = downsampled(terms.flatten(1, 2), scale), terms.shape[1]
+    if shares is not None:  # one layer
+        scattered = field.scattered(shares, terms, blurs[group[0]].kernel, half, scale, frame.size)
+        return scattered.unflatten(1, (kinds, 1))
     kernels = blurs[group[0]].kernel
     if len(group) > 1 or each > 1:
         padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in sorted(group)]
         kernels = torch.cat(padded).repeat(kinds // each, 1, 1)
-    cats_eye = blurs[group[0]].cats_eye
-    scattered = scatter(terms, kernels, half) if cats_eye is None else cats_eye.scattered(terms, kernels, half)
-    return scattered.unflatten(1, (kinds, len(group)))
+    return scatter(terms, kernels, half).unflatten(1, (kinds, len(group)))
 
 
 def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[[], Tensor]:

@@ -22,9 +22,9 @@ from torch import Tensor
 from .. import pixels
 from ..optics.blur_table import BlurTable
 from .disocclusion import HIDDEN_WEIGHT
+from .field import Shares, placed, ray_shares
 from .plan import kernels_for
 from .surfaces import Surface
-from .vignetting import passed
 
 __all__ = ["FACTOR", "Highlights", "extract", "splat", "threshold"]
 
@@ -136,18 +136,20 @@ def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable
     in the light and coc of the rays and in what is in their way.
     """
     batch, _, height, width = shown[0].coc_px.shape
-    aperture = table.aperture
     longest = max(height, width)
     source, light, coc = (torch.cat(parts, -1) for parts in zip(*rays, strict=True))
     order = torch.argsort(coc.detach().abs())
     item, row, column = pixels.places(source[order], height, width)
     light, coc = light[:, order], coc[order]
+    shares: list[Shares] = []
+    if table.depends_on_place:
+        shares = [s.to(light) for s in ray_shares(table, coc.detach().tolist(), (height, width))]
     radii = coc.detach().tolist()
 
     def half_of(radius: float) -> int:
         return min(math.ceil(table.reach_px(radius, width) + 0.5), longest - 1)
 
-    margin = half_of(radii[-1])
+    margin = max([half_of(radii[-1]), *(half_of(each.coc_px) for each in shares)])  # the widest need not be the last
     across = width + 2 * margin
     area = (height + 2 * margin) * across
     splats = light.new_zeros(len(light), batch * area)
@@ -158,10 +160,10 @@ def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
         kernels = kernels_for(table, coc[part], width, longest).to(light.dtype)  # [n, 1 or C, k, k]
-        if aperture is not None and aperture.depends_on_place:
+        if shares:
             half_diagonal = 0.5 * math.hypot(height, width)
             y, x = ((row[part] + 0.5 - height / 2) / half_diagonal, (column[part] + 0.5 - width / 2) / half_diagonal)
-            kernels = passed(kernels, aperture, coc[part], y, x)
+            kernels = _placed(kernels, shares, coc[part], y, x)
         half = kernels.shape[-1] // 2
         step = torch.arange(-half, half + 1, device=light.device)
         landing = kernels * light[:, part].t()[:, :, None, None]
@@ -174,6 +176,19 @@ def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable
         start = stop
     frame = splats.unflatten(1, (batch, height + 2 * margin, across)).transpose(0, 1)
     return frame[..., margin : margin + height, margin : margin + width]
+
+
+def _placed(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """Kernels ``[n, 1 or C, k, k]`` of sources ``[n]`` at places, with the shares of the radii around each of them."""
+    radii = torch.tensor([each.coc_px for each in shares], dtype=coc.dtype, device=coc.device)
+    low = (torch.searchsorted(radii, coc.detach().contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
+    parts = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)
+    made = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], shares[0].values.shape[0]), -1, -1))
+    for k in low.unique().tolist():
+        of = (low == k).nonzero()[:, 0]
+        pair = [(shares[k], 1.0 - parts[of]), (shares[k + 1], parts[of])]
+        made = made.index_put((of,), placed(kernels[of], pair, y[of], x[of]))
+    return made
 
 
 class _Hiding:

@@ -35,7 +35,9 @@ def blur(
     Without a plan each item gets its own.
     """
     if is_traced() and options.table.depends_on_place:
-        raise ValueError("a compiled or exported graph has one kernel a layer; take a table without vignetting")
+        raise ValueError(
+            "a compiled or exported graph has one kernel a layer; take a table without vignetting or field"
+        )
     wide = torch.float64 if torch.float64 in (image.dtype, coc_px.dtype) else torch.float32
     maps = [image, coc_px, *(behind or ())]
     maps = [t.to(wide).contiguous().expand(image.shape[0], -1, -1, -1) for t in maps]

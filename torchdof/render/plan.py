@@ -14,8 +14,8 @@ from ..options import tolerance_of
 from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
+from .field import Shares, layer_shares, own_kernels
 from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
-from .vignetting import CatsEye
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
@@ -31,12 +31,12 @@ _kernels = KernelCache(256 * 2**20)
 class Blur:
     """How one layer is scattered: at every ``scale``-th pixel, with a kernel ``[1 or C, k, k]`` in such pixels.
 
-    Where the lens's barrel shows, ``cats_eye`` tells what becomes of the kernel across the frame.
+    Where kernels depend on the place, ``shares`` tell what becomes of the kernel across the frame.
     """
 
     kernel: Tensor
     scale: int
-    cats_eye: CatsEye | None = None
+    shares: Shares | None = None
 
     @property
     def half(self) -> int:
@@ -186,8 +186,7 @@ class Plan:
         """
         width = 1 if table.unit == "relative" else int(size[1])
         coarse = coarse and len(self.nodes) > 1  # a plane is exact
-        finest = 1.0 if table.aperture is None else table.aperture.finest
-        scales = tuple(self._scale(coc * finest) if coarse else 1 for coc in self.coc_px)
+        scales = tuple(self._scale(table.finest_px(coc, width)) if coarse else 1 for coc in self.coc_px)
         if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
@@ -207,11 +206,11 @@ class Plan:
                 window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
         blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
-        if table.aperture is None or not table.aperture.depends_on_place:
+        if not table.depends_on_place:
             return blurs
         frame = (int(size[0]), int(size[1]))
         return [
-            dataclasses.replace(blur, cats_eye=CatsEye(table.aperture, coc / blur.scale, blur.scale, frame))
+            dataclasses.replace(blur, shares=layer_shares(table, coc, blur.scale, frame))
             for blur, coc in zip(blurs, self.coc_px, strict=True)
         ]
 
@@ -229,12 +228,12 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> T
     within a frame whose longer side is ``longest`` pixels.
     """
     if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
-        kernels = table.kernels(coc_px, width)
+        kernels = own_kernels(table, coc_px, width)
     else:
         steps = coc_px.double() * KERNELS_PER_PX
         below = steps.floor()
         radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
-        low, high = (table.kernels(radii.cpu() / KERNELS_PER_PX, width).to(coc_px.device)[i] for i in which)
+        low, high = (own_kernels(table, radii.cpu() / KERNELS_PER_PX, width).to(coc_px.device)[i] for i in which)
         kernels = torch.lerp(low, high, (steps - below)[:, None, None, None])
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
     return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
@@ -246,9 +245,9 @@ def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, 
     @torch.inference_mode(False)  # what is kept must serve autograd as well
     def made() -> Tensor:
         coc = coc_px / scale
-        if scale > 1:  # averaging and interpolation blur as well
+        if scale > 1 and table.field is None:  # averaging and interpolation blur as well
             coc *= shrink(table, coc, width / scale, scale)
-        return table.kernels(torch.tensor([coc], dtype=torch.float64), width / scale, window=window)[0].clone()
+        return own_kernels(table, torch.tensor([coc], dtype=torch.float64), width / scale, window)[0].clone()
 
     if torch.is_grad_enabled() and table.requires_grad:
         return made()

@@ -92,7 +92,8 @@ class Frame:
     def any_between(self, low: float, high: float, halo: int) -> Tensor:
         """Whether anything, up to so far beyond the area, lies between two places on the blur axis: a bool ``[]``."""
         middle, half = (low + high) / 2.0, (high - low) / 2.0
-        return torch.stack([(self.cut(s.x, halo) - middle).abs().min() for s in self.surfaces]).min() < half
+        x = torch.cat([s.x for s in self.surfaces], 1)
+        return (self.cut(x, halo) - middle).abs().min() < half
 
     def layers(self, first: int, count: int, halo: int) -> tuple[Tensor, Tensor, Tensor]:
         """What layers that follow each other scatter, with so many pixels beyond the area.

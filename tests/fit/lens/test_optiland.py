@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,13 +21,38 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # its warnings are not ours t
 LENSES = ("double_gauss_50mm", "wide_22mm", "telephoto_250mm")
 
 
-def their_lens(lens: Lens, sensor_mm: float) -> Any:
-    material = importlib.import_module("optiland.materials").IdealMaterial
+# Laikin, Lens Design, 4th ed., p. 63: Tessar, f/4.5, 4 inches, of SCHOTT's glasses; its clear diameters are ours
+TESSAR = """
+1.3329  0.2791 N-SK15 1.1
+-9.9754 0.2054 1      1.1
+-2.0917 0.09   F2     0.95
+1.2123  0.0709 1      0.95
+0       0.1534 0      0.75
+-7.5205 0.09   K10    0.95
+1.3010  0.3389 N-SK15 1.1
+-1.5218 0      1      1.1
+"""
+LINES = {"C": 0.65627, "d": 0.58756, "F": 0.48613}
+DEPTHS = (2.5, 2.0, 1.5, 1.2, 1.0, 0.7, 0.4, 0.0)  # in dioptres of the focus
+
+
+def their_lens(lens: Lens, sensor_mm: float, wavelength_um: float = 0.58756) -> Any:
+    """Glasses of the catalogue by name are theirs; of other media they get our index."""
+    materials = importlib.import_module("optiland.materials")
+    media = [
+        materials.IdealMaterial(n=n) if glass is None else materials.Material(glass.name, "schott")
+        for n, glass in zip(lens.indices(wavelength_um)[1:], lens.glass or (), strict=True)
+    ]
     optic = importlib.import_module("optiland.optic").Optic()
     optic.surfaces.add(index=0, radius=np.inf, thickness=10.0)
     gaps = [*lens.thickness[:-1], sensor_mm]
-    for i, (radius, gap, n) in enumerate(zip(lens.radius, gaps, lens.index, strict=True)):
-        optic.surfaces.add(index=i + 1, radius=radius, thickness=gap, material=material(n=n), is_stop=i == lens.stop)
+    for i, (radius, gap, medium) in enumerate(zip(lens.radius, gaps, media, strict=True)):
+        shape = lens.shape(i)
+        asphere = {"surface_type": "even_asphere", "coefficients": shape.polynomial} if any(shape.polynomial) else {}
+        optic.surfaces.add(
+            index=i + 1, radius=radius, thickness=gap, material=medium, is_stop=i == lens.stop, conic=shape.conic,
+            **asphere,
+        )  # fmt: skip
     optic.surfaces.add(index=len(gaps) + 1)
     optic.set_aperture(aperture_type="EPD", value=lens.paraxial().entrance_pupil_diameter)
     optic.fields.set_type("angle")
@@ -35,8 +61,8 @@ def their_lens(lens: Lens, sensor_mm: float) -> Any:
     return optic
 
 
-def their_rays(start: np.ndarray, direction: np.ndarray) -> Any:
-    light, wavelength = np.ones_like(start[0]), np.full_like(start[0], 0.58756)
+def their_rays(start: np.ndarray, direction: np.ndarray, wavelength_um: float = 0.58756) -> Any:
+    light, wavelength = np.ones_like(start[0]), np.full_like(start[0], wavelength_um)
     return importlib.import_module("optiland.rays").RealRays(*start, *direction, light, wavelength)
 
 
@@ -66,9 +92,7 @@ def test_rays_land_within_5e5_mm(name: str, slope: float) -> None:
     ours = trace_rays(lens, start, direction)
     assert ours.alive.sum() > count / 4
     x, y = ours.at(lens.vertices[-1] + sensor)
-    theirs = importlib.import_module("optiland.rays").RealRays(
-        *start, *direction, np.ones(count), np.full(count, 0.58756)
-    )
+    theirs = their_rays(start, direction)
     their_lens(lens, sensor).surfaces.trace(theirs, skip=1)
     apart = np.hypot(np.asarray(theirs.x) - x, np.asarray(theirs.y) - y)[ours.alive]
     print(f"{name}, slope {slope}: {int(ours.alive.sum())} rays, at most {apart.max():.1e} mm apart")
@@ -85,11 +109,47 @@ def test_largest_blur_radius_of_the_double_gauss_agrees() -> None:
     direction = np.stack([0 * height, height, np.full_like(height, 1000.0)]) / np.hypot(height, 1000.0)
     start = np.stack([0 * height, height, np.full_like(height, pupil)]) - direction * ((pupil + 1.0) / direction[2])
     optic = their_lens(lens, sensor)
-    rays = importlib.import_module("optiland.rays").RealRays(
-        *start, *direction, np.ones_like(height), np.full_like(height, 0.58756)
-    )
+    rays = their_rays(start, direction)
     optic.surfaces.trace(rays, skip=1)
     passes = np.abs(np.asarray(optic.surfaces.surfaces[lens.stop + 1].y)) <= lens.diameter[lens.stop] / 2
     theirs = float(np.abs(np.asarray(rays.y))[passes].max())
     print(f"largest blur radius: {ours:.5f} mm, optiland {theirs:.5f} mm")
     assert ours == pytest.approx(theirs, abs=5e-5)
+
+
+def their_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) -> float:
+    """RMS radius of the spot on the axis, of rays equally dense over the entrance pupil that pass every aperture."""
+    first = lens.paraxial()
+    height = 1.5 * first.entrance_pupil_diameter / 2 * np.sqrt((np.arange(4000) + 0.5) / 4000)
+    reach = 1000.0 * z_m - first.front_principal + first.entrance_pupil  # from the object to the entrance pupil
+    along = np.ones_like(height)
+    direction = np.stack([0 * height, height / reach if math.isfinite(reach) else 0 * height, along])
+    direction /= np.linalg.norm(direction, axis=0)
+    start = np.stack([0 * height, height, first.entrance_pupil * along])
+    start = start - direction * ((first.entrance_pupil + 5.0) / direction[2])
+    optic, rays = their_lens(lens, sensor, wavelength_um), their_rays(start, direction, wavelength_um)
+    optic.surfaces.trace(rays, skip=1)
+    passes = np.isfinite(np.asarray(rays.y))
+    for i, diameter in enumerate(lens.diameter):
+        passes &= np.abs(np.asarray(optic.surfaces.surfaces[i + 1].y)) <= diameter / 2
+    return float(np.sqrt(np.mean(np.asarray(rays.y)[passes] ** 2)))
+
+
+@pytest.mark.parametrize("name", [*LENSES, "tessar"])
+def test_rms_spots_of_eight_depths_and_three_lines_agree_within_1_percent(name: str, tmp_path: Path) -> None:
+    (tmp_path / "tessar.txt").write_text(TESSAR)
+    lens = Lens.read(tmp_path / "tessar.txt").scaled(100.0) if name == "tessar" else Lens.read(name)
+    f_number = lens.paraxial().f_number
+    focus_m = 20.0 * lens.paraxial().focal_length / 1000.0
+    sensor = focus_sensor(lens, focus_m)
+    worst = 0.0
+    for line, wavelength_um in LINES.items():
+        row = []
+        for dioptres in DEPTHS:
+            z_m = focus_m / dioptres if dioptres else math.inf
+            ours = point_spread(lens, z_m, sensor, meridional=True, rays=4000, wavelength_um=wavelength_um).rms
+            theirs = their_rms(lens, z_m, sensor, wavelength_um)
+            worst = max(worst, abs(ours / theirs - 1.0))
+            row.append(f"{1000 * ours:.2f}/{1000 * theirs:.2f}")
+        print(f"{name} f/{f_number:.2f} {line}: " + "  ".join(row) + " um")
+    assert worst < 0.01

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from torchdof.fit import problems as p
-from torchdof.fit.photo.photographs import Photograph, _tone_curve, read_photographs, untoned
+from torchdof.fit.photo.photographs import read_photographs
 from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, write_target
+from torchdof.fit.photo.tone import tone_curve, untoned
 from torchdof.io.images import read_image
 
 
@@ -87,21 +88,36 @@ def test_what_cannot_be_read_says_what_to_do(simulator, tmp_path):
 def _photographs(simulator, tone, seed=0):
     """Dots as they would be in large photographs, blurred more and more, with an S-curve that nobody undid."""
     rng, found = np.random.default_rng(seed), []
-    for i, radius in enumerate((0.0, 8.0, 16.0, 24.0, 32.0)):
+    for radius in (0.0, 8.0, 16.0, 24.0, 32.0):
         side, size = 320.0, 321
         dot = simulator.draw_dot(size, DOT_MM / 2 * side / SQUARE_MM, oversample=4)
         dot = simulator.blur(dot, "disc", {"radius": radius}) if radius else dot
         light = simulator.Simulator(tone=tone, snr_db=50).record(0.03 + 0.75 * dot, rng)
         white = float(simulator.Simulator(tone=tone, snr_db=None).record(np.array([[0.78]]), rng)[0, 0])
-        found.append(Photograph(f"{i}.jpg", light, Target(160.0, 160.0, side, 1.0, white, 0.03), 1.0, 0.5, False))
+        found.append((light, Target(160.0, 160.0, side, 1.0, white, 0.03)))
     return found
 
 
 def test_a_tone_curve_is_found_by_the_light_of_the_dot_and_undone(simulator):
-    assert _tone_curve(_photographs(simulator, 0.0), SQUARE_MM) == (0.0, 0.0)
-    tone = _tone_curve(_photographs(simulator, 0.5), SQUARE_MM)
+    assert tone_curve(_photographs(simulator, 0.0), SQUARE_MM) == (0.0, 0.0)
+    tone = tone_curve(_photographs(simulator, 0.5), SQUARE_MM)
     levels = np.linspace(0.05, 0.75, 20)[None]
     curved = simulator.Simulator(tone=0.5, snr_db=None).record(levels, np.random.default_rng(0))
     # up to a common factor, which no kernel feels
     before, after = (v / v[0, -1] - levels / levels[0, -1] for v in (curved, untoned(curved, tone)))
     assert np.abs(after).max() < 0.4 * np.abs(before).max()
+
+
+@pytest.mark.parametrize("tone", [0.0, 0.4])
+def test_a_tone_curve_is_found_by_the_edges_of_the_square(simulator, tmp_path, tone):
+    # of dots as small as these the light tells nothing
+    simulator.write_photographs(tmp_path, 0.2, [0.28, 0.4, 0.6], width=800, tone=tone)
+    found = read_photographs(tmp_path)
+    if tone == 0.0:
+        assert found.tone == (0.0, 0.0)
+        return
+    levels = np.linspace(0.05, 0.75, 20)[None]
+    curved = simulator.Simulator(tone=tone, snr_db=None).record(levels, np.random.default_rng(0))
+    before, after = (v / v[0, -1] - levels / levels[0, -1] for v in (curved, untoned(curved, found.tone)))
+    assert np.abs(after).max() < 0.5 * np.abs(before).max()
+    assert any("the edges of the square" in sentence for sentence in found.advice)

@@ -25,6 +25,15 @@ enum {
   TORCHDOF_STACK = 2,       // surfaces that cover each other, near to far, as they are
 };
 
+// What the field lets through of a kernel, as render/field.py tells it.
+typedef struct {
+  const float *values;     // [colours, distances, rows, columns]
+  const float *boxes;      // [distances, 3]: middle away from the middle of the frame, half length, width, in its pixels
+  float radius;            // signed coc in its pixels
+  int32_t colours;         // 1, or channels
+  int32_t rows, columns;
+} torchdof_shares;
+
 typedef struct {
   int32_t height, width, channels;
   int32_t kind;                // as above
@@ -44,11 +53,10 @@ typedef struct {
   const int32_t *halves;   // its kernel reaches so many of these to each side
   int32_t kernel_colours;  // 1, or channels: kernels for each colour
   const float *kernels;    // one layer after the other, [kernel_colours, 2 half + 1, 2 half + 1]
-  const float *radii;      // signed coc of each layer in its own pixels
 
-  // What the lens's rims cut off kernels, as render/vignetting.py tells it.
-  float front, rear;  // shift of the rims in the frame's corners, in radii of the opening; 0: kernels are alike everywhere
-  float squeeze;      // height of the blur over its width
+  const torchdof_shares *shares;  // of each layer; null: kernels are alike everywhere
+  int32_t distances;              // from the middle of the frame to its corner at which shares are told
+  float squeeze;                  // height of the blur over its width
 
   int32_t threads;
   const volatile int32_t *cancelled;  // rendering stops soon after it becomes 1
@@ -62,8 +70,10 @@ TORCHDOF_API int32_t torchdof_begin(const torchdof_scene *scene, torchdof_job **
 // Signed radii of highlights, in steps of 1/32 pixel; returns how many.
 TORCHDOF_API int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps);
 
-// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. out: [channels, height, width].
-TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves, float *out);
+// kernels[i] is for radius i: [kernel_colours, 2 halves[i] + 1, 2 halves[i] + 1]. shares: by growing radius, two at least
+// around that of each highlight, where layers have them. out: [channels, height, width].
+TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
+                                     const torchdof_shares *shares, int32_t shares_count, float *out);
 
 TORCHDOF_API void torchdof_free(torchdof_job *job);
 
@@ -89,7 +99,7 @@ TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t wid
 
 // What a caller compares with its own idea of this file before it calls anything else: sizes of the two structures and,
 // in the upper half, a number that goes up with every other change of this file.
-#define TORCHDOF_REVISION 1
+#define TORCHDOF_REVISION 2
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

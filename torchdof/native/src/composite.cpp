@@ -58,6 +58,13 @@ struct WindowBlock {
   int room;                // 0 or 1 where that is all that stands in this term, else -1
 };
 
+// A layer's kernels as the field leaves them, in a block of its pixels.
+struct Cut {
+  const Layer *layer = nullptr;
+  int row = 0, column = 0;
+  std::vector<Kernel> kernels;  // of each colour
+};
+
 // Planes of a window, `pitch` values a row.
 struct Scratch {
   std::vector<float> memory;
@@ -68,7 +75,7 @@ struct Scratch {
   std::vector<float *> mine;    // a row of each surface's share
   float *rest;                  // what lies wholly behind a coarse layer
   std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for 16 columns
-  std::vector<Kernel> cut;  // a layer's kernels as the lens's rims leave them
+  std::vector<Cut> cuts = std::vector<Cut>(TILE / Turned::COLUMNS);
   std::vector<const float *> pointers;
   std::vector<uint64_t> layers, block_layers;
   std::vector<WindowBlock> blocks;
@@ -95,8 +102,8 @@ struct Occupied {
 
 class Composite {
  public:
-  Composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out)
-      : job_(job), s_(job.surfaces), layers_(job.layers), ray_kernels_(ray_kernels), ray_halves_(ray_halves), out_(out) {}
+  Composite(const Job &job, const RayKernels &ray_kernels, float *out)
+      : job_(job), s_(job.surfaces), layers_(job.layers), ray_kernels_(ray_kernels), out_(out) {}
 
   void run() {
     H_ = job_.height, W_ = job_.width, C_ = job_.channels, E_ = job_.colours, N_ = (int)layers_.size();
@@ -733,18 +740,24 @@ class Composite {
     return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
   }
 
-  // A layer's kernels at a strip, whose row and column are counted in its pixels from the frame's corner.
+  // A layer's kernels at a strip, whose row and column are counted in its pixels from the frame's corner: those of its block,
+  // kept for the next strip of it.
   const Kernel *kernels_at(Scratch &b, const Layer &l, int row, int column) const {
+    if (!l.shares) return l.kernels.data();
     const torchdof_scene &scene = job_.scene;
-    if (!Rim::cuts(scene)) return l.kernels.data();
     const int before = l.scale > 1;  // a canvas of coarser resolution begins one pixel before the frame
-    const int block = (column + before) / Rim::COLUMNS * Rim::COLUMNS - before;
+    const int block_row = (row + before) / Turned::ROWS, block_column = (column + before) / Turned::COLUMNS;
+    Cut &cut = b.cuts[block_column % (int)b.cuts.size()];
+    if (cut.layer == &l && cut.row == block_row && cut.column == block_column) return cut.kernels.data();
+    cut.layer = &l;
+    cut.row = block_row;
+    cut.column = block_column;
+    cut.kernels.resize(E_);
     const float per = per_half_diagonal(scene);
-    const float y = ((row + 0.5f * STRIP_ROWS) * l.scale - 0.5f * H_) * per, x = ((block + 0.5f * Rim::COLUMNS) * l.scale - 0.5f * W_) * per;
-    const Rim rim(scene, l.coc, y, x);
-    b.cut.resize(E_);
-    for (int e = 0; e < E_; e++) cut_kernel(l.kernels[e], rim, b.cut[e]);
-    return b.cut.data();
+    const float y = (((block_row + 0.5f) * Turned::ROWS - before) * l.scale - 0.5f * H_) * per;
+    const float x = (((block_column + 0.5f) * Turned::COLUMNS - before) * l.scale - 0.5f * W_) * per;
+    for (int e = 0; e < E_; e++) cut_kernel(l.kernels[e], Turned(scene, *l.shares, nullptr, 0.0f, e, y, x), cut.kernels[e]);
+    return cut.kernels.data();
   }
 
   // Spreads the terms of a layer, which begin at a row and a column of the window, and lays them on the tile's canvas,
@@ -972,7 +985,7 @@ class Composite {
     const bool has_rays = !job_.rays.empty() && ray_start_[which] < ray_start_[which + 1];
     if (has_rays) {
       memset(traced, 0, sizeof(float) * C * TILE_PIXELS);
-      splat(job_, visibility_, y0, x0, &ray_list_[ray_start_[which]], ray_start_[which + 1] - ray_start_[which], ray_kernels_, ray_halves_, traced);
+      splat(job_, visibility_, y0, x0, &ray_list_[ray_start_[which]], ray_start_[which + 1] - ray_start_[which], ray_kernels_, gains_, traced);
     }
     const bool normalize = over_ ? job_.behind.empty() : (bool)job_.scene.normalize;
     if (has_rays && !over_)
@@ -1028,12 +1041,13 @@ class Composite {
   // For each tile the rays that land in it, in their order.
   void sort_rays() {
     visibility_ = look_at(job_);
+    gains_ = gains_of(job_, ray_kernels_);
     const int tile_rows = ceil_div(H_, TILE), tile_columns = ceil_div(W_, TILE);
     ray_start_.assign(tile_rows * tile_columns + 1, 0);
     auto each_tile = [&](auto body) {
       for (int i = 0; i < (int)job_.rays.size(); i++) {
         const Ray &ray = job_.rays[i];
-        const int half = std::max(ray_halves_[ray.radius], ray_halves_[ray.radius + 1]);
+        const int half = std::max(ray_kernels_.halves[ray.radius], ray_kernels_.halves[ray.radius + 1]);
         const int r0 = std::max(ray.row - half, 0) / TILE, r1 = std::min(ray.row + half, H_ - 1) / TILE;
         const int c0 = std::max(ray.column - half, 0) / TILE, c1 = std::min(ray.column + half, W_ - 1) / TILE;
         for (int r = r0; r <= r1; r++)
@@ -1050,8 +1064,7 @@ class Composite {
   const Job &job_;
   const Surfaces &s_;
   const std::vector<Layer> &layers_;
-  const float *const *ray_kernels_;
-  const int32_t *ray_halves_;
+  const RayKernels &ray_kernels_;
   float *out_;
   int H_, W_, C_, E_, N_;
   bool over_;
@@ -1062,6 +1075,7 @@ class Composite {
   std::vector<std::unique_ptr<Downsampled>> downsampled_;  // of each scale of the runs
   Border border_;
   Visibility visibility_;
+  std::vector<float> gains_;
   std::vector<int> ray_start_, ray_list_;
 };
 
@@ -1076,8 +1090,8 @@ int LayerIndex::only_interval(size_t i) const {
   return last <= first + 1 ? first : -1;
 }
 
-void composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out) {
-  Composite(job, ray_kernels, ray_halves, out).run();
+void composite(const Job &job, const RayKernels &ray_kernels, float *out) {
+  Composite(job, ray_kernels, out).run();
 }
 
 }  // namespace TORCHDOF_SIMD

@@ -74,21 +74,27 @@ Kernel make_kernel(const float *values, int half, bool one_sided) {
   return k;
 }
 
-void cut_kernel(const Kernel &whole, const Rim &rim, Kernel &cut) {
+void cut_kernel(const Kernel &whole, const Turned &turned, Kernel &cut) {
   const int half = whole.half, side = 2 * half + 1, stride = stride_of(half);
   cut.half = half;
   cut.symmetric = false;
   cut.sum = whole.sum;
-  cut.reach = whole.reach;
+  cut.reach.assign(whole.reach.size(), -1);
   cut.taps = whole.taps;
   float left = 0;
   for (int d = -half; d <= half; d++) {
     float *taps = cut.taps.data() + (size_t)(d + half) * stride + ROWS - 1;
-    for (int y = 0; y < side; y++) taps[y] *= rim.share((float)(half - y), (float)-d);
-    for (int y = 0; y < side; y++) left += taps[y];
+    for (int y = 0; y < side; y++) {
+      if (taps[y] == 0) continue;
+      taps[y] *= turned.share((float)(half - y), (float)-d);
+      if (taps[y] == 0) continue;
+      left += taps[y];
+      for (int o = 0; o < ROWS; o++) cut.reach[y + o] = std::max(cut.reach[y + o], std::abs(d));
+    }
   }
-  if (!(left > Rim::LEAST * whole.sum)) {
+  if (!(left > Turned::LEAST * whole.sum)) {
     cut.taps = whole.taps;
+    cut.reach = whole.reach;
     return;
   }
   const float gain = whole.sum / left;

@@ -66,8 +66,9 @@ int64_t torchdof_radii(const torchdof_job *job, const int32_t **steps) {
   return (int64_t)job->job->radii().size();
 }
 
-int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves, float *out) {
-  return torchdof::guarded([&] { job->job->finish(kernels, halves, out); });
+int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const int32_t *halves,
+                        const torchdof_shares *shares, int32_t shares_count, float *out) {
+  return torchdof::guarded([&] { job->job->finish({kernels, halves, shares, shares_count}, out); });
 }
 
 void torchdof_free(torchdof_job *job) { delete job; }

@@ -15,7 +15,7 @@ namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
 constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 64, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
@@ -171,14 +171,14 @@ class Repair {
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return;
     if (spares) find();
     std::vector<Group> groups = tiles();
-    list(groups, [&](int i) { return !map_.automatic || (marks_[i] & RAMP ? is_soft : wrong(i) > EXACT); });
+    list(groups, [&](int i) { return !map_.automatic || (marks_[i] & RAMP ? is_soft : wrong(i) > DOUBTFUL); });
     judge(groups);
     decide(groups);
     const float sigma = blur();
-    choose(groups);
-    unmix(groups, sigma);
+    const float lost_px = choose(groups);
+    unmix(groups, sigma, lost_px);
     move(groups);
-    if (is_soft) lift_lamps(sigma);
+    if (is_soft) lift_lamps(sigma, lost_px);
   }
 
  private:
@@ -297,11 +297,11 @@ class Repair {
   // Ramps and steps, and the two surfaces that meet there.
   void find() {
     const std::vector<Group> all = tiles();
-    std::vector<double> steepness(all.size(), 0.0);
+    std::vector<double> length(all.size(), 0.0);
     std::vector<int64_t> middles(all.size(), 0);
-    parallel((int)all.size(), [&](int p) { find_in(all[p].part, steepness[p], middles[p]); });
+    parallel((int)all.size(), [&](int p) { find_in(all[p].part, length[p], middles[p]); });
     for (size_t p = 0; p < all.size(); p++) {
-      steepness_ += steepness[p];
+      length_ += length[p];
       middles_ += middles[p];
     }
   }
@@ -309,13 +309,13 @@ class Repair {
   // The same, in the blocks of a sample and what is around them.
   void find_around(const std::vector<Group> &sampled) {
     parallel((int)sampled.size(), [&](int p) {
-      double steepness;
+      double length;
       int64_t middles;
-      find_in(in_frame(sampled[p].part.grown(REACH)), steepness, middles);
+      find_in(in_frame(sampled[p].part.grown(REACH)), length, middles);
     });
   }
 
-  void find_in(const Part &part, double &steepness, int64_t &middles) {
+  void find_in(const Part &part, double &length, int64_t &middles) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *nearness = map_.nearness + i;
@@ -325,7 +325,7 @@ class Repair {
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return;
-    if (!find_in(busy, STEP_HALO, steepness, middles)) find_in(busy, HALO, steepness, middles);
+    if (!find_in(busy, STEP_HALO, length, middles)) find_in(busy, HALO, length, middles);
   }
 
   // Where there may be edges.
@@ -372,7 +372,7 @@ class Repair {
   }
 
   // Returns whether the halo was wide enough.
-  bool find_in(const Part &inner, int halo, double &steepness, int64_t &middles) {
+  bool find_in(const Part &inner, int halo, double &length, int64_t &middles) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -460,18 +460,13 @@ class Repair {
       uint8_t *marks = marks_.data() + row;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)mark_row[k];
       for (int k = 0; k < inner.width; k++) {
-        if (!marks[k]) continue;
+        if (!(marks[k] & EDGE)) continue;
         const int x = inner.x0 + k;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
         const bool is_ramp = marks[k] & RAMP;
-        if (is_ramp && std::fabs(level - 0.5f) < 0.12f) {
-          const float x0 = valid(value[0] - value[-1]), x1 = valid(value[1] - value[0]);
-          const float y0 = valid(value[0] - value[-raw.pitch]), y1 = valid(value[raw.pitch] - value[0]);
-          const float mx = x0 * x1 > 0 ? 0.5f * (x0 + x1) : 0.0f, my = y0 * y1 > 0 ? 0.5f * (y0 + y1) : 0.0f;
-          steepness += std::sqrt(mx * mx + my * my) / gap;
-          middles++;
-        }
-        if (!(marks[k] & EDGE)) continue;
+        const float beside = valid(value[1] - value[0]), under = valid(value[raw.pitch] - value[0]);
+        length += std::sqrt(beside * beside + under * under) / gap;
+        middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
         const int direction = std::fabs(right) > std::fabs(below) ? right > 0 : 2 + (below > 0);
         int ring = 0;
@@ -819,23 +814,34 @@ class Repair {
     return share;
   }
 
-  float blur() const {
-    const double width = middles_ / std::max(std::sqrt(2 * 3.14159265358979323846) * steepness_, 1e-12);
-    return (float)std::sqrt(std::min(std::max(width * width - 0.75, 0.25), 9.0));
-  }
+  // Standard deviation of the blur that made ramps of steps.
+  float blur() const { return clamp((float)(middles_ / (MIDDLE_HALF * std::max(length_, 1e-12))), 0.2f, 3.0f); }
 
-  // Marks the pixels that show the near surface.
-  void choose(std::vector<Group> &groups) {
+  // Marks the pixels that show the near surface; returns how many pixels of it at each edge the map has as far ones.
+  float choose(std::vector<Group> &groups) {
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
+    std::vector<double> lost(groups.size(), 0.0);
     parallel((int)groups.size(), [&](int g) {
       for (size_t k = 0; k < groups[g].pixels.size(); k++) {
         const int i = groups[g].pixels[k];
-        const bool shows_near = groups[g].judged[k].score + prior[kind_[i]] > 0;
+        const float score = groups[g].judged[k].score;
+        const bool shows_near = score + prior[kind_[i]] > -LEAN * clamp01(std::fabs(score) - 1.0f);
         marks_[i] = (uint8_t)((marks_[i] & ~NEAR) | (shows_near ? NEAR : 0));
       }
+      const Part &part = groups[g].part;
+      for (int y = part.y0; y < part.bottom(); y++)
+        for (int i = y * width_ + part.x0, end = i + part.width; i < end; i++)
+          if (marks_[i] & EDGE)
+            lost[g] += (marks_[i] & NEAR ? 1.0f : 0.0f) - clamp01((map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f));
     });
+    double total = 0;
+    for (const double here : lost) total += here;
+    return (float)(total / std::max(length_, 1e-12));
   }
+
+  // How far thin structures can have lost nearness, 0 to 1: none where the map's surfaces are too large.
+  static float is_lost(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
 
   void move(const std::vector<Group> &groups) const {
     parallel((int)groups.size(), [&](int g) {
@@ -863,28 +869,37 @@ class Repair {
     return weights;
   }
 
-  // Nearness around a pixel as a + b cover.
-  static Line regress(const Grid &given, const Grid &cover, const float *weights, int y, int x) {
+  // Nearness around a pixel as a + b blurred, which must explain what the shape does not that is not blurred.
+  static Line regress(const Grid &given, const Grid &shape, const Grid &blurred, const float *weights, int y, int x) {
     const float own = *given.at(y, x);
-    vec mx{}, my{}, xx{}, yy{}, xy{};
+    const Grid *covers[2] = {&blurred, &shape};
+    vec mx[2] = {}, xx[2] = {}, xy[2] = {}, my{}, yy{};
     for (int v = 0; v < SIDE; v++)
       for (int u = 0; u < ACROSS; u += LANES) {
-        const vec weight = load<vec>(weights + v * ACROSS + u), cx = load<vec>(cover.at(y + v - REACH, x + u - REACH));
-        const vec cy = load<vec>(given.at(y + v - REACH, x + u - REACH)) - own, wx = weight * cx, wy = weight * cy;
-        mx += wx;
+        const vec weight = load<vec>(weights + v * ACROSS + u), cy = load<vec>(given.at(y + v - REACH, x + u - REACH)) - own, wy = weight * cy;
         my += wy;
-        xx += wx * cx;
         yy += wy * cy;
-        xy += wx * cy;
+        for (int i = 0; i < 2; i++) {
+          const vec cx = weight > vec{} ? load<vec>(covers[i]->at(y + v - REACH, x + u - REACH)) : vec{}, wx = weight * cx;
+          mx[i] += wx;
+          xx[i] += wx * cx;
+          xy[i] += wx * cy;
+        }
       }
-    const float mean_x = sum(mx), mean_y = sum(my);
-    const float of_x = std::max(sum(xx) - mean_x * mean_x, 0.0f), of_y = std::max(sum(yy) - mean_y * mean_y, 0.0f), both = std::max(sum(xy) - mean_x * mean_y, 0.0f);
-    const float b = both / std::max(of_x, 1e-9f), explained = both * both / std::max(of_x * of_y, 1e-12f);
-    return {mean_y - b * mean_x + own, b, of_x > 0.004f ? clamp01((explained - 0.5f) / 0.3f) : 0.0f};
+    const float mean_y = sum(my), of_y = std::max(sum(yy) - mean_y * mean_y, 0.0f);
+    float mean_x[2], of_x[2], both[2], explained[2];
+    for (int i = 0; i < 2; i++) {
+      mean_x[i] = sum(mx[i]);
+      of_x[i] = std::max(sum(xx[i]) - mean_x[i] * mean_x[i], 0.0f);
+      both[i] = std::max(sum(xy[i]) - mean_x[i] * mean_y, 0.0f);
+      explained[i] = both[i] * both[i] / std::max(of_x[i] * of_y, 1e-12f);
+    }
+    const float b = both[0] / std::max(of_x[0], 1e-9f), better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
+    return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - 0.5f) / 0.3f) * better : 0.0f};
   }
 
   // The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best.
-  void unmix(std::vector<Group> &groups, float sigma) const {
+  void unmix(std::vector<Group> &groups, float sigma, float lost_px) const {
     const std::vector<float> weights = window();
     const int reach = blur_reach(sigma);
     parallel((int)groups.size(), [&](int g) {
@@ -915,7 +930,8 @@ class Repair {
       for (size_t k = 0; k < group.pixels.size(); k++) {
         if (!is_thin[k]) continue;
         const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
-        const Line line = regress(given, blurred, weights.data(), y, x);
+        Line line = regress(given, high, blurred, weights.data(), y, x);
+        line.fit *= is_lost(marks_[group.pixels[k]] & NEAR ? lost_px : -lost_px);
         float &near = group.judged[k].near, &far = group.judged[k].far;
         const float gap = near - far;
         if (marks_[group.pixels[k]] & NEAR)
@@ -968,7 +984,7 @@ class Repair {
   }
 
   // Lamps of a few pixels, whose nearness a soft map spreads around them.
-  void lift_lamps(float sigma) const {
+  void lift_lamps(float sigma, float lost_px) const {
     const std::vector<float> weights = window();
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
@@ -997,7 +1013,8 @@ class Repair {
       gaussian(usual, blurred, rows, around, sigma);
       fetch(map_.nearness, given, valid);
       for (const int i : lamps) {
-        const Line line = regress(given, blurred, weights.data(), i / width_, i % width_);
+        Line line = regress(given, usual, blurred, weights.data(), i / width_, i % width_);
+        line.fit *= is_lost(lost_px);
         map_.out[i] += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - map_.out[i], 0.0f);
       }
     });
@@ -1073,7 +1090,7 @@ class Repair {
   Buffer<float> near_, far_, witness_, score_;
   Buffer<uint8_t> marks_, kind_;
   std::vector<float> shares_;
-  double steepness_ = 0;
+  double length_ = 0;  // of all steps, in pixels
   int64_t middles_ = 0;
 };
 

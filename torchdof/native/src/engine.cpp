@@ -20,8 +20,8 @@ Job::Job(const torchdof_scene &scene)
     l.at = (float)l.node;
     l.per_after = k == scene.layers - 1 ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
     const int side = 2 * l.half + 1;
-    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !Rim::cuts(scene)));
-    if (Rim::cuts(scene)) l.coc = scene.radii[k];
+    for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !scene.shares));
+    if (scene.shares && l.half) l.shares = scene.shares + k;
     layers.push_back(std::move(l));
   }
 }
@@ -154,7 +154,7 @@ void Job::take_scene() {
 void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
-  const bool several = layers.size() > 1 || Rim::cuts(scene), background = scene.kind == TORCHDOF_BACKGROUND;
+  const bool several = layers.size() > 1 || scene.shares, background = scene.kind == TORCHDOF_BACKGROUND;
   const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
   // without occlusion highlights matter where coarse layers would soften them
   const bool limited = several && (scene.occlusion || (scene.highlights && scene.crisp_px < reach));
@@ -172,7 +172,7 @@ void Job::begin() {
   if (limited && scene.highlights) extract_highlights();
 }
 
-void Job::finish(const float *const *kernels, const int32_t *halves, float *out) { composite(*this, kernels, halves, out); }
+void Job::finish(const RayKernels &kernels, float *out) { composite(*this, kernels, out); }
 
 }  // namespace TORCHDOF_SIMD
 
@@ -181,7 +181,7 @@ class JobOf : public AnyJob {
  public:
   explicit JobOf(const torchdof_scene &scene) : job_(scene) { job_.begin(); }
   const std::vector<int32_t> &radii() const override { return job_.radii; }
-  void finish(const float *const *kernels, const int32_t *halves, float *out) override { job_.finish(kernels, halves, out); }
+  void finish(const RayKernels &kernels, float *out) override { job_.finish(kernels, out); }
 
  private:
   Job job_;

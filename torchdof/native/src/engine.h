@@ -12,6 +12,7 @@
 #include "api.h"
 #include "memory.h"
 #include "threads.h"
+#include "variants.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
@@ -131,7 +132,7 @@ struct Layer {
   double node = 0;
   float before = 0, per_before = 0, at = 0, per_after = 0;  // ramps to the layer and beyond it
   bool first = false;
-  float coc = 0;                // in its own pixels
+  const torchdof_shares *shares = nullptr;
   std::vector<Kernel> kernels;  // one, or one a colour
 };
 
@@ -182,7 +183,7 @@ inline V behind(const Layer &l, V place, bool ease) {
 struct Job {
   explicit Job(const torchdof_scene &scene);
   void begin();
-  void finish(const float *const *kernels, const int32_t *halves, float *out);
+  void finish(const RayKernels &kernels, float *out);
 
   const torchdof_scene &scene;
   int height, width, channels, colours;  // colours: kernels a layer, 1 or channels
@@ -281,7 +282,10 @@ struct Visibility {
 Visibility look_at(const Job &job);
 // Adds the light of rays to a tile [channels, TILE, TILE].
 void splat(const Job &job, const Visibility &visibility, int y0, int x0, const int *rays, int count,
-           const float *const *kernels, const int32_t *halves, float *tile);
+           const RayKernels &kernels, const std::vector<float> &gains, float *tile);
+// By how much the light that the field lets through of each ray's kernel is made brighter, [rays, colours]: 0 where none is,
+// and the kernel stays whole. Empty: kernels are alike everywhere.
+std::vector<float> gains_of(const Job &job, const RayKernels &kernels);
 
 // For each pixel of each surface the node before it, and for each cell the layers in it.
 struct LayerIndex {
@@ -335,32 +339,70 @@ class Downsampled {
 constexpr int STRIP_ROWS = 4, STRIP_COLUMNS = 2 * LANES, STRIP = STRIP_ROWS * STRIP_COLUMNS;
 Kernel make_kernel(const float *values, int half, bool one_sided);
 
-// What the lens's rims let through at a place in the frame: render/vignetting.py.
-struct Rim {
-  static constexpr int COLUMNS = 16;     // whose pixels share a kernel, STRIP_ROWS high
-  static constexpr float LEAST = 1e-6f;  // share of a kernel; where less passes it stays whole
-  float down[2], across[2], reach[2], squeeze;  // of the front and the rear rim
-  Rim(const torchdof_scene &scene, float coc, float y, float x) : squeeze(scene.squeeze) {  // place in half diagonals
-    const float shifts[2] = {scene.front * coc, -scene.rear * coc}, far = std::sqrt(y * y + x * x + 1e-12f);
-    for (int i = 0; i < 2; i++) {
-      const float slack = 4.0f * (std::fabs(coc) + 1.0f) * std::max(1.0f - std::fabs(shifts[i]) * far, 0.0f);
-      down[i] = shifts[i] * y;
-      across[i] = shifts[i] * x;
-      reach[i] = std::fabs(coc) + 0.5f + slack;
+// What the field lets through of a kernel at a place in the frame: render/field.py.
+class Turned {
+ public:
+  static constexpr int ROWS = 8, COLUMNS = 16;  // whose pixels share a kernel
+  static constexpr float LEAST = 1e-6f;         // share of a kernel; where less passes it stays whole
+
+  // Of one radius (b null) or of two, b by `part`, at a place in half diagonals from the middle of the frame.
+  Turned(const torchdof_scene &scene, const torchdof_shares &a, const torchdof_shares *b, float part, int colour, float y, float x)
+      : squeeze_(scene.squeeze), part_(part), both_(b != nullptr) {
+    x += ASIDE;
+    const float distance = std::sqrt(y * y + x * x), place = std::min(distance, 1.0f) * (scene.distances - 1);
+    const int low = std::min((int)place, scene.distances - 2);
+    const float near = place - low;
+    down_ = y / distance;
+    right_ = x / distance;
+    const torchdof_shares *const of[2] = {&a, b};
+    float box[3] = {};
+    for (int k = 0; k <= both_; k++) {
+      const float *p = of[k]->boxes + 3 * low, weight = both_ ? k ? part : 1.0f - part : 1.0f;
+      for (int i = 0; i < 3; i++) box[i] += weight * (p[i] + near * (p[3 + i] - p[i]));
+    }
+    for (int k = 0; k <= both_; k++) {
+      Samples &s = samples_[k];
+      const int rows = of[k]->rows, count = rows * of[k]->columns;
+      s.columns = of[k]->columns;
+      s.last_row = (float)(rows - 1);
+      s.last_column = (float)(s.columns - 1);
+      s.per_u = s.last_row / (2.0f * box[1]);
+      s.first_u = 0.5f * s.last_row - box[0] * s.per_u;
+      s.per_v = s.last_column / box[2];
+      s.values.resize(count);
+      const float *p = of[k]->values + ((size_t)(of[k]->colours > 1 ? colour : 0) * scene.distances + low) * count, *q = p + count;
+      for (int i = 0; i < count; i++) s.values[i] = p[i] + near * (q[i] - p[i]);
     }
   }
-  float inside(int i, float dy, float dx) const {
-    const float y = dy + down[i], x = dx * squeeze + across[i];
-    return reach[i] - std::sqrt(y * y + x * x + 1e-12f);
+  float share(float dy, float dx) const {
+    const float across = dx * squeeze_, u = dy * down_ + across * right_, v = std::fabs(across * down_ - dy * right_);
+    const float first = samples_[0].at(u, v);
+    return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, v) : first;
   }
-  float share(float dy, float dx) const { return clamp01(std::min(inside(0, dy, dx), inside(1, dy, dx))); }
-  static bool cuts(const torchdof_scene &scene) { return scene.front != 0 || scene.rear != 0; }
+
+ private:
+  static constexpr float ASIDE = 1e-6f;
+  struct Samples {
+    std::vector<float> values;
+    int columns;
+    float last_row, last_column, per_u, first_u, per_v;
+    float at(float u, float v) const {
+      const float row = std::min(std::max(u * per_u + first_u, 0.0f), last_row), column = std::min(v * per_v, last_column);
+      const int i = std::min((int)row, (int)last_row - 1), j = std::min((int)column, (int)last_column - 1);
+      const float down = row - i, right = column - j, *p = values.data() + i * columns + j;
+      const float upper = p[0] + right * (p[1] - p[0]), lower = p[columns] + right * (p[columns + 1] - p[columns]);
+      return clamp01(upper + down * (lower - upper));
+    }
+  };
+  Samples samples_[2];
+  float squeeze_, part_, down_, right_;
+  bool both_;
 };
 inline float per_half_diagonal(const torchdof_scene &scene) {
   return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);
 }
 // A kernel, made not one-sided, with what does not pass left out and its light made whole again.
-void cut_kernel(const Kernel &whole, const Rim &rim, Kernel &cut);
+void cut_kernel(const Kernel &whole, const Turned &turned, Kernel &cut);
 // Columns from which a strip at column x is spread, counted from its input's first: a bit for each 16 of them.
 inline uint32_t strip_inputs(int x, int half) {
   uint32_t columns = 0;
@@ -374,7 +416,7 @@ void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t c
 // Depth edges; edges.cpp
 void repair_edges(const torchdof_map &map);
 
-void composite(const Job &job, const float *const *ray_kernels, const int32_t *ray_halves, float *out);
+void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

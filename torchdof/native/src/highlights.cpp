@@ -272,36 +272,57 @@ static void add_blocked(const Job &job, const Ray &ray, float place, float fades
   }
 }
 
-void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const float *const *kernels,
-           const int32_t *halves, float *tile) {
+// What the field lets through of a ray's kernel.
+static Turned turned_of(const Job &job, const RayKernels &kernels, const Ray &ray, int colour) {
+  const auto *shares = kernels.shares;
+  int low = 0;
+  while (low < kernels.shares_count - 2 && shares[low + 1].radius <= ray.coc) low++;
+  const float part = clamp01((ray.coc - shares[low].radius) / (shares[low + 1].radius - shares[low].radius));
+  const float per = per_half_diagonal(job.scene);
+  const float y = (ray.row + 0.5f - 0.5f * job.height) * per, x = (ray.column + 0.5f - 0.5f * job.width) * per;
+  return Turned(job.scene, shares[low], &shares[low + 1], part, colour, y, x);
+}
+
+std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
+  const int E = job.colours;
+  if (!job.scene.shares) return {};
+  std::vector<float> gains(job.rays.size() * E);
+  job.parallel((int)job.rays.size(), [&](int r, int) {
+    const Ray &ray = job.rays[r];
+    for (int e = 0; e < E; e++) {
+      const Turned turned = turned_of(job, kernels, ray, e);
+      double all_light = 0, left = 0;
+      for (int which = ray.radius; which <= ray.radius + 1; which++) {
+        const int h = kernels.halves[which], side = 2 * h + 1;
+        const float part = which == ray.radius ? 1.0f - ray.part : ray.part, *values = kernels.kernels[which] + (size_t)e * side * side;
+        for (int y = 0; y < side; y++)
+          for (int x = 0; x < side; x++) {
+            const float light = part * values[y * side + x];
+            if (light == 0) continue;
+            all_light += light;
+            left += light * turned.share((float)(y - h), (float)(x - h));
+          }
+      }
+      gains[(size_t)r * E + e] = left > Turned::LEAST * all_light ? (float)(all_light / left) : 0.0f;
+    }
+  });
+  return gains;
+}
+
+void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const RayKernels &ray_kernels,
+           const std::vector<float> &gains, float *tile) {
+  const float *const *kernels = ray_kernels.kernels;
+  const int32_t *halves = ray_kernels.halves;
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
   std::vector<int> nearer(v.bins.size());
   std::vector<const float *> surface_light(C);
+  std::vector<Turned> turned;  // of each colour
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
     const int half = std::max(halves[ray.radius], halves[ray.radius + 1]);
-    // what the lens's rims let through, and by how much that is made brighter
-    const bool is_cut = Rim::cuts(job.scene);
-    const float per = per_half_diagonal(job.scene);
-    const Rim rim(job.scene, ray.coc, (ray.row + 0.5f - 0.5f * H) * per, (ray.column + 0.5f - 0.5f * W) * per);
-    std::vector<float> gain(E, 1.0f);
-    std::vector<uint8_t> whole(E, !is_cut);
-    for (int e = 0; e < E && is_cut; e++) {
-      double all_light = 0, left = 0;
-      for (int which = ray.radius; which <= ray.radius + 1; which++) {
-        const int h = halves[which], side = 2 * h + 1;
-        const float part = which == ray.radius ? 1.0f - ray.part : ray.part, *values = kernels[which] + (size_t)e * side * side;
-        for (int y = 0; y < side; y++)
-          for (int x = 0; x < side; x++) {
-            const float light_here = part * values[y * side + x];
-            all_light += light_here;
-            left += light_here * rim.share((float)(y - h), (float)(x - h));
-          }
-      }
-      whole[e] = !(left > Rim::LEAST * all_light);
-      gain[e] = whole[e] ? 1.0f : (float)(all_light / left);
-    }
+    turned.clear();
+    for (int e = 0; e < E && !gains.empty(); e++) turned.push_back(turned_of(job, ray_kernels, ray, e));
     // adds a row of one of its two kernels
     auto add_taps = [&](int which, float part, int c, int y, int x, int n, float *taps) {
       const int h = halves[which], first = std::max(x, ray.column - h), last = std::min(x + n - 1, ray.column + h);
@@ -346,8 +367,9 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
               add_taps(ray.radius, 1.0f - ray.part, c, y, px, nx, taps);
               add_taps(ray.radius + 1, ray.part, c, y, px, nx, taps);
               const int e = E > 1 ? c : 0;
-              if (!whole[e])
-                for (int x = 0; x < nx; x++) taps[x] *= gain[e] * rim.share((float)(y - ray.row), (float)(px + x - ray.column));
+              const float gain = gains.empty() ? 0.0f : gains[(size_t)rays[r] * E + e];
+              for (int x = 0; x < nx && gain > 0; x++)
+                if (taps[x] != 0) taps[x] *= gain * turned[e].share((float)(y - ray.row), (float)(px + x - ray.column));
             }
             float *to = tile + (size_t)c * TILE * TILE + (y - y0) * TILE + (px - x0);
             for (int x = 0; x < nx; x++) to[x] += taps[x] * (1.0f - std::min(blocked[x], 1.0f)) * light[c];

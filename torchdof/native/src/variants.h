@@ -6,11 +6,19 @@
 
 namespace torchdof {
 
+// Kernels of highlights: of each radius, and what the field lets through of them.
+struct RayKernels {
+  const float *const *kernels;
+  const int32_t *halves;
+  const torchdof_shares *shares;
+  int32_t shares_count;
+};
+
 class AnyJob {
  public:
   virtual ~AnyJob() = default;
   virtual const std::vector<int32_t> &radii() const = 0;
-  virtual void finish(const float *const *kernels, const int32_t *halves, float *out) = 0;
+  virtual void finish(const RayKernels &kernels, float *out) = 0;
 };
 
 struct Variant {

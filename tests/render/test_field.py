@@ -1,4 +1,4 @@
-"""Cat's eyes towards the corners of the frame."""
+"""Kernels that depend on the place in the frame."""
 
 import math
 from typing import Any
@@ -10,7 +10,8 @@ from torch.testing import assert_close
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.optics.aperture import Aperture
-from torchdof.render.vignetting import passed
+from torchdof.optics.field import Field
+from torchdof.render.field import layer_shares, own_kernels, placed
 
 CUT = Aperture(vignetting=0.4)
 TABLE = BlurTable.disc().with_aperture(CUT)
@@ -18,6 +19,13 @@ TABLE = BlurTable.disc().with_aperture(CUT)
 
 def number(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
+
+
+def passed(table: BlurTable, coc_px: float, y: float, x: float, size: tuple[int, int] = (100, 100)) -> Tensor:
+    """Kernel ``[C, k, k]`` of a place in half diagonals."""
+    shares = layer_shares(table, coc_px, 1, size)
+    kernel = table.kernels(number(coc_px)[None], size[1])
+    return placed(kernel, [(shares, number(1.0))], number(y)[None], number(x)[None])[0]
 
 
 def cats_eye(coc_px: float, y: float, x: float, half: int, front: float, rear: float) -> Tensor:
@@ -39,7 +47,7 @@ def test_the_kernel_of_a_place_is_what_disc_and_rim_leave_open(
 ) -> None:
     aperture = Aperture(vignetting=vignetting)
     kernel = BlurTable.disc().kernels(number(coc_px)[None], 100)[0]
-    cut = passed(kernel, aperture, number(coc_px), number(y), number(x))
+    cut = passed(BlurTable.disc().with_aperture(aperture), coc_px, y, x)
     expected = cats_eye(coc_px, y, x, kernel.shape[-1] // 2, *aperture.rims)
     assert float(cut.sum()) == pytest.approx(1.0, abs=1e-12)
     assert (cut[0] - expected).abs().sum() < 0.04  # of the light, within a pixel of the rim's border
@@ -56,9 +64,9 @@ def test_the_kernel_of_a_place_is_what_disc_and_rim_leave_open(
 def test_in_the_middle_of_the_frame_and_near_focus_nothing_is_cut() -> None:
     for coc in (-9.0, 0.02, 3.0):
         kernel = BlurTable.gaussian().kernels(number(coc)[None], 100)[0]
-        assert_close(passed(kernel, CUT, number(coc), number(0.0), number(0.0)), kernel, rtol=1e-12, atol=0)
+        assert_close(passed(BlurTable.gaussian().with_aperture(CUT), coc, 0.0, 0.0), kernel, rtol=1e-12, atol=0)
     kernel = BlurTable.disc().kernels(number(0.3)[None], 100)[0]
-    assert_close(passed(kernel, CUT, number(0.3), number(0.6), number(0.8)), kernel, rtol=1e-12, atol=0)
+    assert_close(passed(TABLE, 0.3, 0.6, 0.8), kernel, rtol=1e-12, atol=0)
 
 
 def test_blur_across_the_frame_is_each_pixels_own_within_a_hundredth() -> None:
@@ -70,7 +78,7 @@ def test_blur_across_the_frame_is_each_pixels_own_within_a_hundredth() -> None:
     half, diagonal = kernel.shape[-1] // 2, 0.5 * math.hypot(height, width)
     for row, column in ((6, 9), (61, 97), (17, 190), (110, 24), (64, 160)):
         y, x = (number((p + 0.5 - n / 2) / diagonal) for p, n in ((row, height), (column, width)))
-        own = passed(kernel, CUT, number(coc_px), y, x)[0]
+        own = passed(TABLE, coc_px, float(y), float(x), (height, width))[0]
         around = image[0, 0, row - half : row + half + 1, column - half : column + half + 1]
         expected = float((around * own.flip(-2, -1)).sum())
         assert float(picture[0, 0, row, column]) == pytest.approx(expected, abs=0.01)
@@ -96,6 +104,55 @@ def test_a_picture_with_cats_eyes_has_gradients() -> None:
 
     given = (image.requires_grad_(), coc.requires_grad_())
     assert torch.autograd.gradcheck(picture, given, atol=1e-5, fast_mode=True)
+
+
+def lopsided(channels: int = 1) -> BlurTable:
+    """A lens whose spots trail outwards, more so off the axis, and are wider across than along."""
+    coc, radius = torch.tensor([-0.5, -0.2, 0.0, 0.3, 0.6]), torch.tensor([0.0, 8.0, 18.0])
+    size = (coc[:, None].abs() + 0.01) * (1.0 - 0.02 * radius)
+    box = torch.stack([0.02 * radius * size, size, (1.0 + 0.03 * radius) * size], -1)
+    u, v = torch.linspace(-1, 1, 96)[:, None], torch.linspace(0, 1, 48)
+    inside = (torch.hypot(u, v) < 1.0) * (1.0 + 0.05 * radius[:, None, None] * (u + 1.0))
+    light = torch.stack([inside * (1.0 + 0.3 * c * u) for c in range(channels)])[:, None].expand(-1, 5, -1, -1, -1)
+    params = {"radius": coc.abs().expand(channels, -1)}
+    return BlurTable("disc", coc, params, unit="mm", sensor_width_mm=36.0, field=Field(coc, radius, box, light))
+
+
+@pytest.mark.parametrize(("y", "x"), [(0.0, 9.0), (-6.0, 8.0), (5.0, -5.0)])
+def test_a_spot_lies_outwards_of_its_place_and_is_turned_with_it(y: float, x: float) -> None:
+    table, width, coc_px = lopsided(), 360, 6.0
+    per_mm = width / 36.0
+    half_diagonal = 0.5 * math.hypot(width, 240) / per_mm
+    shares = layer_shares(table, coc_px, 1, (240, width))
+    own = own_kernels(table, number(coc_px)[None], width)
+    kernel = placed(own, [(shares, number(1.0))], number(y / half_diagonal)[None], number(x / half_diagonal)[None])[
+        0, 0
+    ]
+    step = torch.arange(len(kernel), dtype=torch.float64) - len(kernel) // 2
+    distance = math.hypot(y, x)
+    u, v = (step[:, None] * y + step * x) / distance, (step[:, None] * x - step * y) / distance
+    assert table.field is not None
+    box, light = table.field.spots(coc_px / per_mm, number(distance)[None])
+    along = (box[0, 0] + box[0, 1] * ((torch.arange(96, dtype=torch.float64) + 0.5) / 48 - 1.0)) * per_mm
+    across = (torch.arange(48, dtype=torch.float64) + 0.5) / 48 * box[0, 2] * per_mm
+    of_u, of_v = light[0, 0].sum(-1), light[0, 0].sum(0)
+    mean = float((of_u * along).sum())
+    assert float(kernel.sum()) == pytest.approx(1.0, abs=1e-12)
+    assert float((kernel * u).sum()) == pytest.approx(mean, abs=0.03)
+    assert float((kernel * v).sum()) == pytest.approx(0.0, abs=0.03)
+    cell = across[1] - across[0], along[1] - along[0]
+    spread = (of_v * across**2).sum() + cell[0] ** 2 / 12, (of_u * (along - mean) ** 2).sum() + cell[1] ** 2 / 12
+    assert float((kernel * v**2).sum()) == pytest.approx(float(spread[0]), rel=0.02)
+    assert float((kernel * (u - mean) ** 2).sum()) == pytest.approx(float(spread[1]), rel=0.02)
+
+
+def test_in_focus_a_field_leaves_a_point_a_point() -> None:
+    table = lopsided()
+    for coc_px in (0.0, 0.02):
+        shares = layer_shares(table, coc_px, 1, (240, 360))
+        own = own_kernels(table, number(coc_px)[None], 360)
+        kernel = placed(own, [(shares, number(1.0))], number(0.4)[None], number(0.7)[None])[0, 0]
+        assert float(kernel[len(kernel) // 2, len(kernel) // 2]) > 1.0 - 1e-9
 
 
 def test_what_has_one_kernel_a_layer_refuses_cats_eyes() -> None:

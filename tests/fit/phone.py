@@ -1,0 +1,85 @@
+"""A phone calibrated end to end, from the target to a rendered picture: `python tests/fit/phone.py --out out/phone`.
+
+A simulated phone takes photographs of the printed target (Bayer pattern, 1 % noise, an S-curve, JPEG 90, a turned page
+on a grey desk); `torchdof fit` makes a table of them without being told anything, and `torchdof render` a picture with
+it. The same picture through the true lens says what all that lost. Every command is printed with its time.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from typer.testing import CliRunner
+
+from torchdof import BlurTable, Camera, blur_by_coc
+from torchdof.cli.main import app
+from torchdof.io.images import Picture, read_image, write_image
+from torchdof.reference.metrics import psnr
+
+FOCUS_M = 0.20
+DISTANCES_M = [0.24, 0.27, 0.30, 0.35, 0.40, 0.50, 0.65, 0.80]
+
+
+def run(*words):
+    """Run a command of torchdof, and print it with its time."""
+    began = time.perf_counter()
+    result = CliRunner().invoke(app, [str(w) for w in words])
+    print(f"{time.perf_counter() - began:6.1f} s  torchdof {' '.join(str(w) for w in words)}", flush=True)
+    if result.exit_code:
+        raise SystemExit(result.output)
+    return result.output
+
+
+def scene(width):
+    """A desk from 0.2 m to 0.8 m with stripes and lights `[1, 3, H, W]`, and its depth in metres `[1, 1, H, W]`."""
+    height = width * 3 // 4
+    place = torch.linspace(0, 1, width)
+    stripes = 0.2 + 0.3 * ((torch.arange(width) // (width // 40)) % 2)
+    image = stripes.expand(height, width).clone()
+    image[height // 2 :] = 0.05
+    image[height * 3 // 4 :: height // 12, width // 20 :: width // 10] = 60.0
+    tint = torch.tensor([1.0, 0.8, 0.6])[:, None, None]
+    return (image * tint)[None], (0.2 + 0.6 * place).expand(1, 1, height, width).clone()
+
+
+def measure(folder, distances=tuple(DISTANCES_M), width=1000, tone=0.5, family="auto"):
+    """Calibrate and render in `folder`; returns the PSNR against the true lens, dB, and of the untouched scene."""
+    import simulator
+
+    folder.mkdir(parents=True, exist_ok=True)
+    run("fit", "--target", folder / "target.pdf")
+    began = time.perf_counter()
+    simulator.write_photographs(folder / "photographs", FOCUS_M, list(distances), width=width, tone=tone)
+    print(f"{time.perf_counter() - began:6.1f} s  {1 + len(distances)} photographs of {width} px simulated")
+    print(run("fit", folder / "photographs", "-o", folder / "phone.json", "--family", family))
+    image, depth = scene(width)
+    write_image(folder / "scene.exr", Picture(image), sample="float")
+    np.save(folder / "depth.npy", depth[0, 0].numpy())
+    lens = {"focal_length_mm": 5.4, "f_number": 1.8, "focus_m": FOCUS_M, "sensor_width_mm": 36 * 5.4 / 26}
+    options = [f"--{name.replace('_', '-')}={value:g}" for name, value in lens.items()]
+    run("render", folder / "scene.exr", folder / "depth.npy", "-o", folder / "rendered.exr", *options,
+        "--table", folder / "phone.json")  # fmt: skip
+    write_image(folder / "rendered.png", read_image(folder / "rendered.exr"))
+    true = blur_by_coc(image, Camera(**lens).coc_px(depth, width=width), table=BlurTable.disc())
+    rendered = read_image(folder / "rendered.exr").pixels
+    shown = [torch.clamp(p, 0, 1) ** (1 / 2.2) for p in (rendered, image, true)]
+    return float(psnr(shown[0], shown[2])), float(psnr(shown[1], shown[2]))
+
+
+def main():
+    """Calibrate a phone and say how well."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for target, photographs, table and picture")
+    parser.add_argument("--width", type=int, default=1000, help="of the photographs, px")
+    parser.add_argument("--tone", type=float, default=0.5, help="strength of the S-curve that nobody tells of")
+    arguments = parser.parse_args()
+    found, untouched = measure(arguments.out, width=arguments.width, tone=arguments.tone)
+    print(f"rendered against the true lens: {found:.1f} dB, untouched {untouched:.1f} dB")
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parent))
+    main()

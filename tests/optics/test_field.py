@@ -1,0 +1,106 @@
+"""Spots of a lens over coc and distance from the middle of the frame."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from torchdof import BlurTable
+from torchdof.optics.aperture import Aperture
+from torchdof.optics.field import Field
+
+COC, RADIUS = torch.tensor([-2.0, 0.5, 1.0]), torch.tensor([0.0, 10.0, 20.0])
+
+
+def field(channels: int = 1) -> Field:
+    light = torch.rand(channels, 3, 3, 8, 4, generator=torch.Generator().manual_seed(1)).double()
+    box = torch.rand(3, 3, 3, generator=torch.Generator().manual_seed(2)).double() + 0.5
+    return Field(COC, RADIUS, box, light)
+
+
+def table(channels: int = 1, **arguments: Any) -> BlurTable:
+    return BlurTable(
+        "disc",
+        [-2.0, 1.0],
+        {"radius": torch.ones(channels, 2)},
+        unit="mm",
+        sensor_width_mm=36.0,
+        field=field(channels),
+        **arguments,
+    )
+
+
+def test_spots_are_linear_between_nodes_and_grow_beyond_the_last_coc() -> None:
+    lens = field(3)
+    box, light = lens.spots(0.75, torch.tensor([5.0, 30.0]))
+    assert_close(box[0], lens.box[1:, :2].mean((0, 1)))
+    assert_close(light[:, 0], lens.light[:, 1:, :2].mean((1, 2)))
+    assert_close(light[:, 1], lens.light[:, 1:, 2].mean(1))
+    assert_close(light.sum((-2, -1)), torch.ones(3, 2, dtype=torch.float64))
+    assert_close(lens.spots(3.0, RADIUS)[0], 3.0 * lens.box[2])
+    assert_close(lens.spots(-3.0, RADIUS)[0], 1.5 * lens.box[0])
+    middle, length, width = lens.box[2].unbind(-1)
+    farthest = torch.hypot(middle.abs() + length, width).max()  # all cells are lit
+    assert float(lens.reach(torch.tensor([1.0]))) == pytest.approx(float(farthest))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_field_is_kept_in_a_tables_file(channels: int, tmp_path: Any) -> None:
+    lens = table(channels)
+    lens.save(tmp_path / "lens.json")
+    loaded = BlurTable.load(tmp_path / "lens.json")
+    assert loaded.field is not None and lens.field is not None and loaded.depends_on_place
+    assert_close(loaded.field.light, lens.field.light, rtol=0, atol=2e-5 * float(lens.field.light.max()))
+    assert_close(loaded.field.box, lens.field.box, rtol=0, atol=0)
+    assert loaded.fingerprint() != lens.replace(field=None).fingerprint()
+    assert "Field(3 blurs, 3 distances to 20)" in repr(loaded)
+
+
+def test_files_of_earlier_versions_load() -> None:
+    data = BlurTable.polygon(5).to_dict()
+    assert data["version"] == 3
+    for version in (1, 2):
+        assert BlurTable.from_dict({**data, "version": version}).aperture is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"coc": COC.abs()}, "field.coc must be at least two strictly increasing"),
+        ({"coc": COC + 3.0}, "reach to both sides"),
+        ({"radius": RADIUS + 1.0}, "must begin at 0"),
+        ({"box": torch.ones(3, 2, 3)}, r"field.box must be \[3, 3, 3\]"),
+        ({"light": torch.ones(3, 3, 8)}, r"field.light must be \[channels, 3, 3, U, V\]"),
+        ({"light": torch.zeros(3, 3, 8, 4)}, "must hold some light"),
+        ({"light": torch.full((3, 3, 8, 4), torch.nan)}, "must hold finite numbers"),
+    ],
+)
+def test_bad_fields_are_refused_by_name(change: dict[str, Any], message: str) -> None:
+    good: dict[str, Any] = {"coc": COC, "radius": RADIUS, "box": torch.ones(3, 3, 3), "light": torch.ones(3, 3, 8, 4)}
+    with pytest.raises(ValueError, match=message):
+        Field(**{**good, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"shape": [1, 3, 3, 8]}, "five numbers"),
+        ({"shape": [1, 3, 3, 8, 5]}, "must hold 720 bytes"),
+        ({"light": "no base64"}, "deflated numbers"),
+        ({"light": 5}, "deflated numbers"),
+        ({"box": "wide"}, "field.box must be rows of numbers"),
+    ],
+)
+def test_bad_files_are_refused_by_name(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Field.from_dict({**field().to_dict(), **change})
+
+
+def test_what_goes_with_no_field_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="has its own opening"):
+        table().with_aperture(Aperture(blades=5))
+    with pytest.raises(ValueError, match="must state its unit"):
+        BlurTable("disc", [1.0], {"radius": [1.0]}, field=field())
+    with pytest.raises(ValueError, match="field must have 1 channels"):
+        table().replace(field=field(3))

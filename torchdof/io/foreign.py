@@ -1,0 +1,38 @@
+"""Files that OpenImageIO reads only where it was built with more libraries: phones' HEIC, cameras' raw files."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+__all__ = ["SUFFIXES", "readable", "refusal"]
+
+_SHARE = "convert it to JPEG or 16-bit TIFF (heif-convert, sips -s format tiff, or let the phone share it as JPEG)"
+_DEVELOP = "develop it to linear 16-bit TIFF (dcraw -4 -T, or a converter's linear profile) and copy its EXIF"
+_READERS = {
+    "heif": (_SHARE, (".heic", ".heif", ".avif")),
+    "raw": (_DEVELOP, (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")),
+}
+
+SUFFIXES = tuple(suffix for _, suffixes in _READERS.values() for suffix in suffixes)
+
+
+def readable() -> tuple[str, ...]:
+    """Suffixes of those that OpenImageIO reads here."""
+    import OpenImageIO as oiio
+
+    readers = oiio.get_string_attribute("format_list").split(",")
+    return tuple(suffix for reader, (_, suffixes) in _READERS.items() if reader in readers for suffix in suffixes)
+
+
+def refusal(path: Any) -> str | None:
+    """Why a file of such a type cannot be read here and how to convert it; None for all other types.
+
+    Example:
+        >>> refusal("holiday.jpg") is None
+        True
+    """
+    suffix = Path(path).suffix.lower() if isinstance(path, str | os.PathLike) else ""
+    if suffix not in SUFFIXES or suffix in readable():
+        return None
+    how = next(how for how, suffixes in _READERS.values() if suffix in suffixes)
+    return f"{suffix} is not read here: {how}"

@@ -1,0 +1,213 @@
+"""Across the field: where a lens's light falls that comes from off its axis, traced or measured.
+
+Off its axis a lens blurs otherwise than on it: its barrel cuts cat's eyes, its focus shifts (field curvature), up and
+down otherwise than across (astigmatism), light trails outwards (coma) and each colour by itself (lateral colour). All
+of it is a spot that turns with the azimuth and is mirrored at the line to the middle of the frame. So half a spot each
+is kept, over the signed circle of confusion and the distance from the middle, in coordinates ``u`` away from the middle
+and ``v`` across. Their origin is where the sharp image shows the point.
+
+A spot is a histogram in a box that just holds it. Between nodes boxes and histograms are linear in the signed coc and
+in the distance; beyond the last coc of a side boxes grow with it, and beyond the last distance all stays as it is.
+"""
+
+import base64
+import dataclasses
+import functools
+import hashlib
+import math
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..validation import real_tensor, show
+
+__all__ = ["Field"]
+
+_STEPS = 65535  # that the brightest cell of a spot counts in a file
+_MOST_CELLS = 2**28  # in a file
+_LIT = 1e-3  # of the brightest cell
+_LEAST_SIDE = 1e-6  # of the largest box: a spot has a size
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Field:
+    """Spots of a lens over the signed circle of confusion and the distance from the middle of the frame.
+
+    Args:
+        coc: Signed coc of the nodes ``[K]``, strictly increasing, from in front of the focus plane to behind it; in the
+            table's unit, as all lengths.
+        radius: Distances from the middle of the frame ``[F]``, strictly increasing from 0.
+        box: Each spot's box ``[K, F, 3]``: its middle away from the middle of the frame, half its length along that
+            direction, and half its width.
+        light: Light in the cells of half of each box ``[channels, K, F, U, V]``, or of all channels
+            ``[K, F, U, V]``: U from the end next to the middle of the frame outwards, V from the line to the middle to
+            one side. Each spot is made to sum to 1.
+
+    Raises:
+        ValueError: If a field is not as described; the message names it.
+
+    Example:
+        >>> light = torch.ones(2, 2, 8, 4)
+        >>> Field(torch.tensor([-1.0, 1.0]), torch.tensor([0.0, 20.0]), torch.ones(2, 2, 3), light).channels
+        1
+    """
+
+    coc: Tensor
+    radius: Tensor
+    box: Tensor
+    light: Tensor
+
+    def __post_init__(self) -> None:
+        for name in ("coc", "radius", "box", "light"):
+            value = real_tensor(f"field.{name}", getattr(self, name), "numbers").detach().to("cpu", torch.float64)
+            if not value.numel() or not bool(torch.isfinite(value).all()):
+                raise ValueError(f"field.{name} must hold finite numbers, got {show(value)}")
+            object.__setattr__(self, name, value)
+        for name, low in (("coc", 2), ("radius", 2)):
+            value = getattr(self, name)
+            if value.ndim != 1 or len(value) < low or bool((value.diff() <= 0).any()):
+                raise ValueError(f"field.{name} must be at least two strictly increasing numbers, got {show(value)}")
+        if self.radius[0] != 0 or not self.coc[0] < 0 < self.coc[-1]:
+            raise ValueError(
+                "field.radius must begin at 0 and field.coc reach to both sides of it, "
+                f"got {float(self.radius[0]):g} and {float(self.coc[0]):g} to {float(self.coc[-1]):g}"
+            )
+        nodes = (len(self.coc), len(self.radius))
+        if (
+            self.box.shape != (*nodes, 3)
+            or bool((self.box[..., 1:] < 0).any())
+            or not bool((self.box[..., 1:] > 0).any())
+        ):
+            raise ValueError(
+                f"field.box must be [{nodes[0]}, {nodes[1]}, 3] with lengths >= 0, got {list(self.box.shape)}"
+            )
+        light = self.light if self.light.ndim == 5 else self.light.unsqueeze(0)
+        if light.ndim != 5 or light.shape[1:3] != nodes or min(light.shape[3:]) < 2 or bool((light < 0).any()):
+            raise ValueError(
+                f"field.light must be [channels, {nodes[0]}, {nodes[1]}, U, V] >= 0, got {list(self.light.shape)}"
+            )
+        total = light.sum((-2, -1), keepdim=True)
+        if not bool((total > 0).all()):
+            raise ValueError("field.light must hold some light at every node")
+        object.__setattr__(self, "light", light / total)
+        sides = self.box[..., 1:].clamp_min(_LEAST_SIDE * float(self.box[..., 1:].max()))
+        object.__setattr__(self, "box", torch.cat([self.box[..., :1], sides], -1))
+
+    @property
+    def channels(self) -> int:
+        """Spots at a node: 1, or the number of image channels that are blurred differently."""
+        return self.light.shape[0]
+
+    def spots(self, coc: float, radius: Tensor) -> tuple[Tensor, Tensor]:
+        """Boxes ``[n, 3]`` and light ``[channels, n, U, V]`` at a signed coc and distances ``[n]``, float64."""
+        beyond = max(1.0, coc / float(self.coc[-1]), coc / float(self.coc[0]))
+        low, part = _between(self.coc, torch.tensor(coc, dtype=torch.float64))
+        box = torch.lerp(self.box[low], self.box[low + 1], part) * beyond  # [F, 3]
+        light = torch.lerp(self.light[:, low], self.light[:, low + 1], part)  # [channels, F, U, V]
+        low, part = _between(self.radius, radius.to(torch.float64))
+        return (
+            torch.lerp(box[low], box[low + 1], part[:, None]),
+            torch.lerp(light[:, low], light[:, low + 1], part[:, None, None]),
+        )
+
+    def reach(self, coc: Tensor) -> Tensor:
+        """Distances from the origin that hold all spots of signed coc ``[n]``."""
+        coc = coc.to(torch.float64)
+        beyond = torch.maximum(coc / self.coc[-1], coc / self.coc[0]).clamp_min(1.0)
+        low, part = _between(self.coc, coc)
+        return torch.lerp(self._reaches[low], self._reaches[low + 1], part) * beyond
+
+    @functools.cached_property
+    def _reaches(self) -> Tensor:
+        """Distance from the origin that holds all spots of a node ``[K]``: their lit cells."""
+        length, width = self.light.shape[-2:]
+        u = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64) * self.box[..., 1:2] + self.box[..., :1]
+        farthest = torch.maximum(u[..., 1:].abs(), u[..., :-1].abs())
+        v = torch.linspace(0.0, 1.0, width + 1, dtype=torch.float64)[1:] * self.box[..., 2:]
+        lit = self.light > _LIT * self.light.amax((-2, -1), keepdim=True)
+        return torch.where(lit, torch.hypot(farthest[..., None], v[..., None, :]), 0.0).amax((0, 2, 3, 4))
+
+    def finest(self, coc: float) -> float:
+        """Radius of the disc about as fine as the finest of the spots of a signed coc, up to halfway to the corner."""
+        box, light = self.spots(coc, self.radius[-1] * torch.linspace(0.0, 0.5, 5, dtype=torch.float64))
+        return float(2.0 * deviations(box, light).amin())
+
+    def fingerprint(self) -> str:
+        """Hash of the numbers."""
+        made = hashlib.sha256()
+        for value in (self.coc, self.radius, self.box, self.light):
+            made.update(repr(value.shape).encode() + value.contiguous().numpy().tobytes())
+        return made.hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The field as JSON-like data, the inverse of :meth:`from_dict`.
+
+        The light of each spot is in whole steps, 65535 to its brightest cell, as little-endian 16 bit numbers, deflated
+        (RFC 1950) and as base64; ``shape`` tells their axes, ``[channels, K, F, U, V]``.
+        """
+        light = self.light / self.light.amax((-2, -1), keepdim=True)
+        steps = (light * _STEPS).round().to(torch.int32).numpy().astype("<u2")
+        return {
+            "coc": self.coc.tolist(),
+            "radius": self.radius.tolist(),
+            "box": self.box.tolist(),
+            "shape": list(light.shape),
+            "light": base64.b64encode(zlib.compress(steps.tobytes(), 9)).decode("ascii"),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "Field":
+        """Build a field from :meth:`to_dict`'s data.
+
+        Raises:
+            ValueError: If a field is missing, unknown or of the wrong kind; the message names it.
+        """
+        known = ["coc", "radius", "box", "shape", "light"]
+        if not isinstance(data, Mapping) or set(data) != set(known):
+            raise ValueError(f"field must be an object with {', '.join(known)}, got {show(data)}")
+        values = {}
+        for name in known[:4]:
+            try:
+                values[name] = torch.tensor(data[name], dtype=torch.float64)
+            except (TypeError, ValueError, RuntimeError, OverflowError):
+                raise ValueError(f"field.{name} must be rows of numbers, got {show(data[name])}") from None
+        shape = [int(n) for n in values.pop("shape").flatten().nan_to_num().clamp(-1, _MOST_CELLS).tolist()]
+        if len(shape) != 5 or min(shape) < 1 or math.prod(shape) > _MOST_CELLS:
+            raise ValueError(f"field.shape must be five numbers of cells, got {show(data['shape'])}")
+        count = 2 * math.prod(shape)
+        try:
+            packed = base64.b64decode(data["light"], validate=True)
+            cells = zlib.decompressobj().decompress(packed, count + 1)
+        except (TypeError, ValueError, zlib.error):
+            raise ValueError("field.light must be deflated numbers of 16 bit as base64 text") from None
+        if len(cells) != count:
+            raise ValueError(f"field.light must hold {count} bytes, as field.shape tells, got {len(cells)}")
+        light = np.frombuffer(cells, "<u2").astype(np.float64).reshape(shape)
+        return cls(**values, light=torch.from_numpy(light))
+
+    def __repr__(self) -> str:
+        return f"Field({len(self.coc)} blurs, {len(self.radius)} distances to {float(self.radius[-1]):g})"
+
+
+def deviations(box: Tensor, light: Tensor) -> Tensor:
+    """Standard deviations ``[n, 2]`` along u and v of spots' light ``[channels, n, U, V]``, the least of the channels.
+
+    That along v is taken about the line to the middle of the frame.
+    """
+    length, width = light.shape[-2:]
+    u = (torch.arange(length, dtype=torch.float64, device=light.device) + 0.5) * (2.0 / length) - 1.0
+    v = (torch.arange(width, dtype=torch.float64, device=light.device) + 0.5) / width
+    along, across = light.sum(-1), light.sum(-2)
+    mean = (along * u).sum(-1, keepdim=True)
+    spread = torch.stack([(along * (u - mean) ** 2).sum(-1), (across * v**2).sum(-1)], -1).amin(0).sqrt()
+    return spread * box[:, 1:]
+
+
+def _between(nodes: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    """Node before each place and how far on the way to the next one it lies, 0 to 1."""
+    low = (torch.searchsorted(nodes, place.contiguous(), right=True) - 1).clamp(0, len(nodes) - 2)
+    return low, ((place - nodes[low]) / (nodes[low + 1] - nodes[low])).clamp(0.0, 1.0)
