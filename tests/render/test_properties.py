@@ -151,14 +151,24 @@ def rms(difference: Tensor) -> float:
 
 @seeds(20)
 @pytest.mark.parametrize(
-    ("tolerance", "most_rms", "most"), [(0.0, 0.15 / 255, 7e-3), (1 / 255, 0.25 / 255, torch.inf)], ids=["0", "1/255"]
+    ("depth_edges", "tolerance", "most_rms", "most"),
+    [
+        ("as given", 0.0, 0.05 / 255, 5e-3),
+        ("auto", 0.0, 0.15 / 255, 7e-3),
+        ("auto", 1 / 255, 0.25 / 255, torch.inf),
+    ],
+    ids=["as given 0", "0", "1/255"],
 )
 def test_a_hair_of_depth_changes_the_picture_by_a_hair(
-    seeds: range, tolerance: float, most_rms: float, most: float, dtype: torch.dtype
+    seeds: range, depth_edges: str, tolerance: float, most_rms: float, most: float, dtype: torch.dtype
 ) -> None:
-    """At tolerance 0 three of the 500 scenes change by more than 0.05/255 or 5e-3, by 0.12/255 at most."""
+    """With depth as given. Where its edges are repaired, a hair can decide to which surface a pixel belongs.
+
+    Of the 500 scenes of the sweep that is so in seven: they change by more than 0.05/255 or 5e-3, by 1.05/255 at most.
+    """
     for seed in seeds:
         scene = random_scene(seed, ["shallow", "background", "accumulated"])
+        scene.options["depth_edges"] = depth_edges
         noise = torch.rand(scene.coc_px.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         for step_px in (STEP_PX, -STEP_PX, (2.0 * noise - 1.0) * STEP_PX):
             change = scene.blurred(dtype, tolerance, step_px) - scene.blurred(dtype, tolerance)
