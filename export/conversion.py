@@ -153,13 +153,13 @@ def _put(self: Any, dim: int, index: Any, source: Any) -> Any:
         raise ValueError(f"values are put along axis 1 of [C, P], got axis {dim}")
     changed = opset20.ScatterND(
         opset20.Transpose(self, perm=[1, 0]),
-        opset20.Unsqueeze(index, opset20.Constant(value_ints=[1])),
+        opset20.Unsqueeze(index, opset20.Constant(value_ints=[1])),  # type: ignore[arg-type]
         opset20.Transpose(source, perm=[1, 0]),
     )
     return opset20.Transpose(changed, perm=[1, 0])
 
 
-_TRANSLATIONS = {
+_TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.aten.remainder.Scalar: _remainder,
     torch.ops.aten.to.dtype: _to_dtype,
     torch.ops.aten.to.device: _to_device,
