@@ -32,7 +32,8 @@ FLOORS = {
     "distributed": {"validation", "io", "optics", "depth", "options", "augmentation"},
     "bench": {"validation", "io", "optics", "depth", "options", "render", "reference", "module", "export"},
     "cli": {
-        *("validation", "native", "io", "optics", "depth", "options", "reference", "module", "fit", "export", "bench"),
+        *("validation", "native", "io", "optics", "depth", "options", "render", "reference", "module"),
+        *("fit", "export", "bench"),
     },
 }
 

@@ -154,12 +154,12 @@ def test_no_family_finds_a_blur_where_there_is_none_to_find(name: str, family: s
 @pytest.mark.parametrize(
     ("sigma", "camera"),
     [
-        (4.0, {"snr_db": 20.0, "size": 81}),
+        pytest.param(4.0, {"snr_db": 20.0, "size": 81}, marks=pytest.mark.sweep),
         (2.0, {"snr_db": 10.0}),
         (1.0, {"size": 21, "dot_radius": 3.0}),
-        (2.0, {"dot_radius": 1.5}),
-        (2.0, {"full_well": 300.0, "snr_db": 30.0}),
-        (2.0, {"bits": 6, "snr_db": 40.0, "black": 0.05, "level": 0.8}),
+        pytest.param(2.0, {"dot_radius": 1.5}, marks=pytest.mark.sweep),
+        pytest.param(2.0, {"full_well": 300.0, "snr_db": 30.0}, marks=pytest.mark.sweep),
+        pytest.param(2.0, {"bits": 6, "snr_db": 40.0, "black": 0.05, "level": 0.8}, marks=pytest.mark.sweep),
         (2.0, {"clip": 0.9, "snr_db": 30.0}),
     ],
     ids=lambda value: str(value),

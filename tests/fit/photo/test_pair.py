@@ -134,7 +134,7 @@ def test_offset_gain_shift_and_magnification_are_reported(simulator):
     assert fit.magnification == pytest.approx(0.9, rel=0.01)
 
 
-@pytest.mark.parametrize("snr_db", [40, 30])
+@pytest.mark.parametrize("snr_db", [40, pytest.param(30, marks=pytest.mark.sweep)])
 def test_standard_errors_hold_in_repeated_captures(simulator, snr_db):
     camera = simulator.Simulator(snr_db=snr_db, size=81, dot_radius=8.0)
     fits = [
