@@ -1,6 +1,7 @@
 """What a scene needs: the layers to render it with, for a tolerance, and their kernels."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -199,7 +200,10 @@ class Plan:
             lens = table.fingerprint()
             bank = []
             for coc, scale in zip(self.coc_px, scales, strict=True):
-                window = 2 * max(-(-max(size) // scale), _LEAST_CUT) - 1
+                longest_px = max(-(-max(size) // scale), _LEAST_CUT)
+                reach = functools.partial(table.reach_px, coc / scale, width / scale)
+                reach_px = _kernels.get((lens, coc, width, scale), reach)
+                window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
                 bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
         blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
         if not table.depends_on_place:
