@@ -29,7 +29,7 @@ def _same_random_numbers() -> None:
 @functools.cache
 def _beside(name: str) -> ModuleType:
     """A module of shared helpers in this folder: tests are imported one by one, not as a package."""
-    spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).with_name(f"{name}.py"))
+    spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).parent / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -47,6 +47,12 @@ def loops() -> ModuleType:
 def tolerances() -> dict[torch.dtype, dict[str, float]]:
     """Type -> rtol and atol, for `assert_close(a, b, **tolerances[a.dtype])`."""
     return _beside("tolerances").TOLERANCES
+
+
+@pytest.fixture(scope="session")
+def simulator() -> ModuleType:
+    """A camera that photographs dots: `fit/simulator.py`."""
+    return _beside("fit/simulator")
 
 
 @pytest.fixture(scope="session")
