@@ -72,8 +72,14 @@ def layered(shared_folder: Path) -> Any:
 
 @pytest.fixture(scope="session")
 def fold(shared_folder: Path) -> Any:
-    """An exported module with occlusion, by the literal scatter."""
+    """An exported module without occlusion, by the literal scatter."""
     return _beside("exported").export_once("fold", shared_folder)
+
+
+@pytest.fixture(scope="session")
+def fold_with_occlusion(shared_folder: Path) -> Any:
+    """The same with occlusion."""
+    return _beside("exported").export_once("fold with occlusion", shared_folder)
 
 
 @pytest.fixture(scope="session")
