@@ -1,4 +1,5 @@
 import csv
+import functools
 import importlib.metadata
 import importlib.util
 import json
@@ -270,7 +271,11 @@ def test_an_exported_file_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
-def test_a_compiled_module_has_its_row_and_tells_what_compiling_took() -> None:
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.sweep)])
+def test_a_compiled_module_has_its_row_and_tells_what_compiling_took(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
     subject = shipped(64, 96)
     found = [s for s in speed.settings(subject, ["compiled"]) if s.runtime == "compiled"]
     assert [(s.name, s.occlusion) for s in found] == [("compiled 1/255", True), ("compiled 1/255", False)]
