@@ -63,6 +63,8 @@ _SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
 _BLOCK = 32
 _CHUNK = 40_000
 _NEVER = 1e30
+_LARGEST = 1e15  # nearness, and light, whose squares are numbers too: beyond it the one is none, the other no brighter
+_BRIGHTEST = 1e30
 
 
 class _Edges(NamedTuple):
@@ -130,7 +132,7 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
 
 
 def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) -> Tensor:
-    """Repairs a map of nearness, of any scale and offset; what is not finite stays and touches nothing.
+    """Repairs a map of nearness, of any scale and offset; what is not finite, or above 1e15, stays and touches nothing.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
@@ -158,9 +160,9 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
 
 @torch.no_grad()
 def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
-    valid = torch.isfinite(nearness)
+    valid = nearness.abs() <= _LARGEST
     given = torch.where(valid, nearness, 0.0)
-    light = torch.where(torch.isfinite(image), image, 0.0).clamp_min(0.0)
+    light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST)
     edges = _find(given, valid, step)
     habits = _learn(light, given, valid, edges, auto)
 

@@ -23,7 +23,7 @@ constexpr int AREA = 64, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
 constexpr float NONE = 1e30f;
-constexpr float LARGEST = 3.402823466e38f;
+constexpr float LARGEST = 1e15f, BRIGHTEST = 1e30f, FINITE = 3.402823466e38f;
 constexpr int SIDE = 2 * REACH + 1, ACROSS = (SIDE + LANES - 1) / LANES * LANES;  // of a window, and in whole vectors
 
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8;  // marks of a pixel; NEAR: it shows the near surface
@@ -226,7 +226,7 @@ class Repair {
   // How far an edge pixel shows the near surface.
   float label(size_t i) const { return marks_[i] & LISTED ? score_[i] : marks_[i] & NEAR ? 1.0f : 0.0f; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
-  static float colour(float light) { return (light <= LARGEST) & (light > 0) ? std::sqrt(light) : 0.0f; }
+  static float colour(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Share of ramps among a sample's pixels.
   float ramps_of(const std::vector<Group> &sampled) const {
@@ -414,7 +414,7 @@ class Repair {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
-    fetch(map_.nearness, raw, [](float v) { return v; });
+    fetch(map_.nearness, raw, [](float v) { return std::fabs(v) <= LARGEST ? v : NAN; });
     each_vector(whole, [&](int y, int x) {
       const vec v = load<vec>(raw.at(y, x));
       const auto is_valid = size_of(v) <= all(LARGEST);
@@ -464,7 +464,7 @@ class Repair {
     const Part means = inner.grown(2);  // of 5 x 5, for what lies two pixels to each side
     each_vector(inner.grown(4), [&](int y, int x) {
       const vec v = load<vec>(raw.at(y, x));
-      store(slope.at(y, x), size_of(v) <= all(LARGEST) ? v : vec{});
+      store(slope.at(y, x), size_of(v) <= all(FINITE) ? v : vec{});
     });
     sums<2>(slope, high, rows, means, 1.0f);
 
@@ -529,7 +529,7 @@ class Repair {
 
   // Steepness where it goes on from one side to the other, and by how much the change on one side exceeds it.
   void slopes(const Grid &raw, const Grid &slope, const Grid &jump, const Part &part) const {
-    const auto known = [](vec change) { return size_of(change) <= all(LARGEST) ? change : vec{}; };
+    const auto known = [](vec change) { return size_of(change) <= all(FINITE) ? change : vec{}; };
     each_vector(part, [&](int y, int x) {
       const float *at = raw.at(y, x);
       const vec here = load<vec>(at);
@@ -1085,7 +1085,7 @@ class Repair {
     const Part &whole = bright;
     const Grid light(whole);
     for (int c = 0; c < channels_; c++) {
-      fetch(map_.light + c * area_, light, [](float v) { return (v <= LARGEST) & (v > 0) ? v : 0.0f; });
+      fetch(map_.light + c * area_, light, [](float v) { return (v <= FINITE) & (v > 0) ? std::min(v, BRIGHTEST) : 0.0f; });
       each_vector(bright, [&](int y, int x) { store(bright.at(y, x), most(load<vec>(bright.at(y, x)), load<vec>(light.at(y, x)))); });
     }
     for (size_t i = 0; i < light.size; i++) light.at(light.y0, light.x0)[i] = std::sqrt(bright.at(light.y0, light.x0)[i]);
