@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
+from rich.console import Console
 from torch import Tensor
 from typer.testing import CliRunner
 
 from torchdof import BlurTable, blur_by_coc
+from torchdof.cli.fit import _draw_table
 from torchdof.cli.main import app
 from torchdof.depth.edges import repair
 from torchdof.fit.lens.glass import Glass
@@ -199,3 +202,14 @@ def test_a_root_holds_photographs_without_a_description_as_well(tmp_path: Path) 
     said: Callable[[Path], str] = lambda root: CliRunner().invoke(app, [*call, str(root)]).output  # noqa: E731
     assert "lies outside of" in said(tmp_path / "photographs")
     assert "show the target" in said(tmp_path)
+
+
+def test_a_plot_that_cannot_be_finished_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(_: Figure, path: Path) -> None:
+        Path(path).write_bytes(b"half of a picture")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        _draw_table(BlurTable.disc(), tmp_path, "disc", Console(quiet=True))
+    assert not list(tmp_path.iterdir())
