@@ -83,8 +83,9 @@ def test_a_field_that_inflates_without_end_is_refused() -> None:
 
 @pytest.mark.parametrize("name", ["blades", "rotation_deg", "curvature", "squeeze", "vignetting"])
 def test_openings_of_a_number_of_400_digits_are_refused(name: str) -> None:
+    given: dict[str, Any] = {"blades": 5, name: HUGE}
     with pytest.raises(ValueError, match=name):
-        Aperture(**{"blades": 5, name: HUGE})
+        Aperture(**given)
 
 
 @pytest.mark.parametrize(
