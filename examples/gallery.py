@@ -123,6 +123,11 @@ def draw_bokeh(path: Path) -> None:
     subprocess.run([sys.executable, ROOT / "examples/bokeh.py", "--out", path, "--height", "320"], check=True)
 
 
+def draw_field(path: Path) -> None:
+    """A street at night through a lens that is traced across the field, as ``examples/benchmarks`` draws it."""
+    subprocess.run([sys.executable, ROOT / "examples/benchmarks/across_field.py", "--picture", path], check=True)
+
+
 def draw_lights(path: Path, tables: dict[str, torchdof.BlurTable]) -> None:
     """Small lights, from 14 px in front of the focus to 14 px behind it."""
     height, width, cocs = 150, 220, (-14.0, -7.0, 0.0, 7.0, 14.0)
@@ -187,6 +192,7 @@ GALLERY: dict[str, Callable[[Path], None]] = {
     "lenses.jpg": draw_lenses,
     "shapes.jpg": draw_shapes,
     "bokeh.jpg": draw_bokeh,
+    "field.jpg": draw_field,
     "layers.jpg": draw_layers,
     "truth_lamps.jpg": draw_truth,
     "truth_bars.jpg": draw_truth,

@@ -26,7 +26,7 @@ from ..result import Array
 from .lens import Lens
 from .rays import Rays, trace_rays
 
-__all__ = ["Focus", "Reference", "Spot", "focus_sensor", "point_spread"]
+__all__ = ["Focus", "Reference", "Spot", "focus_sensor", "point_spread", "vertex_distance_mm"]
 
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
@@ -115,7 +115,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
     first = lens.paraxial()
     sensor = first.back_focal
     for _ in range(100 if reference == "sensor" else 1):
-        object_mm = _object_mm(lens, focus_m, reference, sensor)
+        object_mm = vertex_distance_mm(lens, focus_m, reference, sensor)
         before, sensor = sensor, _image_mm(lens, object_mm, kind)
         if abs(sensor - before) < 1e-12 * first.focal_length:
             break
@@ -163,7 +163,7 @@ def point_spread(
     number("field_mm", field_mm, low=-_WIDEST_MM, high=_WIDEST_MM, unit="millimetres")
     if meridional and field_mm:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
-    object_mm = _object_mm(lens, z_m, reference, sensor_mm)
+    object_mm = vertex_distance_mm(lens, z_m, reference, sensor_mm)
     point = _object_point(lens, object_mm, sensor_mm, field_mm)
     low, high = _pupil_box(lens, point, wavelength_um)
     if meridional:
@@ -193,7 +193,7 @@ def point_spread(
     return Spot(hit_x - centre[0], hit_y - centre[1], weight, -float(centre[1]), cell * int(keep.sum()))
 
 
-def _object_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
+def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
     """Distance of an object in front of the first vertex, in mm."""
     if reference not in get_args(Reference):
         raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, got {reference!r}")
