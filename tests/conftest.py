@@ -29,7 +29,7 @@ def _same_random_numbers() -> None:
 @functools.cache
 def _beside(name: str) -> ModuleType:
     """A module of shared helpers in this folder: tests are imported one by one, not as a package."""
-    spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).with_name(f"{name}.py"))
+    spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).parent / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -47,6 +47,12 @@ def loops() -> ModuleType:
 def tolerances() -> dict[torch.dtype, dict[str, float]]:
     """Type -> rtol and atol, for `assert_close(a, b, **tolerances[a.dtype])`."""
     return _beside("tolerances").TOLERANCES
+
+
+@pytest.fixture(scope="session")
+def simulator() -> ModuleType:
+    """A camera that photographs dots: `fit/simulator.py`."""
+    return _beside("fit/simulator")
 
 
 @pytest.fixture(scope="session")
@@ -80,3 +86,10 @@ def fold_with_occlusion(shared_folder: Path) -> Any:
 def plain(shared_folder: Path) -> Any:
     """An exported module without occlusion, which is traced in a few seconds."""
     return _beside("exported").export_once("plain", shared_folder)
+
+
+@pytest.fixture(scope="session")
+def exported_by_command(shared_folder: Path) -> tuple[Path, str]:
+    """A file of blur radii as ``torchdof export`` writes it, without occlusion, and what that printed."""
+    path, told = _beside("exported").command_once(shared_folder)
+    return path, told
