@@ -186,7 +186,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     score, evidence, near, far = _judge(light, given, valid, edges, firmness, edge_pixels)
     shows_near = score + torch.logit(prior)
     if auto:  # else steps that prove right are asked as well, and would be moved
-        shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
+        shows_near = shows_near + _LEAN
     is_near = level > 0.5
     stays = torch.where(is_ramp, 0.0, _SUREST * (1.0 - strength))
     shows_near = (0.5 + (shows_near + torch.where(is_near, stays, -stays)) / _FADE).clamp(0.0, 1.0)
