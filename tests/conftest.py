@@ -86,3 +86,10 @@ def fold_with_occlusion(shared_folder: Path) -> Any:
 def plain(shared_folder: Path) -> Any:
     """An exported module without occlusion, which is traced in a few seconds."""
     return _beside("exported").export_once("plain", shared_folder)
+
+
+@pytest.fixture(scope="session")
+def exported_by_command(shared_folder: Path) -> tuple[Path, str]:
+    """A file of blur radii as ``torchdof export`` writes it, without occlusion, and what that printed."""
+    path, told = _beside("exported").command_once(shared_folder)
+    return path, told

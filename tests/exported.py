@@ -10,8 +10,10 @@ import numpy as np
 import torch
 from filelock import FileLock
 from torch import Tensor
+from typer.testing import CliRunner
 
 import torchdof
+from torchdof.cli.main import app
 from torchdof.export import Verification, to_onnx
 from torchdof.export.verification import session
 from torchdof.render.plan import Plan
@@ -63,3 +65,16 @@ def export_once(name: str, folder: Path) -> Exported:
         if not told.exists():
             told.write_bytes(pickle.dumps(to_onnx(dof, path)))
     return Exported(dof, path, pickle.loads(told.read_bytes()))
+
+
+def command_once(folder: Path) -> tuple[Path, str]:
+    """A file of blur radii that ``torchdof export`` wrote, alone in its folder, and what it printed; written once."""
+    path, told = folder / "command" / "dof.onnx", folder / "command.json"
+    with FileLock(folder / "command.lock"):
+        if not told.exists():
+            path.parent.mkdir()
+            options = ["--inputs", "coc_px", "--max-coc", "2", "--no-occlusion", "--json"]
+            result = CliRunner().invoke(app, ["export", "-o", str(path), *options], catch_exceptions=False)
+            assert result.exit_code == 0, result.output
+            told.write_text(result.stdout)
+    return path, told.read_text()
