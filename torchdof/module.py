@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from . import validation
 from .batch import flattened, leading_axes, numbers, restored
-from .depth.edges import repair
+from .depth.edges import STEP_PX, repair
 from .depth.size import at_size_of
 from .optics.blur_table import BlurTable
 from .optics.camera import CAMERA_NUMBERS, Camera
@@ -22,8 +22,6 @@ from .render.plan import Plan
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
 Number = float | Sequence[float] | Tensor
-
-_EDGE_PX = 1.0  # difference in coc from which on the edge between two surfaces is worth repair
 
 
 @spells_options
@@ -377,7 +375,7 @@ def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     """A map of the coc with its edges where the image has them, as far as the options ask for that."""
     if options.depth_edges == "as given":
         return coc_px
-    mended = -repair(image, -coc_px.detach(), _EDGE_PX, auto=options.depth_edges == "auto")
+    mended = -repair(image, -coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto")
     return torch.where(mended == coc_px, coc_px, mended) if coc_px.requires_grad else mended
 
 

@@ -42,7 +42,7 @@ def test_it_prints_ranges_blur_focus_holes_and_edges_and_writes_a_picture(scene:
         "blur radius   +0.0 to +",
         "in focus      50.0 %",
         "####",
-        "depth edges   24 steps between pixels: 100.0 % exact",
+        "depth edges   144 pixels: 100.0 % exact",
         "picture       photo.inspect.png",
     ):
         assert words in out, words
@@ -57,7 +57,7 @@ def test_json_says_for_programs_what_is_printed(scene: Path) -> None:
     assert facts["camera"]["focus_m"] == 2.0 and facts["picture"] == "photo.inspect.png"
     assert facts["depth_m"] == {"nearest": 2.0, "1 %": 2.0, "median": 4.0, "99 %": 6.0, "farthest": 6.0}
     assert facts["holes_px"] == 0 and facts["in_focus"] == 0.5 and facts["coc_px"][0] == 0.0
-    assert facts["depth_edges"] == {"exact": 24, "ramp": 0, "beside": 0, "unclear": 0}
+    assert facts["depth_edges"] == {"exact": 144, "ramp": 0, "beside": 0, "unclear": 0}
     assert sum(part["share"] for part in facts["histogram"]) == pytest.approx(1.0)
 
 

@@ -20,10 +20,13 @@ from torch import Tensor
 
 from .. import native, pixels, validation
 
-__all__ = ["DepthEdges", "repair", "repair_edges"]
+__all__ = ["STEP_PX", "DepthEdges", "judged", "repair", "repair_edges"]
 
 DepthEdges = Literal["auto", "repair", "as given"]
 """What is done to depth edges before rendering: repaired where the map proves inexact, or all of them, or nothing."""
+
+STEP_PX = 1.0
+"""Difference in the circle of confusion from which on the edge between two surfaces is worth repair."""
 
 _STEP = 0.1  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
 _RINGS = 3  # pixels beside a step that may be on its wrong side
@@ -163,6 +166,25 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
 
 
 @torch.no_grad()
+def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tensor, Tensor]:
+    """The pixels at a map's edges, and those whose nearness :func:`repair` changes with ``auto``.
+
+    Args:
+        image: As there.
+        nearness: As there.
+        step: As there.
+
+    Returns:
+        ``[B, 1, H, W]``, uint8: 0 where there is no edge, 1 beside a step, 2 on a ramp; and bool.
+    """
+    given = nearness.float().expand(len(image), -1, -1, -1)
+    valid = given.abs() <= _LARGEST
+    edges = _find(torch.where(valid, given, 0.0), valid, torch.as_tensor(step, dtype=given.dtype, device=given.device))
+    mended = repair(image, nearness, step, auto=True)
+    return edges.is_edge * (1 + edges.is_ramp.byte()), (mended != nearness) & valid
+
+
+@torch.no_grad()
 def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     valid = nearness.abs() <= _LARGEST
     given = torch.where(valid, nearness, 0.0)
@@ -190,7 +212,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     score, evidence, near, far = _judge(light, given, valid, edges, firmness, edge_pixels)
     shows_near = score + torch.logit(prior)
     if auto:  # else steps that prove right are asked as well, and would be moved
-        shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
+        shows_near = shows_near + _LEAN
     is_near = level > 0.5
     stays = torch.where(is_ramp, 0.0, _SUREST * (1.0 - strength))
     shows_near = (0.5 + (shows_near + torch.where(is_near, stays, -stays)) / _FADE).clamp(0.0, 1.0)

@@ -7,26 +7,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..io.transfer import encode
 from ..optics.camera import Camera
 from ..validation import image_and_map
+from .edges import STEP_PX, judged
 
-__all__ = ["EDGES", "DepthReport", "coc_colours", "edges_of", "inspect_depth", "panels"]
+__all__ = ["EDGES", "DepthReport", "coc_colours", "inspect_depth", "panels"]
 
 EDGES = ("exact", "ramp", "beside", "unclear")
-"""Kinds of depth edges: a step where the image has an edge; not one step; a step that lies beside the image's edge;
-a step where the image is the same on both sides."""
+"""Pixels at depth edges, by what rendering does: beside a step that stays where it is; on a ramp that becomes a step;
+of one surface with the depth of the other, which gets its own; on a ramp that stays, for the image shows no edge."""
 
 _BOUNDS_PX = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-_REACH = 5  # pixels on each side of a step in which a ramp lies
-_JUMP = 0.08  # least relative difference of inverse depth across an edge
-_STEP = 0.7  # least share of it between two pixels that is a step
-_CONTRAST, _SPREADS = (
-    0.06,
-    2.0,
-)  # of the image across an edge, display-encoded: at least, and over what varies beside it
-_DOUBTFUL = 0.3  # share of edges from which on it is said
-_BESIDE = 0.25  # share of its own side's colour that a pixel at the step has at least
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +28,7 @@ class DepthReport:
         depth: The map, ``[1, 1, H, W]`` in metres, NaN in holes.
         coc_px: Signed circle of confusion, ``[1, 1, H, W]``, NaN in holes.
         edges: ``[1, 1, H, W]``, uint8: 0 where there is no edge of depth, else 1 + the place in :data:`EDGES`.
-        counts: How many edges of each kind of :data:`EDGES` there are, in steps between two pixels.
+        counts: How many pixels of each kind of :data:`EDGES` there are.
     """
 
     depth: Tensor
@@ -57,9 +48,8 @@ class DepthReport:
 
     @property
     def doubtful(self) -> float:
-        """Share of the edges that are ramps or lie beside the image's, among those where that can be told."""
-        exact, ramp, beside, _ = self.counts
-        return (ramp + beside) / max(1, exact + ramp + beside)
+        """Share of the pixels at edges whose depth rendering repairs; 0 where it takes the map as it is."""
+        return (self.counts[1] + self.counts[2]) / max(1, sum(self.counts))
 
     def histogram(self) -> list[tuple[float, float, float]]:
         """Lower and upper blur radius in pixels (negative: in front of the focus), and the share of the pixels between.
@@ -111,13 +101,12 @@ class DepthReport:
             for low, high, share in self.histogram():
                 bar = "#" * math.ceil(40 * share / longest)
                 lines.append(f"{low:+8.0f} to {high:+5.0f} px {100 * share:5.1f} % {bar}".rstrip())
-        steps = sum(self.counts)
-        shares = ", ".join(f"{_percent(n, steps)} {name}" for n, name in zip(self.counts, EDGES, strict=True))
-        lines.append(f"depth edges   {steps} steps between pixels: {shares}")
-        if self.doubtful > _DOUBTFUL:
-            lines.append(
-                "              the edges are not where the image has them: outlines of what is blurred will show"
-            )
+        edge_px = sum(self.counts)
+        shares = ", ".join(f"{_percent(n, edge_px)} {name}" for n, name in zip(self.counts, EDGES, strict=True))
+        lines.append(f"depth edges   {edge_px} pixels: {shares}")
+        if edge_px:
+            taken = "are repaired before rendering" if self.doubtful else "are exact and stay as they are"
+            lines.append(f"              they {taken} (depth edges auto)")
         return "\n".join(lines)
 
 
@@ -143,82 +132,19 @@ def inspect_depth(image: Tensor, depth: Tensor, camera: Camera) -> DepthReport:
         >>> image, depth = torch.full((1, 3, 16, 24), 0.2), torch.full((1, 1, 16, 24), 4.0)
         >>> image[..., 12:], depth[..., 12:] = 0.6, 2.0
         >>> report = inspect_depth(image, depth, Camera(focus_m=2.0))
-        >>> report.counts, report.sharp
-        ((16, 0, 0, 0), 1.0)
+        >>> report.counts, report.sharp  # no edge is blurred by a pixel
+        ((0, 0, 0, 0), 1.0)
     """
     image_and_map(image, "depth", depth, "in metres")
     if image.shape[0] != 1:
         raise ValueError(f"inspect one image at a time, got a batch of {image.shape[0]}")
     depth = torch.where(depth > 0, depth, torch.nan)
-    edges, counts = edges_of(image, depth)
-    return DepthReport(depth, camera.coc_px(depth, depth.shape[-1]), edges, counts)
-
-
-def edges_of(image: Tensor, depth: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
-    """Where depth has edges, and which of them are exact.
-
-    Along rows and along columns, an edge is the steepest step of inverse depth within five pixels, where depth on both
-    sides differs by more than it slopes. It is exact where one step between two pixels holds most of the difference and
-    each of the two looks like its own side. Exact depth of a ray tracer has 10 to 20 % doubtful edges by this measure,
-    for textures and mixed pixels; maps that were upsampled, smoothed or shifted by a pixel 45 to 100 %.
-
-    Args:
-        image: ``[1, C, H, W]``, linear light.
-        depth: ``[1, 1, H, W]``, metres, NaN in holes.
-
-    Returns:
-        The map and the counts of :class:`DepthReport`.
-    """
-    light = image.float()
-    level = light.clamp(min=0).mean().clamp(min=1e-12)
-    shown = encode((light * (0.2 / level)).clamp(0.0, 1.0), "srgb", has_alpha=False, straight=False)
-    inverse = 1.0 / depth.float()
-    edges = torch.zeros_like(depth, dtype=torch.uint8)
-    counts = torch.zeros(len(EDGES), dtype=torch.long)
-    for lines, colours, marks in (
-        (inverse, shown, edges),
-        (inverse.transpose(-1, -2), shown.transpose(-1, -2), edges.transpose(-1, -2)),
-    ):
-        if lines.shape[-1] < 2 * _REACH + 2:
-            continue
-        kinds = _kinds(lines, colours)
-        counts += torch.bincount(kinds.flatten(), minlength=len(EDGES) + 1)[1:].cpu()
-        for start in (_REACH, _REACH + 1):  # both pixels of the step
-            window = marks[..., start : start + kinds.shape[-1]]
-            window.copy_(torch.where(kinds > 0, kinds.to(torch.uint8), window))
-    exact, ramp, beside, unclear = counts.tolist()
-    return edges, (exact, ramp, beside, unclear)
-
-
-def _kinds(inverse: Tensor, shown: Tensor) -> Tensor:
-    """Kind of the edge between the pixels ``_REACH + i`` and ``_REACH + i + 1`` of each row, 0 for none."""
-    count = inverse.shape[-1] - 2 * _REACH - 1
-
-    def at(values: Tensor, offset: int) -> Tensor:
-        return values[..., _REACH + offset : _REACH + offset + count]
-
-    steps = (inverse[..., 1:] - inverse[..., :-1]).abs()
-    step = at(steps, 0)
-    around = torch.stack([at(steps, k) for k in range(-_REACH, _REACH + 1)])
-    left, right = at(inverse, -_REACH), at(inverse, _REACH + 1)
-    jump = (right - left).abs()
-    slope = torch.maximum(at(steps, -_REACH), at(steps, _REACH))
-    is_edge = (jump - 2 * _REACH * slope > _JUMP * torch.maximum(left, right)) & (step >= around.amax(0)) & (step > 0)
-    is_step = step >= _STEP * jump
-    side_left, side_right = (torch.stack([at(shown, k) for k in places]) for places in ((-4, -3, -2), (3, 4, 5)))
-    mean_left, mean_right = side_left.mean(0), side_right.mean(0)
-    spread = (side_left - mean_left).abs().mean(0) + (side_right - mean_right).abs().mean(0)
-    across = mean_right - mean_left
-    contrast = across.square().sum(1, keepdim=True)
-    is_told = contrast.sqrt() > torch.maximum(
-        torch.full_like(contrast, _CONTRAST), _SPREADS * spread.amax(1, keepdim=True)
-    )
-    share_left, share_right = (
-        ((at(shown, k) - mean_left) * across).sum(1, keepdim=True) / contrast.clamp(min=1e-12) for k in (0, 1)
-    )
-    is_beside = (share_left > 1.0 - _BESIDE) | (share_right < _BESIDE)
-    kind = torch.where(is_step, torch.where(is_told, torch.where(is_beside, 3, 1), 4), 2)
-    return torch.where(is_edge, kind, 0)
+    coc_px = camera.coc_px(depth, depth.shape[-1])
+    places, changed = judged(image, -coc_px, STEP_PX)
+    is_ramp = places == 2
+    kinds = torch.where(changed, torch.where(is_ramp, 2, 3), torch.where(is_ramp, 4, places)).byte()
+    counts = torch.bincount(kinds.flatten(), minlength=len(EDGES) + 1)[1:].tolist()
+    return DepthReport(depth, coc_px, kinds, (counts[0], counts[1], counts[2], counts[3]))
 
 
 def coc_colours(coc_px: Tensor) -> Tensor:

@@ -895,7 +895,7 @@ class Repair {
         const int i = groups[g].pixels[k];
         const float score = groups[g].judged[k].score, share = prior(i);
         const float stays = marks_[i] & RAMP ? 0.0f : SUREST * (1.0f - strength_[i]);
-        const float surely = score + std::log(share / (1.0f - share)) + lean * clamp01(std::fabs(score) - 1.0f) + (is_near(i) ? stays : -stays);
+        const float surely = score + std::log(share / (1.0f - share)) + lean + (is_near(i) ? stays : -stays);
         score_[i] = clamp01(0.5f + surely / FADE);
       }
       const Part &part = groups[g].part;
