@@ -22,7 +22,7 @@ from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
 from .mosaic import PATTERNS, demosaiced
 
-__all__ = ["Capture", "Captures", "read_captures", "read_pair"]
+__all__ = ["Capture", "Captures", "inside", "read_captures", "read_pair"]
 
 MANIFEST = "capture.toml"
 Colours = Literal["mean", "each"]
@@ -145,7 +145,7 @@ def read_captures(
     path = Path(folder)
     path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
     if root is not None:
-        _inside(path, root, str(path))
+        inside(path, root, str(path))
     fields = _manifest(path)
     where, base = str(path), path.parent
     focus = _number(fields, "focus_m", where)
@@ -174,7 +174,7 @@ def read_captures(
     files = [base / _text(shot, "file", where, needed=True) for shot in shots]  # type: ignore[operator]
     if root is not None:
         for file in [sharp, *files, *([] if dark is None else [base / dark])]:
-            _inside(file, root, where)
+            inside(file, root, where)
     crop = _crop(fields, where)
     darkness = None if dark is None else _read(base / dark, transfer, None, crop, pattern)
     first = _read(sharp, transfer, darkness, crop, pattern)
@@ -273,7 +273,7 @@ def _manifest(path: Path) -> dict[str, Any]:
         raise ManifestError(f"is not TOML: {error}", file=str(path)) from error
 
 
-def _inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
+def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
     """Refuse a file that does not lie in a folder, wherever its name and links lead."""
     folder, real = os.path.realpath(root), os.path.realpath(file)
     if not os.path.isdir(folder):

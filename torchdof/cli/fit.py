@@ -21,6 +21,7 @@ from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.photo.target import SQUARE_MM, Paper, write_target
 from torchdof.fit.problems import FitError, FitWarning
+from torchdof.validation import number
 
 __all__ = ["fit"]
 
@@ -73,7 +74,7 @@ def fit(
     root: Annotated[
         Path | None,
         typer.Option(
-            help="Folder that capture.toml and all its pictures must lie in; by default they may lie anywhere.",
+            help="Folder that capture.toml and all pictures must lie in; by default they may lie anywhere.",
             rich_help_panel=_CAPTURE,
         ),
     ] = None,
@@ -144,7 +145,7 @@ def fit(
             _draw_table(table, plots, out.stem, console)
         return
     if captures is not None and captures.is_dir() and not (captures / MANIFEST).is_file():
-        photographs = read_photographs(captures, square_mm=square_mm)
+        photographs = read_photographs(captures, square_mm=square_mm, root=root)
         _tell(photographs, console)
         command = f"torchdof fit {captures.name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(photographs.captures, family, accuracy_db, command, None, console)
@@ -204,7 +205,8 @@ def _trace(
     if not 0 <= field_deg < 90:
         raise FitError(f"--field-deg must be 0 to 90 degrees from the axis, got {field_deg:g}")
     focal = lens.paraxial().focal_length
-    image_mm = focal if math.isinf(focus_m) else focal / (1 - focal / 1000 / focus_m)
+    number("--focus-m", focus_m, low=focal / 1000, unit="metres", infinite=True)
+    image_mm = focal / (1 - focal / 1000 / focus_m)
     with console.status("tracing the lens"):
         return trace_table(
             lens,

@@ -24,6 +24,7 @@ _EDGE_PX = 0.5  # difference in coc of neighbours from which on they may be two 
 _UNCLEAN = 1e-2  # weight of a pixel that may be mixed itself
 _FALLOFF = math.exp(-1 / 4.5)
 _TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
+_ALIKE = 1.0 / 255.0  # contrast, as a share of the brightest light around, that is worth as much as none
 _UNBOUNDED = 1e6  # times the brightest pixel around: so bright is neither part of a pixel
 _EMITTER_REACH = 3  # pixels around a highlight that tell on which surface it lies
 _MOST_WEIGHT = 0.98  # of a highlight's pixel that a farther emitter may have
@@ -90,7 +91,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     back, back_variance = _mean(window_light, far_weight)
     # a thin foreground has no clean pixel: trust the one that differs most from what is behind
     differs = ((window_light - back[:, None]) ** 2).sum(0)
-    differs = (differs + 1e-12) / (differs.amax(0) + 1e-12)
+    differs = (differs + _ALIKE**2) / (differs.amax(0) + _ALIKE**2)
     clean = (0.1 * near_weight.sum(0) / _UNCLEAN - 1.0).clamp(0.0, 1.0)
     front, front_variance = _mean(window_light, near_weight * torch.lerp(differs, torch.ones_like(clean), clean))
 
@@ -99,7 +100,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     strength = (contrast**2).sum(0)
     fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
     misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
-    trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit)).clamp_min(1e-12)
+    trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit) + _ALIKE**2)
     # the pixel's depth must be that of one of the two: in between, a steep surface goes on
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     certainty = edge * trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
@@ -187,5 +188,5 @@ def _mean(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted mean over n of colours ``[C, n, P]`` and their variance, summed over colours, ``[P]``."""
     total = weight.sum(0).clamp_min(1e-12)
     mean = (colour * weight).sum(1) / total
-    second = (colour**2 * weight).sum(1) / total
-    return mean, (second - mean**2).clamp_min(0.0).sum(0)
+    # not as a difference of squares, whose rounding would decide where all colours are alike
+    return mean, (((colour - mean[:, None]) ** 2 * weight).sum(1) / total).sum(0)

@@ -88,7 +88,7 @@ struct Occupied {
   void add(int x, float share, float room, bool over) {
     const uint32_t bit = 1u << std::min(x / 16, 31);
     if (share > 0) some |= bit;
-    if (over && room > share) open |= bit;
+    if (over && room != share) open |= bit;  // of a hair there is less room than share
     if (over && (room - 1.0f) * (room - 1.0f) > EVEN) uneven |= bit;
   }
   void put(Scratch &b, int y) const {

@@ -372,11 +372,6 @@ class Turned {
       s.per_v = s.last_column / box[2];
       s.values = of[k]->values + ((size_t)(of[k]->colours > 1 ? colour : 0) * scene.distances + low) * count;
       s.next = s.values + count;
-      s.dark_around = true;
-      for (const float *values : {s.values, s.next}) {
-        for (int j = 0; j < s.columns; j++) s.dark_around &= values[j] == 0 && values[count - 1 - j] == 0;
-        for (int i = 1; i <= rows; i++) s.dark_around &= values[i * s.columns - 1] == 0;
-      }
     }
   }
   float share(float dy, float dx) const {
@@ -391,12 +386,9 @@ class Turned {
     const float *values, *next;  // of the distance before the place and of the one after it
     int columns;
     float near, last_row, last_column, per_u, first_u, per_v;
-    bool dark_around;
     float at(float u, float v) const {
-      float row = u * per_u + first_u, column = v * per_v;
-      if (dark_around && (row <= 0 || row >= last_row || column >= last_column)) return 0.0f;
-      row = std::min(std::max(row, 0.0f), last_row);
-      column = std::min(column, last_column);
+      // what is no number is 0
+      const float row = std::min(std::max(0.0f, u * per_u + first_u), last_row), column = std::min(std::max(0.0f, v * per_v), last_column);
       const int i = std::min((int)row, (int)last_row - 1), j = std::min((int)column, (int)last_column - 1);
       const float down = row - i, right = column - j;
       float mean[2];

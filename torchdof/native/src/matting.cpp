@@ -9,6 +9,7 @@ namespace {
 constexpr float EDGE_PX = 0.5f;   // difference in coc of neighbours from which on they may be two surfaces
 constexpr float UNCLEAN = 1e-2f;  // weight of a pixel that may be mixed itself
 constexpr float TRUST = 4.0f;     // how much texture discredits the contrast of the two surfaces
+constexpr float ALIKE = 1.0f / 255;  // contrast, as a share of the brightest light around, that is worth as much as none
 constexpr float UNBOUNDED = 1e6f;  // times the brightest pixel around: so bright is neither part of a pixel
 constexpr int EMITTER_REACH = 3;  // pixels around a highlight that tell on which surface it lies
 constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that a farther emitter may have
@@ -102,14 +103,11 @@ float mean(const Window &w, int channels, size_t first, float scale, const f4 *w
   float variance = 0;
   for (int c = 0; c < channels; c++) {
     const float *light = w.light.data() + (size_t)c * EDGES * PITCH + first;
-    f4 one = {}, two = {};
-    for (int r = 0; r < AROUND; r++) {
-      const f4 v = load<f4>(light + r * PITCH) / all4(scale), weighted = v * weight[r];
-      one += weighted;
-      two += v * weighted;
-    }
+    f4 v[AROUND], one = {}, two = {};
+    for (int r = 0; r < AROUND; r++) one += (v[r] = load<f4>(light + r * PITCH) / all4(scale)) * weight[r];
     mean[c] = sum(one) / total;
-    variance += std::max(sum(two) / total - mean[c] * mean[c], 0.0f);
+    for (int r = 0; r < AROUND; r++) two += (v[r] - all4(mean[c])) * (v[r] - all4(mean[c])) * weight[r];
+    variance += sum(two) / total;
   }
   return variance;
 }
@@ -157,7 +155,7 @@ void split(const Job &job, Window &w, int y, int x, const f4 *falloff, const Blo
       most = std::max(most, largest(differs[r]));
     }
     for (int r = 0; r < AROUND; r++) {
-      const f4 part = (differs[r] + all4(1e-12f)) / all4(most + 1e-12f);
+      const f4 part = (differs[r] + all4(ALIKE * ALIKE)) / all4(most + ALIKE * ALIKE);
       nearer[r] *= part + all4(clean) * (all4(1.0f) - part);
     }
   }
@@ -176,7 +174,7 @@ void split(const Job &job, Window &w, int y, int x, const f4 *falloff, const Blo
     const float left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
     misfit += left * left;
   }
-  const float trust = strength / std::max(strength + TRUST * (behind_variance + front_variance + misfit), 1e-12f);
+  const float trust = strength / (strength + TRUST * (behind_variance + front_variance + misfit) + ALIKE * ALIKE);
   const float sided = std::fabs((here - near) - (far - here)) / gap;
   const float certainty = w.edge[first + REACH * PITCH + REACH] * trust * clamp01(4.0f * sided - 2.0f);
   const float weight = std::min(is_near ? 1.0f - fitted : fitted, 0.5f) * certainty, rest = 1.0f - weight;
