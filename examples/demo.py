@@ -8,6 +8,8 @@ of confusion (orange in front of the focus, black in focus, blue behind it) and 
 
 import argparse
 import dataclasses
+import json
+import math
 import time
 from pathlib import Path
 
@@ -21,7 +23,6 @@ from torchdof.io.images import read_image, write_image
 from torchdof.io.sheet import write_sheet
 
 FOCUS_M = {"near": 2.3, "middle": 3.1, "far": 4.6}
-FOCAL_PX, BASELINE_M, DISPARITY_OFFSET_PX = 994.978, 0.193001, 31.086
 APERTURE_RADIUS_M = 0.04  # wider than lenses are made, so that a picture of 741 pixels shows it
 
 
@@ -29,22 +30,17 @@ def main() -> None:
     """Render the three pictures and their sheets."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument(
-        "--data", type=Path, required=True, help="folder with motorcycle_left.png and motorcycle_disp.npz"
+        "--data", type=Path, required=True, help="folder with motorcycle_left.png, motorcycle_disp.npz and camera.json"
     )
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
 
     picture = read_image(arguments.data / "motorcycle_left.png")
-    depth = read_depth(
-        arguments.data / "motorcycle_disp.npz",
-        kind="disparity",
-        scale=BASELINE_M * FOCAL_PX,
-        offset=DISPARITY_OFFSET_PX,
-        fill="far",  # the 7 % that stereo did not see lie behind what is in front of them
-    )
+    known = json.loads((arguments.data / "camera.json").read_text())
+    depth = read_depth(arguments.data / "motorcycle_disp.npz", **known["depth"])
     height, width = depth.shape[-2:]
-    fov_x_deg = float(torch.rad2deg(2 * torch.atan(torch.tensor(width / 2 / FOCAL_PX))))
+    fov_x_deg = math.degrees(2 * math.atan(width / 2 / known["focal_length_px"]))
 
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), transient=True) as progress:
         task = progress.add_task("rendering", total=len(FOCUS_M))

@@ -6,6 +6,8 @@ Usage: python examples/gallery.py --out docs/pictures
 """
 
 import argparse
+import json
+import math
 import subprocess
 import sys
 from collections.abc import Callable
@@ -25,13 +27,15 @@ from torchdof.reference.scenes import read_scenes
 
 ROOT = Path(__file__).parents[1]
 MOTORCYCLE, SCENES = ROOT / "examples/data/motorcycle", ROOT / "tests/data/scenes"
-FOV_X_DEG, APERTURE_RADIUS_M = 40.85, 0.04  # wider than lenses are made, so that a picture of 741 pixels shows it
+KNOWN = json.loads((MOTORCYCLE / "camera.json").read_text())
+FOV_X_DEG = math.degrees(2 * math.atan(741 / 2 / KNOWN["focal_length_px"]))
+APERTURE_RADIUS_M = 0.04  # wider than lenses are made, so that a picture of 741 pixels shows it
 TABLES = ("sato_j15", "double_gauss_50mm_f2", "wide_22mm_f4")
 
 
 def motorcycle() -> tuple[Tensor, Tensor]:
     """The photograph, ``[1, 3, 500, 741]`` in linear light, and its depth in metres."""
-    depth = read_depth(MOTORCYCLE / "motorcycle_disp.npz", kind="disparity", scale=192.03, offset=31.086, fill="far")
+    depth = read_depth(MOTORCYCLE / "motorcycle_disp.npz", **KNOWN["depth"])
     return read_image(MOTORCYCLE / "motorcycle_left.png").pixels, depth
 
 
@@ -119,6 +123,11 @@ def draw_bokeh(path: Path) -> None:
     subprocess.run([sys.executable, ROOT / "examples/bokeh.py", "--out", path, "--height", "320"], check=True)
 
 
+def draw_field(path: Path) -> None:
+    """A street at night through a lens that is traced across the field, as ``examples/benchmarks`` draws it."""
+    subprocess.run([sys.executable, ROOT / "examples/benchmarks/across_field.py", "--picture", path], check=True)
+
+
 def draw_lights(path: Path, tables: dict[str, torchdof.BlurTable]) -> None:
     """Small lights, from 14 px in front of the focus to 14 px behind it."""
     height, width, cocs = 150, 220, (-14.0, -7.0, 0.0, 7.0, 14.0)
@@ -183,6 +192,7 @@ GALLERY: dict[str, Callable[[Path], None]] = {
     "lenses.jpg": draw_lenses,
     "shapes.jpg": draw_shapes,
     "bokeh.jpg": draw_bokeh,
+    "field.jpg": draw_field,
     "layers.jpg": draw_layers,
     "truth_lamps.jpg": draw_truth,
     "truth_bars.jpg": draw_truth,

@@ -72,7 +72,7 @@ def to_onnx(
 
     Example:
         >>> import tempfile, torchdof
-        >>> dof = torchdof.DepthOfField(torchdof.Camera(), max_coc_px=2.0, occlusion=False)
+        >>> dof = torchdof.DepthOfField(torchdof.Camera(), max_coc_px=1.0, tolerance="draft", occlusion=False)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     len(to_onnx(dof, f"{folder}/dof.onnx").cases) > 5
         True

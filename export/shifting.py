@@ -9,14 +9,14 @@ from torch import Tensor
 __all__ = ["samples"]
 
 
-def samples(values: Tensor, size: tuple[int, int], ratio: float) -> Iterator[tuple[Tensor, Tensor]]:
-    """The samples around each pixel of a map, and their shares of the linear mean.
+def samples(values: Tensor, size: int, ratio: float, half_px: tuple[Tensor, Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
+    """The samples around each pixel of a square map, and their shares of the linear mean.
 
     Args:
-        values: Samples ``[B, C, h, w]`` at every ``ratio``-th pixel of the map, with the same centre. At the map's ends
-            they go on as they are there; they reach beyond it by less than one of them.
+        values: Samples ``[B, C, n, n]`` at every ``ratio``-th pixel of the map, among them all around its pixels.
         size: Of the map.
-        ratio: 1/2, 1 or more powers of two.
+        ratio: 1/2, 1 or more powers of two. Up to 1 both have one centre.
+        half_px: How many halves of a pixel of the map, 0 or 1, its centre lies below and right of that of the samples.
     """
     if ratio < 1:  # midway between four
         share = values.new_full((), 0.25)
@@ -26,18 +26,12 @@ def samples(values: Tensor, size: tuple[int, int], ratio: float) -> Iterator[tup
         yield values, values.new_ones(())
         return
     step = int(ratio)
-    enlarged = functional.interpolate(
-        functional.pad(values, (1,) * 4, mode="replicate"), scale_factor=float(step), mode="nearest"
-    )
-    rows, columns = (_ends(values, dim, length, step) for dim, length in zip((-2, -1), size, strict=True))
-    for row, down in rows:
-        for column, right in columns:
-            yield enlarged[..., row : row + size[0], column : column + size[1]], down[:, None] * right
-
-
-def _ends(values: Tensor, dim: int, length: int, step: int) -> list[tuple[int, Tensor]]:
-    """Along an axis: by how much to shift the samples before each pixel, and those after it, and their shares."""
-    twice = step * (values.shape[dim] + 1) - length + 1  # of the first pixel's place, in pixels of the map
-    place = 2 * torch.arange(length, device=values.device) + twice
-    part = (place % (2 * step)).to(values.dtype) / (2 * step)
-    return [(twice // 2, 1.0 - part), (twice // 2 + step, part)]
+    enlarged = functional.interpolate(values, scale_factor=float(step), mode="nearest")
+    first = (step * values.shape[-1] - size - step) // 2  # of the samples before the first pixel
+    place = 2 * torch.arange(size, device=values.device) + 2 * first + 1
+    shares = [((place % (2 * step)).to(values.dtype) + half) / (2 * step) for half in half_px]
+    down, right = ((1.0 - share, share) for share in shares)
+    for row in (0, 1):
+        for column in (0, 1):
+            top, left = first + row * step, first + column * step
+            yield enlarged[..., top : top + size, left : left + size], down[row][:, None] * right[column]

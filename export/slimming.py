@@ -167,7 +167,7 @@ class _Cuts(onnx_ir.passes.InPlacePass):
         for node in list(model.graph):
             whole = node.inputs[0] if node.op_type == "Slice" else None
             first = None if whole is None else whole.producer()
-            if first is None or first.op_type != "Slice":
+            if first is None or first.op_type != "Slice" or len(first.inputs) != len(node.inputs):
                 continue
             along: list[Any] = [first.inputs[3], node.inputs[3]]
             axes = [onnx_ir.convenience.get_const_tensor(value) for value in along]

@@ -29,18 +29,20 @@ def _ours(graph: onnx_ir.Graph, name: str) -> list[onnx_ir.Node]:
 
 
 def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
-    """What lies between a window and its tiles, as the body of a loop that slices its window from the frame."""
-    window = next(node for node in _ours(graph, WINDOW))
-    dependent, body_nodes = {window}, []
+    """What lies between windows and their tiles, as the body of a loop that slices its windows from the frame."""
+    windows, dependent, body_nodes = [], set(), []
     for node in graph:
-        if node is not collect and any(v is not None and v.producer() in dependent for v in node.inputs):
-            dependent.add(node)
-            body_nodes.append(node)
         if node is collect:
             break
-    frame, size = window.inputs[0], window.outputs[0].shape
+        if node.domain == DOMAIN and node.op_type == WINDOW:
+            windows.append(node)
+            dependent.add(node)
+        elif any(v is not None and v.producer() in dependent for v in node.inputs):
+            dependent.add(node)
+            body_nodes.append(node)
+    frame = windows[0].inputs[0]
     tile: Any = collect.inputs[0]
-    side, margin = (window.attributes[name].as_int() for name in ("side", "margin"))
+    side, margin = (windows[0].attributes[name].as_int() for name in ("side", "margin"))
 
     before = Tape()
     shape = before.op("Shape", [frame])
@@ -58,12 +60,16 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
     inside = Tape()
     line = inside.op("Div", [step, columns])
     place = [inside.op("Div", [line, rows]), inside.op("Mod", [line, rows]), inside.op("Mod", [step, columns])]
-    start = inside.op("Mul", [inside.op("Concat", place, {"axis": 0}), _ints(inside, 1, side, side)])
-    stop = inside.op("Add", [start, _ints(inside, 1, side + 2 * margin, side + 2 * margin)])
-    sliced = inside.op("Slice", [frame, start, stop, _ints(inside, 0, 2, 3)])
-    # runtimes cannot tell the size of a slice, and take their fast convolutions only for sizes that they know
-    cut = inside.op("Reshape", [sliced, _ints(inside, *(size.numpy() if size else ()))])
-    window.outputs[0].replace_all_uses_with(cut)
+    tile_place = inside.op("Concat", place, {"axis": 0})
+    for window in windows:
+        side, margin = (window.attributes[name].as_int() for name in ("side", "margin"))
+        start = inside.op("Mul", [tile_place, _ints(inside, 1, side, side)])
+        stop = inside.op("Add", [start, _ints(inside, 1, side + 2 * margin, side + 2 * margin)])
+        sliced = inside.op("Slice", [window.inputs[0], start, stop, _ints(inside, 0, 2, 3)])
+        # runtimes cannot tell the size of a slice, and take their fast convolutions only for sizes that they know
+        size = window.outputs[0].shape
+        cut = inside.op("Reshape", [sliced, _ints(inside, *(size.numpy() if size else ()))])
+        window.outputs[0].replace_all_uses_with(cut)
     for node in body_nodes:
         graph.remove(node)
     goes_on = inside.op("Identity", [going])
@@ -77,7 +83,8 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
     graph.insert_before(collect, [*before.nodes, loop])
     owners[body] = loop
     _replace(graph, collect, loop)
-    graph.remove(window, safe=True)
+    for window in windows:
+        graph.remove(window, safe=True)
 
 
 def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:

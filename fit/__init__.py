@@ -1,6 +1,7 @@
 """Capture to radial profile to fitted kernel to blur table: lengths in, lengths out, in the caller's unit."""
 
 from .lens.trace import trace_table
+from .photo.across import table_of_dots
 from .photo.family_choice import highlight_psnr, natural_psnr
 from .photo.kernel_image import KernelImage, fit_kernel_image
 from .photo.manifest import Capture, Captures, read_captures, read_pair
@@ -32,5 +33,6 @@ __all__ = [
     "polar_samples",
     "read_captures",
     "read_pair",
+    "table_of_dots",
     "trace_table",
 ]

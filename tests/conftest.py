@@ -29,7 +29,7 @@ def _same_random_numbers() -> None:
 @functools.cache
 def _beside(name: str) -> ModuleType:
     """A module of shared helpers in this folder: tests are imported one by one, not as a package."""
-    spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).with_name(f"{name}.py"))
+    spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).parent / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
@@ -50,6 +50,12 @@ def tolerances() -> dict[torch.dtype, dict[str, float]]:
 
 
 @pytest.fixture(scope="session")
+def simulator() -> ModuleType:
+    """A camera that photographs dots: `fit/simulator.py`."""
+    return _beside("fit/simulator")
+
+
+@pytest.fixture(scope="session")
 def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of all workers of this run."""
     own = tmp_path_factory.getbasetemp()
@@ -66,11 +72,24 @@ def layered(shared_folder: Path) -> Any:
 
 @pytest.fixture(scope="session")
 def fold(shared_folder: Path) -> Any:
-    """An exported module with occlusion, by the literal scatter."""
+    """An exported module without occlusion, by the literal scatter."""
     return _beside("exported").export_once("fold", shared_folder)
+
+
+@pytest.fixture(scope="session")
+def fold_with_occlusion(shared_folder: Path) -> Any:
+    """The same with occlusion."""
+    return _beside("exported").export_once("fold with occlusion", shared_folder)
 
 
 @pytest.fixture(scope="session")
 def plain(shared_folder: Path) -> Any:
     """An exported module without occlusion, which is traced in a few seconds."""
     return _beside("exported").export_once("plain", shared_folder)
+
+
+@pytest.fixture(scope="session")
+def exported_by_command(shared_folder: Path) -> tuple[Path, str]:
+    """A file of blur radii as ``torchdof export`` writes it, without occlusion, and what that printed."""
+    path, told = _beside("exported").command_once(shared_folder)
+    return path, told

@@ -10,24 +10,30 @@ import numpy as np
 import torch
 from filelock import FileLock
 from torch import Tensor
+from typer.testing import CliRunner
 
 import torchdof
+from torchdof.cli.main import app
 from torchdof.export import Verification, to_onnx
 from torchdof.export.verification import session
 from torchdof.render.plan import Plan
 
 CAMERA = torchdof.Camera.from_fov(50.0, 0.05, 2.0)
+SMALL = torchdof.Camera(sensor_width_mm=4.0)  # 4 px at infinity in the hard cases' small frames
 GIVEN: dict[str, Any] = {"depth_edges": "as given"}  # as a file takes it
 MODULES: dict[str, Callable[[], torchdof.DepthOfField]] = {
-    # with occlusion, by convolution at resolutions down to a sixteenth
-    "layered": lambda: torchdof.DepthOfField(CAMERA, **GIVEN, tolerance=64 / 255, max_coc_px=32.0, check=False),
-    # with occlusion, by the literal scatter
-    "fold": lambda: torchdof.DepthOfField(
-        CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, method="fold", check=False
-    ),
+    # with occlusion, at resolutions down to a sixteenth: the one such file that a run of the tests writes
+    "layered": lambda: torchdof.DepthOfField(SMALL, **GIVEN, tolerance=64 / 255, max_coc_px=16.0, check=False),
     # without occlusion, which is traced in a few seconds
     "plain": lambda: torchdof.DepthOfField(
         CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, occlusion=False, check=False
+    ),
+    # the literal scatter, without occlusion and with it
+    "fold": lambda: torchdof.DepthOfField(
+        CAMERA, **GIVEN, tolerance=32 / 255, max_coc_px=2.5, occlusion=False, method="fold", check=False
+    ),
+    "fold with occlusion": lambda: torchdof.DepthOfField(
+        CAMERA, **GIVEN, tolerance=16 / 255, max_coc_px=2.5, method="fold", check=False
     ),
 }
 
@@ -59,3 +65,16 @@ def export_once(name: str, folder: Path) -> Exported:
         if not told.exists():
             told.write_bytes(pickle.dumps(to_onnx(dof, path)))
     return Exported(dof, path, pickle.loads(told.read_bytes()))
+
+
+def command_once(folder: Path) -> tuple[Path, str]:
+    """A file of blur radii that ``torchdof export`` wrote, alone in its folder, and what it printed; written once."""
+    path, told = folder / "command" / "dof.onnx", folder / "command.json"
+    with FileLock(folder / "command.lock"):
+        if not told.exists():
+            path.parent.mkdir()
+            options = ["--inputs", "coc_px", "--max-coc", "2", "--no-occlusion", "--json"]
+            result = CliRunner().invoke(app, ["export", "-o", str(path), *options], catch_exceptions=False)
+            assert result.exit_code == 0, result.output
+            told.write_text(result.stdout)
+    return path, told.read_text()

@@ -181,11 +181,12 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         chosen = self._chosen(params, len(input))
         out = image
         for index in params["table"][chosen].unique().tolist():
-            items = chosen[params["table"][chosen] == index]
-            items = items.to(input.device)
-            rendered = self._blurred(image[items], depth[items], params, items, int(index), flags["transfer"])
-            out = out.index_copy(0, items, rendered)
-        return torch.cat([out, kept], dim=1)
+            items = chosen[params["table"][chosen] == index].to(input.device)
+            alone = len(items) == len(input)  # then nothing is copied
+            picked = (image, depth) if alone else (image[items], depth[items])
+            rendered = self._blurred(*picked, params, items, int(index), flags["transfer"])
+            out = rendered if alone else out.index_copy(0, items, rendered)
+        return torch.cat([out, kept], dim=1) if kept.shape[1] else out
 
     def _chosen(self, params: Mapping[str, Tensor], count: int) -> Tensor:
         """Numbers of the items to blur; where all are always blurred, Kornia does not look at the gate."""

@@ -409,7 +409,5 @@ def _check_attention(attention: Attention | None, plan: Plan | None, options: Op
         return
     if plan is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
-    if options.table.depends_on_place:
-        raise ValueError("attention renders a part of the frame by itself; take a table without vignetting or field")
     if validation.is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")

@@ -85,10 +85,6 @@ class Options:
                 raise ValueError(f"{name} must be True or False, got {show(getattr(self, name))}")
         if not isinstance(self.method, str) or self.method not in ("layered", "fold"):
             raise ValueError(f"method must be 'layered' or 'fold', got {show(self.method)}")
-        if self.method == "fold" and self.table.depends_on_place:
-            raise ValueError(
-                "method='fold' has one kernel a blur radius; take 'layered', or a table without vignetting or field"
-            )
         if self.occlusion and not self.normalize:
             raise ValueError("normalize=False is the plain sum of occlusion=False; set occlusion=False as well")
         reach = self.max_coc_px

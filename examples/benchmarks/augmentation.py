@@ -9,6 +9,8 @@ albumentations' Defocus one disc: neither knows depth, so they are a measure of 
 
 import argparse
 import functools
+import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,7 +31,6 @@ from torchdof.validation import whole
 
 __all__ = ["crops", "main", "works"]
 
-_FOCAL_PX, _BASELINE_M, _DISPARITY_OFFSET_PX = 994.978, 0.193001, 31.086
 _SIDE_PX = 256
 _WAYS = {
     "final": {"tolerance": "final"},
@@ -38,33 +39,28 @@ _WAYS = {
 }
 
 
-def crops(data: Path, count: int) -> tuple[Tensor, Tensor]:
-    """Crops of the photograph, encoded for display ``[B, 3, 256, 256]``, and their depth in metres."""
+def crops(data: Path, count: int) -> tuple[Tensor, Tensor, Camera]:
+    """Crops of the photograph, encoded for display ``[B, 3, 256, 256]``, their depth in metres, and their camera."""
+    known = json.loads((data / "camera.json").read_text())
     image = encode(read_image(data / "motorcycle_left.png").pixels, "srgb", has_alpha=False, straight=False)
-    depth = read_depth(
-        data / "motorcycle_disp.npz",
-        kind="disparity",
-        scale=_BASELINE_M * _FOCAL_PX,
-        offset=_DISPARITY_OFFSET_PX,
-        fill="far",
-    )
+    depth = read_depth(data / "motorcycle_disp.npz", **known["depth"])
+    fov_x_deg = math.degrees(2 * math.atan(_SIDE_PX / 2 / known["focal_length_px"]))
     generator = torch.Generator().manual_seed(0)
     corners = [
         [int(torch.randint(size - _SIDE_PX + 1, (1,), generator=generator)) for size in image.shape[-2:]]
         for _ in range(count)
     ]
     windows = [(..., slice(y, y + _SIDE_PX), slice(x, x + _SIDE_PX)) for y, x in corners]
-    return torch.cat([image[w] for w in windows]), torch.cat([depth[w] for w in windows])
+    camera = Camera.from_fov(fov_x_deg, aperture_radius_m=0.04, focus_m=3.0)
+    return torch.cat([image[w] for w in windows]), torch.cat([depth[w] for w in windows]), camera
 
 
-def works(image: Tensor, depth: Tensor) -> dict[str, Callable[[], object]]:
+def works(image: Tensor, depth: Tensor, camera: Camera) -> dict[str, Callable[[], object]]:
     """What is compared, by name; torchdof's pictures are checked first.
 
     Raises:
         RuntimeError: If a picture is not the rendering of its parameters.
     """
-    fov_x_deg = float(torch.rad2deg(2 * torch.atan(torch.tensor(_SIDE_PX / 2 / _FOCAL_PX))))
-    camera = Camera.from_fov(fov_x_deg, aperture_radius_m=0.04, focus_m=3.0)
     compared: dict[str, Callable[[], object]] = {}
     for name, options in _WAYS.items():
         aug = RandomDepthOfField((2.2, 5.0), (1.4, 8.0), camera=camera, p=1.0, **options)  # type: ignore[arg-type]
@@ -106,8 +102,8 @@ def main() -> None:
         whole(f"--{name}", getattr(arguments, name), 1, 100_000)
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    image, depth = crops(arguments.data, arguments.batch)
-    seconds = in_turns(works(image, depth), arguments.repeat, _processor_seconds)
+    compared = works(*crops(arguments.data, arguments.batch))
+    seconds = in_turns(compared, arguments.repeat, _processor_seconds)
     print(machine())
     print("| blur | images/s/core | interquartile range |\n| --- | --- | --- |")
     for name, taken in seconds.items():

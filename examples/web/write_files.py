@@ -23,7 +23,6 @@ FOV_X_DEG = 40.0  # of a 50 mm lens on full frame
 MAX_COC_PX = 32.0
 TOLERANCE = 4 / 255  # a preview's: the page is looked at, and a browser is slow
 DATA = Path(__file__).parents[1] / "data" / "motorcycle"
-FOCAL_PX, BASELINE_M, DISPARITY_OFFSET_PX = 994.978, 0.193001, 31.086
 
 
 def main() -> None:
@@ -51,13 +50,8 @@ def main() -> None:
     sample = arguments.out / "sample"
     sample.mkdir(exist_ok=True)
     shutil.copyfile(DATA / "motorcycle_left.png", sample / "motorcycle.png")
-    depth_m = read_depth(
-        DATA / "motorcycle_disp.npz",
-        kind="disparity",
-        scale=BASELINE_M * FOCAL_PX,
-        offset=DISPARITY_OFFSET_PX,
-        fill="far",
-    )
+    kind = json.loads((DATA / "camera.json").read_text())["depth"]
+    depth_m = read_depth(DATA / "motorcycle_disp.npz", **kind)
     depth_m = repair_edges(read_image(DATA / "motorcycle_left.png").pixels, depth_m)
     write_millimetres(sample / "motorcycle_depth.png", depth_m[0, 0].numpy())
 

@@ -130,11 +130,16 @@ def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, 
 
 
 def coc_nodes(near_mm: float, far_mm: float, count: int) -> list[float]:
-    """Signed coc from the nearest to the farthest, closer to each other near focus; so many on either side.
+    """Signed coc from the nearest to the farthest, closer to each other near focus; so many on either side on average.
+
+    The side that reaches farther has more of them, two at least.
 
     Example:
-        >>> [round(coc, 3) for coc in coc_nodes(-0.4, 0.1, 2)]
-        [-0.4, -0.141, 0.0, 0.035, 0.1]
+        >>> [round(coc, 3) for coc in coc_nodes(-0.4, 0.2, 3)]
+        [-0.4, -0.26, -0.141, -0.05, 0.0, 0.071, 0.2]
     """
-    steps = [(i / count) ** _GROWING for i in range(1, count + 1)]
-    return [*(near_mm * step for step in reversed(steps)), 0.0, *(far_mm * step for step in steps if far_mm > 0)]
+    of_far = min(max(2, round(2 * count * far_mm / (far_mm - near_mm))), 2 * count - 2) if far_mm > 0 else 0
+    nodes = [0.0]
+    for end, of_side in ((near_mm, 2 * count - of_far if of_far else count), (far_mm, of_far)):
+        nodes += [end * (i / of_side) ** _GROWING for i in range(1, of_side + 1)]
+    return sorted(nodes)

@@ -13,9 +13,12 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from torchdof.validation import number, show
+
 __all__ = ["C_UM", "D_UM", "F_UM", "G_UM", "Glass"]
 
 D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
+_LARGEST = 1e100  # coefficient, whose products are numbers too
 _CATALOGUE = Path(__file__).parent / "glasses" / "schott.txt"
 
 
@@ -41,8 +44,12 @@ class Glass:
 
     def __post_init__(self) -> None:
         """Check that it is a glass."""
-        if len(self.sellmeier) != 6 or not all(math.isfinite(value) for value in self.sellmeier):
-            raise ValueError(f"glass {self.name} must have six finite coefficients B1 B2 B3 C1 C2 C3")
+        given = self.sellmeier
+        plain = isinstance(given, tuple) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
+        if not plain or len(given) != 6 or not all(abs(value) <= _LARGEST for value in given):
+            raise ValueError(
+                f"glass {self.name} must have six finite coefficients B1 B2 B3 C1 C2 C3, got {show(given)}"
+            )
         for wavelength_um in (0.4, D_UM, 0.7):
             self.index(wavelength_um)
 
@@ -53,9 +60,9 @@ class Glass:
         Raises:
             ValueError: If there is none of that name; the message says how to state it.
         """
-        if name.upper() not in _catalogue():
+        if not isinstance(name, str) or name.upper() not in _catalogue():
             raise ValueError(
-                f"no glass {name!r} in the catalogue of SCHOTT; define it by a line "
+                f"no glass {show(name)} in the catalogue of SCHOTT; define it by a line "
                 f"`glass {name} B1 B2 B3 C1 C2 C3` (Sellmeier, micrometres), or write index/V or index/V/P_gF instead"
             )
         return _catalogue()[name.upper()]
@@ -66,7 +73,7 @@ class Glass:
         Raises:
             ValueError: If the formula gives none from 1 to 5 there: the wavelength is beyond what the glass lets pass.
         """
-        square = wavelength_um * wavelength_um
+        square = number("wavelength_um", wavelength_um, low=0.0, high=1e3, unit="micrometres") ** 2
         poles, b = self.sellmeier[3:], self.sellmeier[:3]
         terms = [b_i * square / (square - c_i) for b_i, c_i in zip(b, poles, strict=True) if square != c_i]
         if len(terms) < 3 or not 1.0 <= 1.0 + sum(terms) < 25.0:

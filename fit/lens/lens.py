@@ -29,6 +29,8 @@ RGB_UM = (C_UM, 0.54607, F_UM)
 
 _SHIPPED = Path(__file__).parent / "lenses"
 _NORMAL = 0.6438, -0.001682  # P_gF of normal glasses at V = 0, and its slope
+_LARGEST = 1e12  # mm, of focal lengths and what else first-order optics tells of a lens
+_MOST_CONIC, _DEEPEST_MM = 1e6, 1e5  # of a surface's shape
 _MARKED = 1.03  # a lens is sold by a rounded f-number: f/2.03 is marked f/2
 
 
@@ -148,8 +150,21 @@ class Lens:
             for name, value in columns.items():
                 if problem := prescription.fault(name, float(value[i])):
                     raise ValueError(f"surface {i}: {problem}")
+            self._check_shape(i)
         if self.index[-1] != 1.0:
             raise ValueError(f"the index behind the last surface must be 1 (air), got {self.index[-1]:g}")
+
+    def _check_shape(self, surface: int) -> None:
+        """Refuse a shape that no lens has: rays would meet it at lengths beyond what numbers hold."""
+        shape, rim = self.shape(surface), self.diameter[surface] / 2
+        if abs(shape.conic) > _MOST_CONIC:
+            raise ValueError(f"surface {surface}: the conic constant must be within 1e6, got {shape.conic:g}")
+        for i, coefficient in enumerate(shape.polynomial):
+            if abs(coefficient) > _DEEPEST_MM / rim ** (2 * i + 2):
+                raise ValueError(
+                    f"surface {surface}: A{2 * i + 2} must bend it by less than {_DEEPEST_MM:g} mm up to its rim at "
+                    f"{rim:g} mm, got {coefficient:g}"
+                )
 
     @classmethod
     def read(cls, source: str | os.PathLike[str]) -> Lens:
@@ -226,12 +241,15 @@ class Lens:
         """Ray matrix ``[2, 2]`` on (height, angle) from just before surface ``first`` to just behind ``last - 1``."""
         n = self.indices(wavelength_um)
         matrix = np.eye(2)
-        for i in range(first, last):
-            if i > first:
-                matrix = np.array([[1.0, self.thickness[i - 1]], [0.0, 1.0]]) @ matrix
-            shape = self.shape(i)
-            power = (n[i + 1] - n[i]) * (shape.curvature + 2.0 * sum(shape.polynomial[:1]))
-            matrix = np.array([[1.0, 0.0], [-power / n[i + 1], n[i] / n[i + 1]]]) @ matrix
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i in range(first, last):
+                if i > first:
+                    matrix = np.array([[1.0, self.thickness[i - 1]], [0.0, 1.0]]) @ matrix
+                shape = self.shape(i)
+                power = (n[i + 1] - n[i]) * (shape.curvature + 2.0 * sum(shape.polynomial[:1]))
+                matrix = np.array([[1.0, 0.0], [-power / n[i + 1], n[i] / n[i + 1]]]) @ matrix
+        if not (np.abs(matrix) < _LARGEST).all():
+            raise ValueError(f"lens {self.name!r} bends light beyond measure; check its radii and polynomials")
         return matrix
 
     def paraxial(self, wavelength_um: float | None = None) -> Paraxial:
@@ -242,7 +260,7 @@ class Lens:
         """
         last = len(self.radius)
         a, _, c, d = self.matrix(0, last, wavelength_um).ravel()
-        if c >= 0:
+        if not c < -1.0 / _LARGEST:
             raise ValueError(f"lens {self.name!r} must have a positive focal length: it does not converge light")
         focal = -1.0 / c
         front = self.matrix(0, self.stop, wavelength_um)  # to the stop
@@ -250,6 +268,8 @@ class Lens:
             front = np.array([[1.0, self.thickness[self.stop - 1]], [0.0, 1.0]]) @ front
         rear = self.matrix(self.stop, last, wavelength_um)
         aperture = self.diameter[self.stop]
+        if abs(front[0, 0]) < 1.0 / _LARGEST:
+            raise ValueError(f"lens {self.name!r} must have its entrance pupil somewhere: its stop is seen at infinity")
         entrance = aperture / abs(front[0, 0])
         # an image of the stop's centre: height 0 at the stop, whatever the angle
         exit_at = -rear[0, 1] / rear[1, 1] if rear[1, 1] else math.inf

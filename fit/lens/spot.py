@@ -20,16 +20,20 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from torchdof.validation import number, show
+
 from ..result import Array
 from .lens import Lens
 from .rays import Rays, trace_rays
 
-__all__ = ["Focus", "Reference", "Spot", "focus_sensor", "point_spread"]
+__all__ = ["Focus", "Reference", "Spot", "focus_sensor", "point_spread", "vertex_distance_mm"]
 
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
 
 _PROBES = 64
+_MOST_RAYS = 10**8
+_FARTHEST_M, _WIDEST_MM = 1e12, 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +115,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
     first = lens.paraxial()
     sensor = first.back_focal
     for _ in range(100 if reference == "sensor" else 1):
-        object_mm = _object_mm(lens, focus_m, reference, sensor)
+        object_mm = vertex_distance_mm(lens, focus_m, reference, sensor)
         before, sensor = sensor, _image_mm(lens, object_mm, kind)
         if abs(sensor - before) < 1e-12 * first.focal_length:
             break
@@ -154,11 +158,12 @@ def point_spread(
         >>> round(point_spread(lens, 1.0, sensor, meridional=True).radius, 4)
         0.3705
     """
-    if rays < 16:
-        raise ValueError(f"rays must be at least 16, got {rays}")
+    if isinstance(rays, bool) or not isinstance(rays, int) or not 16 <= rays <= _MOST_RAYS:
+        raise ValueError(f"rays must be at least 16, got {show(rays)} (and {_MOST_RAYS} at most)")
+    number("field_mm", field_mm, low=-_WIDEST_MM, high=_WIDEST_MM, unit="millimetres")
     if meridional and field_mm:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
-    object_mm = _object_mm(lens, z_m, reference, sensor_mm)
+    object_mm = vertex_distance_mm(lens, z_m, reference, sensor_mm)
     point = _object_point(lens, object_mm, sensor_mm, field_mm)
     low, high = _pupil_box(lens, point, wavelength_um)
     if meridional:
@@ -188,7 +193,7 @@ def point_spread(
     return Spot(hit_x - centre[0], hit_y - centre[1], weight, -float(centre[1]), cell * int(keep.sum()))
 
 
-def _object_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
+def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
     """Distance of an object in front of the first vertex, in mm."""
     if reference not in get_args(Reference):
         raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, got {reference!r}")
@@ -200,6 +205,8 @@ def _object_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -
         "sensor": float(lens.vertices[-1]) + sensor_mm,
     }[reference]
     object_mm = 1000.0 * z_m - behind_vertex
+    if _FARTHEST_M < z_m < math.inf:
+        raise ValueError(f"objects must be at most {_FARTHEST_M:g} m away, or at infinity, got {z_m} m")
     if not object_mm > 0:
         raise ValueError(
             f"objects must lie in front of the lens, more than {max(behind_vertex, 0.0) / 1000:.4g} m from its "
@@ -228,7 +235,10 @@ def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
     height = traced.at(lens.vertices[-1] + paraxial)[1]
     slope = traced.direction[1] / traced.direction[2]
     # the squared radius is a parabola over the sensor's position
-    return paraxial - float(weight @ (height * slope)) / float(weight @ (slope * slope))
+    steepness = float(weight @ (slope * slope))
+    if steepness == 0.0:
+        raise ValueError(f"no ray of a fan through lens {lens.name!r} comes to a focus; are its openings too narrow?")
+    return paraxial - float(weight @ (height * slope)) / steepness
 
 
 class _Point(NamedTuple):

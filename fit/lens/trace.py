@@ -77,7 +77,8 @@ def trace_table(
         field: Distances in mm from the middle of the frame, increasing from 0, at which spots are traced as they are,
             for a table whose kernels depend on the place (:class:`torchdof.optics.field.Field`): a full frame of
             36 x 24 mm wants those to 21.6 mm. None traces the axis alone.
-        field_nodes: Blurs at which these are traced on either side of focus.
+        field_nodes: Blurs at which these are traced on either side of focus, on average: the farther a side reaches,
+            the more.
         field_rays: Rays of each of these spots.
         name: Name of the table; None is the lens's with the f-number.
 

@@ -13,7 +13,7 @@ from .dot import Dot, find_dot, find_dots
 
 __all__ = ["Capture", "Dots", "cut_pairs", "size_of"]
 
-Dots = Literal["one", "centre", "each"]
+Dots = Literal["one", "centre", "each", "field"]
 
 _MARGIN = 1.35  # window over the blur's reach
 

@@ -12,6 +12,7 @@ from ..result import Array
 __all__ = ["Dot", "find_dot", "find_dots", "noise_inside", "noise_of", "radial_mean"]
 
 _THRESHOLD = 0.15  # of the peak: low enough to keep an uneven ring in one piece
+_SMALLEST_PX = 9
 _OTHER_DOT = 0.08  # light of a second dot, over the first's, that is not dirt
 
 
@@ -50,7 +51,7 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     Raises:
         DotNotFoundError: nothing stands out from the noise.
         SeveralDotsError: more than one does.
-        WindowError: the dot touches the edge of the picture.
+        WindowError: the dot touches the edge of the picture, or that is too small.
     """
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
@@ -74,10 +75,17 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
 
     Raises:
         DotNotFoundError: nothing stands out from the noise.
-        WindowError: the brightest dot touches the edge of the picture.
+        WindowError: the brightest dot touches the edge of the picture, or that is too small.
     """
     from scipy import ndimage
 
+    if min(picture.shape) < _SMALLEST_PX:
+        raise WindowError(
+            f"a picture of {picture.shape[1]}x{picture.shape[0]} px is too small for a dot; {_SMALLEST_PX} px a side "
+            "are the least",
+            file=file,
+            number=float(min(picture.shape)),
+        )
     noise = noise_of(picture)
     frame = max(1, min(picture.shape) // 20)
     edge = np.ones(picture.shape, dtype=bool)
@@ -125,7 +133,8 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
 def _level(values: Array, noise: float) -> float:
     """Mean without outliers: where blacks are cut off at 0, half the noise is gone and the median is not the mean."""
     middle = float(np.median(values))
-    return float(values[np.abs(values - middle) <= 5 * noise].mean()) if noise > 0 else middle
+    kept = values[np.abs(values - middle) <= 5 * noise]
+    return float(kept.mean()) if noise > 0 and kept.size else middle
 
 
 def _measure(above: Array, x: float, y: float, background: float, noise: float, peak: float) -> Dot:

@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
 from .mosaic import PATTERNS, demosaiced
 
-__all__ = ["Capture", "Captures", "read_captures", "read_pair"]
+__all__ = ["Capture", "Captures", "inside", "read_captures", "read_pair"]
 
 MANIFEST = "capture.toml"
 Colours = Literal["mean", "each"]
@@ -132,7 +132,7 @@ def read_captures(
             manifests of strangers. None reads whatever they name, `../` and absolute paths among it.
 
     Returns:
-        One `Captures`; with `dots="each"` one for every dot of the grid, the most central first.
+        One `Captures`; with `dots="each"` or "field" one for every dot of the grid, the most central first.
 
     Raises:
         ManifestError: the manifest is missing, is not TOML, or a field is wrong.
@@ -145,7 +145,7 @@ def read_captures(
     path = Path(folder)
     path = path / MANIFEST if path.is_dir() or path.suffix != ".toml" else path
     if root is not None:
-        _inside(path, root, str(path))
+        inside(path, root, str(path))
     fields = _manifest(path)
     where, base = str(path), path.parent
     focus = _number(fields, "focus_m", where)
@@ -161,8 +161,8 @@ def read_captures(
     if transfer not in (None, "linear", "srgb"):
         raise ManifestError(f"transfer must be 'linear' or 'srgb', got {transfer!r}", file=where)
     chosen = dots or fields.get("dots", "one")
-    if chosen not in ("one", "centre", "each"):
-        raise ManifestError(f"dots must be 'one', 'centre' or 'each', got {chosen!r}", file=where)
+    if chosen not in get_args(Dots):
+        raise ManifestError(f"dots must be 'one', 'centre', 'each' or 'field', got {chosen!r}", file=where)
     wanted = colours or fields.get("colours", "mean")
     if wanted not in ("mean", "each"):
         raise ManifestError(f"colours must be 'mean' or 'each', got {wanted!r}", file=where)
@@ -174,7 +174,7 @@ def read_captures(
     files = [base / _text(shot, "file", where, needed=True) for shot in shots]  # type: ignore[operator]
     if root is not None:
         for file in [sharp, *files, *([] if dark is None else [base / dark])]:
-            _inside(file, root, where)
+            inside(file, root, where)
     crop = _crop(fields, where)
     darkness = None if dark is None else _read(base / dark, transfer, None, crop, pattern)
     first = _read(sharp, transfer, darkness, crop, pattern)
@@ -220,7 +220,7 @@ def read_captures(
             width_px=first.width_px if full_width is None else round(full_width),
             **{name: first.facts.get(name) if value is None else value for name, value in camera.items()},
             name=_text(fields, "name", where) or base.resolve().name,
-            notes=notes | {"position_px": list(columns[0][i].position_px)},
+            notes=notes | {"dots": chosen, "position_px": list(columns[0][i].position_px)},
             original_width_px=first.original_width_px if full_width is None else None,
         )
         for i in range(min(len(c) for c in columns))
@@ -273,7 +273,7 @@ def _manifest(path: Path) -> dict[str, Any]:
         raise ManifestError(f"is not TOML: {error}", file=str(path)) from error
 
 
-def _inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
+def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
     """Refuse a file that does not lie in a folder, wherever its name and links lead."""
     folder, real = os.path.realpath(root), os.path.realpath(file)
     if not os.path.isdir(folder):

@@ -14,11 +14,12 @@ from pathlib import Path
 from torchdof.io import foreign
 from torchdof.io.images import read_image
 from torchdof.io.metadata import camera_facts
+from torchdof.validation import number
 
 from ..problems import DotNotFoundError, FitError, ManifestError
 from ..result import Array
 from .crop import Capture
-from .manifest import Captures
+from .manifest import Captures, inside
 from .target import DOT_MM, SQUARE_MM, Target, find_target
 from .tone import WINDOW, tone_curve, untoned
 
@@ -67,19 +68,27 @@ class Photographs:
     advice: tuple[str, ...]
 
 
-def read_photographs(folder: str | os.PathLike[str], *, square_mm: float = SQUARE_MM) -> Photographs:
+def read_photographs(
+    folder: str | os.PathLike[str], *, square_mm: float = SQUARE_MM, root: str | os.PathLike[str] | None = None
+) -> Photographs:
     """Read a folder of photographs of the target, without any description.
 
     Args:
         folder: with the photographs; other files are left alone.
         square_mm: side of the black square as printed, mm.
+        root: folder that every photograph must lie in, links followed, for a service that reads folders of strangers.
+            None reads wherever links lead.
 
     Raises:
-        FitError: fewer than two photographs show the target, or no EXIF tells the lens.
+        FitError: fewer than two photographs show the target, no EXIF tells the lens, or one lies outside of the root.
+        ValueError: the square's side is none.
         OSError: a picture is damaged.
     """
+    number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
     files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *foreign.SUFFIXES))
     for path in files:
+        if root is not None:
+            inside(path, root, str(folder))
         unread = foreign.refusal(path)
         if unread is not None:
             raise FitError(unread, file=str(path))

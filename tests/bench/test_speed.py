@@ -1,8 +1,10 @@
 import csv
+import functools
 import importlib.metadata
 import importlib.util
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -257,7 +259,12 @@ def test_bad_arguments_are_refused_in_a_sentence(
     assert result.output.count("\n") == 1
 
 
-def test_an_exported_file_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exported_file_has_its_row(exported_by_command: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def copied(dof: DepthOfField, path: str, inputs: str, channels: int) -> None:
+        assert dof.options.max_coc_px == 2.0 and not dof.options.occlusion and (inputs, channels) == ("coc_px", 3)
+        shutil.copyfile(exported_by_command[0], path)
+
+    monkeypatch.setattr("torchdof.export.to_onnx", copied)
     subject = shipped(64, 96)
     found = [s for s in speed.settings(subject, ["onnxruntime"]) if s.runtime == "onnxruntime"]
     assert [(s.name, s.occlusion) for s in found] == [("onnx 1/255", True), ("onnx 1/255", False)]
@@ -270,7 +277,11 @@ def test_an_exported_file_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
-def test_a_compiled_module_has_its_row_and_tells_what_compiling_took() -> None:
+@pytest.mark.parametrize("backend", ["eager", pytest.param("inductor", marks=pytest.mark.sweep)])
+def test_a_compiled_module_has_its_row_and_tells_what_compiling_took(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
     subject = shipped(64, 96)
     found = [s for s in speed.settings(subject, ["compiled"]) if s.runtime == "compiled"]
     assert [(s.name, s.occlusion) for s in found] == [("compiled 1/255", True), ("compiled 1/255", False)]

@@ -15,19 +15,16 @@ def run(*arguments: object) -> Any:
     return CliRunner().invoke(app, ["export", *map(str, arguments)])
 
 
-def test_a_file_is_written_and_its_verification_printed(tmp_path: Path) -> None:
-    path = tmp_path / "dof.onnx"
-    options = ("--table", "sato_j15", "--max-coc", 1.5, "--tolerance", 0.2, "--no-occlusion", "--inputs", "coc_px")
-    result = run("-o", path, *options, "--channels", 1, "--json")
-    assert result.exit_code == 0, result.output
-    printed = json.loads(result.stdout)
-    assert printed["out"] == str(path) and "sato_j15 (ring)" in printed["title"]
+def test_a_file_is_written_and_its_verification_printed(exported_by_command: tuple[Path, str]) -> None:
+    path, told = exported_by_command
+    printed = json.loads(told)
+    assert printed["out"] == str(path) and "disc" in printed["title"]
     assert "bad depths" in {case["name"] for case in printed["cases"]}
     assert max(case["max_error"] for case in printed["cases"]) < 1e-5
     facts = describe(path)
-    assert facts["options"]["max_coc_px"] == 1.5 and not facts["options"]["occlusion"]
-    assert list(facts["inputs"]) == ["image", "coc_px"] and "[B, 1, H, W]" in facts["inputs"]["image"]
-    assert [file.name for file in tmp_path.iterdir()] == ["dof.onnx"]
+    assert facts["options"]["max_coc_px"] == 2.0 and not facts["options"]["occlusion"]
+    assert list(facts["inputs"]) == ["image", "coc_px"] and "[B, 3, H, W]" in facts["inputs"]["image"]
+    assert [file.name for file in path.parent.iterdir()] == ["dof.onnx"]
 
 
 def test_show_prints_units_camera_table_and_options(plain: Any) -> None:

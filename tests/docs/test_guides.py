@@ -4,7 +4,11 @@ import importlib.metadata
 import re
 import runpy
 import shlex
+import shutil
+import tomllib
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -14,13 +18,16 @@ from typer.testing import CliRunner
 import torchdof
 from torchdof.cli import main
 from torchdof.cli.main import app
+from torchdof.fit.lens import Lens
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.reference.metrics import display, psnr
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 RUN = [ROOT / "README.md", ROOT / "docs" / "speed.md", *sorted((ROOT / "docs" / "guides").glob("*.md"))]
-RUN += [ROOT / "docs" / f"{name}.md" for name in ("index", "datasets", "depth", "shapes")]
+RUN += [
+    ROOT / "docs" / f"{name}.md" for name in ("index", "datasets", "depth", "embedding", "measuring", "phone", "shapes")
+]
 """Pages whose blocks are run from top to bottom, but for those below a comment that says why not."""
 
 _BLOCK = re.compile(r"(?P<skip><!-- not run: [^\n]+ -->\n)?^```(?P<kind>sh|python)\n(?P<text>.*?)^```$", re.M | re.S)
@@ -73,14 +80,60 @@ def given(folder: Path) -> dict[str, Any]:
     }
 
 
+def captures_of_measuring(folder: Path, simulator: ModuleType) -> None:
+    """The photographs that the manifest of docs/measuring.md names, by the camera that it states."""
+    text = _text_block("measuring.md", "toml")
+    said = tomllib.loads(text)
+    camera = torchdof.Camera(*(said[name] for name in ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")))
+    width, lens = 640, folder / "my-lens"
+
+    def kernel(distance_m: float) -> tuple[str, dict[str, float]]:
+        return "disc", {"radius": float(camera.coc_px(torch.full((1, 1, 1, 1), distance_m), width).abs())}
+
+    dot = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0)
+    simulator.write_captures(
+        lens, dot, said["focus_m"], [shot["distance_m"] for shot in said["shot"]], kernel, width, height=240
+    )
+    for path in lens.glob("*.png"):
+        write_image(path.with_suffix(".tif"), Picture(read_image(path).pixels), said["transfer"], "16")
+        path.unlink()
+    assert {path.name for path in lens.glob("*.tif")} == {said["sharp"], *(shot["file"] for shot in said["shot"])}
+    (lens / "capture.toml").write_text(text)
+
+
+def photographs_of_a_phone(folder: Path, simulator: ModuleType) -> None:
+    """Two of the target, one of them in focus."""
+    simulator.write_photographs(folder / "photographs", 0.2, [0.45], width=500, tone=0.0, noise=0.003, jpeg=97)
+
+
+STAND_INS: dict[str, Callable[[Path, ModuleType], None]] = {
+    "docs/measuring.md": captures_of_measuring,
+    "docs/phone.md": photographs_of_a_phone,
+}
+
+
+def _text_block(page: str, kind: str) -> str:
+    (block,) = re.findall(rf"^```{kind}\n(.*?)^```$", (ROOT / "docs" / page).read_text(), re.M | re.S)
+    return str(block)
+
+
 @pytest.mark.parametrize("name", _names(RUN))
 def test_blocks_of_a_guide_run_from_top_to_bottom(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    request: pytest.FixtureRequest,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for folder in ("examples", "tests"):
         (tmp_path / folder).symlink_to(ROOT / folder)
     names = given(tmp_path)
+    if name in STAND_INS:
+        STAND_INS[name](tmp_path, request.getfixturevalue("simulator"))
+    if name == "docs/embedding.md":
+        shutil.copyfile(request.getfixturevalue("plain").path, "dof.onnx")
+        names |= {key: names[key].numpy() for key in ("image", "depth")}
     blocks = [match for match in _BLOCK.finditer((ROOT / name).read_text()) if not match["skip"]]
     assert blocks
     for block in blocks:
@@ -89,6 +142,13 @@ def test_blocks_of_a_guide_run_from_top_to_bottom(
         else:
             for words in commands_of(block["text"]):
                 run_command(words)
+
+
+def test_the_prescription_that_measuring_shows_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "lens.txt"
+    path.write_text(_text_block("measuring.md", "text"))
+    lens = Lens.read(path)
+    assert len(lens.radius) == 8 and lens.stop == 4 and lens.conic is not None and lens.glass is not None
 
 
 @pytest.mark.parametrize("name", _names(PAGES))

@@ -1,11 +1,12 @@
 """The demo's pictures, of stereo depth: how many pixels stick out of what is blurred."""
 
+import json
+import math
 import runpy
 import sys
 from pathlib import Path
 
 import pytest
-import torch
 import torch.nn.functional as functional
 
 from torchdof.depth.reading import read_depth
@@ -22,10 +23,10 @@ MOST = {"near": 680, "middle": 1070, "far": 390}
 def test_few_pixels_stick_out_of_what_is_blurred(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["demo.py", "--data", str(DATA), "--out", str(tmp_path)])
     demo = runpy.run_path(str(ROOT / "examples" / "demo.py"), run_name="__main__")
-    scale, offset = demo["BASELINE_M"] * demo["FOCAL_PX"], demo["DISPARITY_OFFSET_PX"]
-    depth = read_depth(DATA / "motorcycle_disp.npz", kind="disparity", scale=scale, offset=offset, fill="far")
+    known = json.loads((DATA / "camera.json").read_text())
+    depth = read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
     width = depth.shape[-1]
-    fov_x_deg = float(torch.rad2deg(2 * torch.atan(torch.tensor(width / 2 / demo["FOCAL_PX"]))))
+    fov_x_deg = math.degrees(2 * math.atan(width / 2 / known["focal_length_px"]))
     for name, focus_m in demo["FOCUS_M"].items():
         shown = display(read_image(tmp_path / f"{name}.png").pixels).mean(1, keepdim=True)
         around = functional.unfold(functional.pad(shown, (1,) * 4, mode="replicate"), 3)

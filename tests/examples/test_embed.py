@@ -22,7 +22,7 @@ DATA = ROOT / "examples" / "data" / "motorcycle"
 EMBED = ROOT / "examples" / "embed"
 NODE_FOLDER = Path(os.environ.get("TORCHDOF_NODE_FOLDER", ROOT / "build" / "node"))
 FOCUS_M, F_NUMBER = 2.3, 1.2
-SCALE, OFFSET = 192.03, 31.086  # of the disparity
+DISPARITY = json.loads((DATA / "camera.json").read_text())["depth"]
 
 
 def header_folder() -> Path | None:
@@ -51,7 +51,7 @@ def crop() -> tuple[np.ndarray, np.ndarray]:
     """A piece of the photograph, 8-bit sRGB ``[H, W, 3]``, and its depth in whole millimetres ``[H, W, 1]``."""
     piece = np.s_[150:246, 300:428]
     disparity = np.load(DATA / "motorcycle_disp.npz")["arr_0"][piece][..., None]
-    depth_mm = np.where(np.isfinite(disparity), 1000 * SCALE / (disparity + OFFSET), 0)
+    depth_mm = np.where(np.isfinite(disparity), 1000 * DISPARITY["scale"] / (disparity + DISPARITY["offset"]), 0)
     return np.rint(255 * pixels(DATA / "motorcycle_left.png")[piece]).astype(np.uint8), np.rint(depth_mm).astype(
         np.uint16
     )
@@ -82,7 +82,10 @@ def test_python_needs_no_torch(plain: Any, tmp_path: Path) -> None:
     call = [sys.executable, str(EMBED / "run_onnx.py"), str(plain.path)]
     call += [str(DATA / "motorcycle_left.png"), str(DATA / "motorcycle_disp.npz"), str(tmp_path / "out.png")]
     call += ["--focus-m", str(FOCUS_M), "--f-number", str(F_NUMBER)]
-    told = run([*call, "--disparity-scale", str(SCALE), "--disparity-offset", str(OFFSET)], environment)
+    told = run(
+        [*call, "--disparity-scale", str(DISPARITY["scale"]), "--disparity-offset", str(DISPARITY["offset"])],
+        environment,
+    )
     assert "741 x 500" in told and "'disc'" in told
     sharp, blurred = (pixels(path)[..., :3] for path in (DATA / "motorcycle_left.png", tmp_path / "out.png"))
     assert sharp.shape == blurred.shape

@@ -150,7 +150,10 @@ def test_a_crop_and_its_gradients_are_measured(small: None) -> None:
     assert figures[0].value > 0 and figures[2].value > 1
 
 
-def test_it_prints_and_writes_every_figure(small: None, tmp_path: Path) -> None:
+def test_it_prints_and_writes_every_figure(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    blurs = {"_RADII": (2.0, 4.0, 6.0, 8.0), "_USUAL_PX": 4.0, "_WIDE_PX": 8.0, "_FOLD_PX": 16}
+    for name, value in blurs.items():
+        monkeypatch.setattr(goals, name, value)
     shutil.copytree(DATA / "room", tmp_path / "scenes" / "room")
     result = run(tmp_path / "scenes", "--repeat", 1, "--out", tmp_path)
     assert result.exit_code == 0, result.output
@@ -185,7 +188,7 @@ def test_it_prints_and_writes_every_figure(small: None, tmp_path: Path) -> None:
     ],
 )
 def test_bad_arguments_are_refused(
-    arguments: list[object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    arguments: list[object], message: str, small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     result = run(*arguments)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -44,6 +45,20 @@ def test_a_wrong_shape_is_named(plain: Any, name: str, shape: tuple[int, ...]) -
     feed[name] = np.ones(shape)
     with pytest.raises(Exception, match=f"{name}_must_have_one_item_or_as_many_as_image"):
         runner.run(None, {key: np.asarray(value, np.float32) for key, value in feed.items()})
+
+
+def test_sizes_can_be_fixed_by_the_runtimes_tool(plain: Any, tmp_path: Path) -> None:
+    tools = pytest.importorskip("onnxruntime.tools.onnx_model_utils")
+    model = onnx.load(plain.path)
+    for name, number in (("B", 1), ("B_or_1", 1), ("H", 20), ("W", 31)):
+        tools.make_dim_param_fixed(model.graph, name, number)
+    onnx.save(model, tmp_path / "fixed.onnx")
+    runner = onnxruntime.InferenceSession(tmp_path / "fixed.onnx", providers=["CPUExecutionProvider"])
+    assert runner.get_inputs()[0].shape == [1, 3, 20, 31] and runner.get_inputs()[1].shape == [1, 1, 20, 31]
+    tensors = torch.rand(1, 3, 20, 31), 1.0 + 4.0 * torch.rand(1, 1, 20, 31), *LENS
+    names = [value.name for value in runner.get_inputs()]
+    (out,) = runner.run(None, {name: tensor.numpy() for name, tensor in zip(names, tensors, strict=True)})
+    assert torch.equal(torch.from_numpy(out), plain.render(*tensors))
 
 
 def test_loading_says_nothing(layered: Any, capfd: pytest.CaptureFixture[str]) -> None:

@@ -25,7 +25,7 @@ def scene() -> list[torch.Tensor]:
     depth = depth + 0.2 * torch.rand(2, 1, 45, 71)
     depth[:, :, 20:30, 30:40] = 1.3
     depth[0, 0, 5, 6] = torch.nan
-    return [torch.rand(2, 3, 45, 71), depth, torch.tensor([1.5, 3.0]), torch.tensor([0.022, 0.03])]
+    return [torch.rand(2, 3, 45, 71), depth, torch.tensor([1.5, 3.0]), torch.tensor([0.7, 1.0])]
 
 
 def compare(exported: Any, tensors: list[torch.Tensor], got: np.ndarray) -> None:

@@ -6,6 +6,7 @@ pixels. Both pictures are in linear light.
 
 from __future__ import annotations
 
+import inspect
 import io
 from dataclasses import dataclass
 
@@ -198,7 +199,8 @@ def write_captures(
 ):
     """A folder of 16-bit sRGB PNGs with its capture.toml: the dot in the frame's centre, and wherever `grid` says.
 
-    `kernel(distance)` gives (family, params); `camera` is a `Simulator` whose window is ignored.
+    `kernel(distance)` gives (family, params), `kernel(distance, x, y)` that of the dot at a place in the sharp picture;
+    `camera` is a `Simulator` whose window is ignored.
     """
     from dataclasses import replace
 
@@ -207,15 +209,18 @@ def write_captures(
     from torchdof.io.images import Picture, write_image
 
     folder.mkdir(parents=True, exist_ok=True)
-    places = grid or [(0.0, 0.0)]
+    places, across = grid or [(0.0, 0.0)], len(inspect.signature(kernel).parameters) == 3
     shots = []
     for i, distance in enumerate([focus_m, *distances]):
         m = focus_m / distance
         light = np.zeros((height, width))
         for x, y in places:
             square = draw_dot(max(width, height) + 1, camera.dot_radius * m, (x * m, y * m), oversample=8)
-            light += _centre(square, height, width)
-        if distance != focus_m:
+            dot = _centre(square, height, width)
+            if distance != focus_m and across:
+                dot = blur(dot, *kernel(distance, x, y))
+            light += dot
+        if distance != focus_m and not across:
             light = blur(light, *kernel(distance))
         picture = replace(camera, **harm).record(camera.level * light, np.random.default_rng(100 + i))
         name = f"{round(distance * 1000):04d}mm.png"

@@ -1,5 +1,7 @@
 """Inputs made from others, by a seeded random generator: bytes and the structure that a checksum would protect."""
 
+import base64
+import binascii
 import random
 import re
 import struct
@@ -11,6 +13,7 @@ _WORDS = [b"", b"0", b"-1", b"1", b"nan", b"inf", b"-inf", b"1e308", b"-1e308", 
           b'"x"', b"[]", b"{}", b"[[1]]", b"\x00", b"\xff\xfe", b"../x", b"/dev/null", b"/"]  # fmt: skip
 _NUMBERS = [0, 1, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1]
 _FLOATS = [0.0, -0.0, 1e-45, 1e-38, 1.0, 2e9, 2e19, 1e30, 3.4e38, -1.0, -1e30, float("inf"), float("nan"), 0.5, 64.0]
+_PACKED = re.compile(rb'"light": "([A-Za-z0-9+/=]+)"')
 _TOKEN = re.compile(rb'-?\d[\d.eE+-]*|"[^"]*"|[a-z_]+')
 
 
@@ -19,9 +22,11 @@ def mutated(content: bytes, others: list[bytes], suffix: str, rng: random.Random
     made = content
     for _ in range(rng.choice((1, 1, 1, 2, 3, 6))):
         kinds = [_bytes, _bytes, _number, _cut, _splice, _repeat]
-        if suffix in (".json", ".toml", ".txt"):
+        if suffix in (".json", ".toml", ".txt", ".zmx"):
             kinds += [_token] * 12
-        elif suffix == ".scene":
+        if suffix == ".json" and _PACKED.search(made):
+            kinds += [_packed] * 3
+        if suffix == ".scene":
             kinds += [_float] * 12
         made = rng.choice(kinds)(made, others, rng)
     if suffix == ".png" and rng.random() < 0.8:
@@ -67,6 +72,19 @@ def _token(content: bytes, _: list[bytes], rng: random.Random) -> bytes:
     token = rng.choice(tokens)
     word = rng.choice([*_WORDS, rng.choice(tokens).group(), repr(rng.choice(_FLOATS)).encode()])
     return content[: token.start()] + word + content[token.end() :]
+
+
+def _packed(content: bytes, others: list[bytes], rng: random.Random) -> bytes:
+    """Other numbers in what is deflated and told as text."""
+    found = _PACKED.search(content)
+    try:
+        numbers = zlib.decompress(base64.b64decode(found.group(1), validate=True)) if found else b""
+    except (binascii.Error, zlib.error):
+        numbers = b""
+    if found is None or not numbers:
+        return content
+    numbers = rng.choice((_bytes, _bytes, _number, _cut, _repeat))(numbers, others, rng)
+    return content[: found.start(1)] + base64.b64encode(zlib.compress(numbers)) + content[found.end(1) :]
 
 
 def _float(content: bytes, _: list[bytes], rng: random.Random) -> bytes:

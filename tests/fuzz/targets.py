@@ -1,4 +1,4 @@
-"""What is fuzzed: every reader of a file, and the compiled engine; each with whole inputs to start from.
+"""What is fuzzed: every reader of a file, and both engines' rendering and repair; each with whole inputs to start from.
 
 A target takes a file and may refuse it with its own errors, in one sentence that names the file. Anything else is a
 finding: another exception, a crash, a line that a library prints, a picture that is not finite, too long or too large.
@@ -18,12 +18,15 @@ import OpenImageIO as oiio
 import torch
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.depth import read_depth
+from torchdof.depth import edges, read_depth
 from torchdof.export import describe
 from torchdof.fit import FitError, read_captures
 from torchdof.fit.lens.lens import Lens
+from torchdof.fit.lens.spot import focus_sensor, point_spread
 from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.io.metadata import camera_facts
+from torchdof.optics.aperture import Aperture
+from torchdof.optics.field import Field
 
 REFUSED = (ValueError, OSError, FitError)
 
@@ -152,6 +155,9 @@ def _table_seeds(folder: Path) -> None:
         BlurTable.load(name).save(folder / f"{name}.json")
     soft = {"radius": [0.01, 0.02], "sigma": [0.003, 0.001], "b": [1.0, 0.0], "m": [2.0, 8.0]}
     BlurTable("softm", [-0.01, 0.02], soft, unit="mm", sensor_width_mm=36.0).save(folder / "soft.json")
+    BlurTable.polygon(5, 12.0, 0.3, squeeze=1.5, vignetting=(0.3, 0.1)).save(folder / "polygon.json")
+    opening = Aperture(rotation_deg=30.0, mask=torch.eye(5), vignetting=0.5)
+    BlurTable.gaussian().with_aperture(opening).save(folder / "mask.json")
 
 
 def _read_table(path: Path) -> None:
@@ -163,6 +169,41 @@ def _read_table(path: Path) -> None:
             assert "at most" in str(error), f"read, and then: {error}"
         else:
             assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0, "kernels that are none"
+
+
+def _field_seeds(folder: Path) -> None:
+    """Tables with small fields: what is changed in the files of large ones is mostly the light of one spot."""
+    coc, radius = torch.tensor([-0.4, 0.1, 0.5]), torch.tensor([0.0, 9.0, 20.0])
+    box = torch.tensor([0.01, 0.5, 0.4]) * (0.1 + coc.abs())[:, None, None].expand(3, 3, 3)
+    for colours, unit in ((1, "mm"), (3, "mm"), (3, "fraction")):
+        light = torch.rand(colours, 3, 3, 6, 4, generator=torch.Generator().manual_seed(colours))
+        in_unit = {"unit": "mm", "sensor_width_mm": 36.0} if unit == "mm" else {"unit": unit}
+        sigma = {"sigma": torch.full((colours, 2), 0.2)}
+        lens = BlurTable("gaussian", [-0.4, 0.5], sigma, field=Field(coc, radius, box, light), **in_unit)  # type: ignore[arg-type]
+        lens.save(folder / f"{unit}{colours}.json")
+
+
+def _read_field(path: Path) -> None:
+    table = BlurTable.load(path)
+    image = torch.linspace(0, 1, 3 * 12 * 16).reshape(1, 3, 12, 16) if table.channels in (1, 3) else None
+    if image is None:
+        return
+    image[..., 6, 8] = 50.0
+    coc = torch.linspace(-3, 4, 16).expand(1, 1, 12, 16)
+    pictures = _by_both_engines(lambda: blur_by_coc(image, coc, table=table, tolerance="preview"))
+    for picture in pictures:
+        assert torch.isfinite(picture).all(), "read, and then: light that is not finite"
+        assert float(picture.max()) <= 60.0 and float(picture.min()) >= -1e-3, "brighter than its light"
+    apart = float((pictures[0] - pictures[1]).abs().max())
+    assert apart <= 1e-3 * 50.0, f"the engines differ by {apart:.2g}"
+
+
+def _by_both_engines(make: Callable[[], torch.Tensor]) -> list[torch.Tensor]:
+    pictures = []
+    for engine in ("torch", "native"):
+        os.environ["TORCHDOF_ENGINE"] = engine
+        pictures.append(make())
+    return pictures
 
 
 def _manifest_seeds(folder: Path) -> None:
@@ -184,12 +225,30 @@ def _lens_seeds(folder: Path) -> None:
         (folder / f"{name}.txt").write_text("\n".join([f"# source: {lens.source}", *lens.lines()]) + "\n")
 
 
+def _zmx_seeds(folder: Path) -> None:
+    for name, encoding in (("double_gauss_50mm", "utf-16"), ("telephoto_250mm", "utf-8")):
+        lens = Lens.read(name)
+        text = "MODE SEQ\nNAME A lens\nUNIT MM X W X CM MR CPMM\nSURF 0\n  CURV 0\n  DISZ INFINITY\n"
+        for i, (radius, thickness, diameter) in enumerate(zip(lens.radius, lens.thickness, lens.diameter, strict=True)):
+            text += f"SURF {i + 1}\n  TYPE {'EVENASPH' if i == 1 else 'STANDARD'}\n" + "  STOP\n" * (i == lens.stop)
+            text += f"  CURV {1 / radius:.6g} 0 0\n  DISZ {thickness:.6g}\n  DIAM {diameter / 2:.6g} 1 0 0 1\n"
+            text += "  PARM 1 0\n  PARM 2 -1.5e-8\n  CONI -0.1\n" if i == 1 else ""
+            glass = "N-BK7" if i == 1 else "___BLANK"
+            text += f"  GLAS {glass} 1 0 {lens.index[i]:.6g} 50 0\n" if lens.index[i] > 1 else ""
+        text += f"SURF {len(lens.radius) + 1}\n  TYPE STANDARD\n  CURV 0\n  DISZ 0\n"
+        (folder / f"{name}.zmx").write_text(text, encoding=encoding)
+
+
 def _read_lens(path: Path) -> None:
     lens = Lens.read(path)
     try:
-        lens.paraxial()
+        sensor_mm = focus_sensor(lens, 2.0)
+        spot = point_spread(lens, 1.0, sensor_mm, field_mm=1.0, rays=200)
     except ValueError as error:
-        assert "lens" in str(error)
+        assert any(word in str(error) for word in ("lens", "focus", "object")), f"read, and then: {error}"
+    else:
+        for numbers in (sensor_mm, spot.x, spot.y, spot.weight, spot.centre, spot.pupil_mm2):
+            assert np.isfinite(numbers).all(), "rays that are no numbers"
 
 
 def _onnx_seeds(folder: Path) -> None:
@@ -265,14 +324,35 @@ def _render(path: Path) -> None:
     assert float(apart) <= 1e-3 * float(light) + 1e-37, f"the engines differ by {float(apart / light):.2g}"
 
 
+def _repair(path: Path) -> None:
+    image, coc, options = scene_of(path.read_bytes())
+    nearness = -coc
+    span = float(torch.where(torch.isfinite(coc), coc, 0.0).abs().amax())
+    step = torch.tensor(span / 8 if options["check"] else 2.0)
+    if options["normalize"]:
+        step = step.expand_as(nearness)
+    mended = _by_both_engines(lambda: edges.repair(image, nearness, step, options["occlusion"]))
+    known = torch.isfinite(nearness)
+    for name, one in zip(("plain", "compiled"), mended, strict=True):
+        assert torch.equal(torch.isfinite(one), known), f"{name}: what is known, and what is not, changes"
+        assert torch.equal(one.nan_to_num()[~known], nearness.nan_to_num()[~known]), f"{name}: what is unknown changes"
+        assert float(one[known].abs().amax() if known.any() else 0.0) <= 10.0 * span, f"{name}: far beyond the map"
+    usual = float(image.nan_to_num(0.0, 0.0, 0.0).abs().amax()) < 1e6 and span < 1e6
+    same = torch.isclose(*mended, rtol=1e-3, atol=1e-3 * span, equal_nan=True).float().mean()
+    assert not usual or float(same) > 0.9, f"the engines agree on {float(same):.2f} of the pixels"
+
+
 TARGETS: dict[str, Target] = {
     **{s[1:]: Target(s, _image_seeds(s), _read_picture) for s in (".png", ".exr", ".tif", ".jpg", ".hdr", ".pfm")},
     **{suffix[1:]: Target(suffix, _array_seeds(suffix), _read_array) for suffix in (".npy", ".npz")},
     "table": Target(".json", _table_seeds, _read_table),
     "manifest": Target(".toml", _manifest_seeds, _read_manifest, named=False),  # a picture that is not there is named
+    "field": Target(".json", _field_seeds, _read_field),
     "lens": Target(".txt", _lens_seeds, _read_lens),
+    "zmx": Target(".zmx", _zmx_seeds, _read_lens),
     "onnx": Target(".onnx", _onnx_seeds, _read_onnx),
     "engines": Target(".scene", _scene_seeds, _render, named=False),
+    "repair": Target(".scene", _scene_seeds, _repair, named=False),
 }
 
 

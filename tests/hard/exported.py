@@ -12,29 +12,23 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock
 from torch import Tensor
 
-from torchdof import Camera, DepthOfField
-from torchdof.export import to_onnx
+from torchdof import DepthOfField
 from torchdof.export.graph import Portable
 from torchdof.export.verification import session
 
 
 class Exported:
-    """One exported module, layers up to 6 pixels, and the eager module of the same layers.
+    """A file and the eager module of the same layers.
 
     Args:
-        path: The file, which is written by whoever needs it first.
-        camera: Of the cases.
+        path: The file.
+        dof: Its module.
     """
 
-    def __init__(self, path: Path, camera: Camera) -> None:
-        self.camera = camera
-        dof = DepthOfField(camera, tolerance=8 / 255, max_coc_px=6.0, check=False)
-        with FileLock(path.with_suffix(".lock")):
-            if not path.exists():
-                to_onnx(dof, path)
+    def __init__(self, path: Path, dof: DepthOfField) -> None:
+        self.camera = dof.camera
         self.session, self.portable = session(path), Portable(dof)
 
     def run(self, image: Tensor, depth: Tensor, focus_m: float, f_number: float) -> tuple[Tensor, Tensor]:

@@ -26,8 +26,8 @@ pytestmark = pytest.mark.hard
 
 
 @pytest.fixture(scope="module")
-def exported(shared_folder: Path) -> Any:
-    return exported_module.Exported(shared_folder / "hard.onnx", cases.CAMERA)
+def exported(layered: Any) -> Any:
+    return exported_module.Exported(layered.path, layered.dof)
 
 
 ROUNDED = {  # where light in front is far brighter than what shows past it, float32 rounds what it leaves

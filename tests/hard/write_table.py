@@ -17,6 +17,9 @@ from typing import Any
 import onnxruntime
 import torch
 
+from torchdof import DepthOfField
+from torchdof.export import to_onnx
+
 MARK = "## What the hard cases found"
 TYPES = {"float32": torch.float32, "float16": torch.float16}
 ENGINES = ("torch", "native")
@@ -98,7 +101,12 @@ def main() -> None:
     out = parser.parse_args().out
     cases, exported = beside("cases"), beside("exported")
     with tempfile.TemporaryDirectory() as folder:
-        file = exported.Exported(Path(folder) / "dof.onnx", cases.CAMERA)
+        path, dof = (
+            Path(folder) / "dof.onnx",
+            DepthOfField(cases.CAMERA, tolerance=8 / 255, max_coc_px=6.0, check=False),
+        )
+        to_onnx(dof, path)
+        file = exported.Exported(path, dof)
     rows = table(cases, lambda case: exported.worst_error(file, cases, case))
     head = HEAD.format(
         half=2**-11,

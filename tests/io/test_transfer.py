@@ -16,3 +16,10 @@ def test_negative_light_mirrors_positive_light() -> None:
     values = torch.linspace(0, 2, 100).reshape(1, 1, 10, 10)
     for curve in (decode, encode):
         assert torch.equal(curve(-values, "srgb", False, False), -curve(values, "srgb", False, False))
+
+
+def test_gradients_are_finite_at_black() -> None:
+    for curve in (decode, encode):
+        values = torch.tensor([0.0, -0.0, 1e-3, 0.5], dtype=torch.float64).reshape(1, 1, 1, 4).requires_grad_()
+        curve(values, "srgb", False, False).sum().backward()
+        assert values.grad is not None and bool(torch.isfinite(values.grad).all())

@@ -9,9 +9,11 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.io.transfer import encode
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
-from torchdof.render.field import layer_shares, own_kernels, placed
+from torchdof.reference.metrics import psnr
+from torchdof.render.field import BLOCK, layer_shares, own_kernels, placed
 
 CUT = Aperture(vignetting=0.4)
 TABLE = BlurTable.disc().with_aperture(CUT)
@@ -155,12 +157,66 @@ def test_in_focus_a_field_leaves_a_point_a_point() -> None:
         assert float(kernel[len(kernel) // 2, len(kernel) // 2]) > 1.0 - 1e-9
 
 
-def test_what_has_one_kernel_a_layer_refuses_cats_eyes() -> None:
-    image, coc = torch.rand(1, 3, 8, 12), torch.full((1, 1, 8, 12), 2.0)
-    with pytest.raises(ValueError, match="method='fold' has one kernel a blur radius"):
-        blur_by_coc(image, coc, table=TABLE, method="fold")
-    with pytest.raises(ValueError, match="take a table without vignetting"):
-        blur_by_coc(image, coc, table=TABLE, attention=(4.0, 4.0, 2.0))
+@pytest.mark.parametrize("colours", [1, 3])
+def test_fold_scatters_each_pixel_with_the_kernel_of_its_own_place(colours: int) -> None:
+    height, width, coc_px, table = 48, 72, -3.3, lopsided(colours)
+    image = torch.zeros(1, 3, height, width, dtype=torch.float64)
+    row, column = 13, 55
+    image[0, :, row, column] = torch.tensor([1.0, 2.0, 3.0])
+    coc = torch.full((1, 1, height, width), coc_px, dtype=torch.float64)
+    picture = blur_by_coc(image, coc, table=table, method="fold", occlusion=False, normalize=False)[0]
+    own = own_kernels(table, number(coc_px)[None], width)
+    diagonal = 0.5 * math.hypot(height, width)
+    y, x = (number((p + 0.5 - n / 2) / diagonal)[None] for p, n in ((row, height), (column, width)))
+    kernel = placed(own, [(layer_shares(table, coc_px, 1, (height, width)), number(1.0))], y, x)[0]
+    half = kernel.shape[-1] // 2
+    around = picture[:, row - half : row + half + 1, column - half : column + half + 1]
+    assert_close(around, kernel * image[0, :, row, column, None, None], rtol=0, atol=1e-12)
+    assert float(picture.sum()) == pytest.approx(6.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("table", "occlusion"),
+    [(BlurTable.disc().with_aperture(Aperture(vignetting=0.8)), True), (lopsided(3), False)],
+    ids=["cat's eyes", "a field of three colours"],
+)
+def test_layers_are_the_literal_scatter_but_for_what_blocks_share(
+    table: BlurTable, occlusion: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = torch.rand(1, 3, 16, 24, generator=torch.Generator().manual_seed(3))
+    image = torch.nn.functional.interpolate(image, (64, 96), mode="bicubic").clamp(0.0, 1.0)
+    coc = torch.linspace(-4.0, 2.0, 96).expand(1, 1, 64, 96).contiguous()
+    with torch.no_grad():
+        literal, plain = (
+            blur_by_coc(image, coc, table=t, method="fold", occlusion=occlusion) for t in (table, BlurTable.disc())
+        )
+        for engine in ("native", "torch"):
+            monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+            layered = blur_by_coc(image, coc, table=table, occlusion=occlusion)
+            assert psnr(layered, literal) > 44.0
+            assert psnr(plain, literal) < 32.0
+
+
+def test_no_seam_shows_between_blocks() -> None:
+    y, x = torch.meshgrid(torch.arange(240.0), torch.arange(720.0), indexing="ij")
+    image = ((x + 0.3 * y) % 61.0 - 12.5).clamp(0.0, 1.0)[None, None] * 0.8 + 0.1  # slanted bars
+    aperture = Aperture(vignetting=0.8)
+    picture = blur_by_coc(image, torch.full_like(image, -8.0), table=BlurTable.disc().with_aperture(aperture))
+    shown = encode(picture, "srgb", has_alpha=False, straight=False)
+    third = shown[..., 3:] - 3.0 * shown[..., 2:-1] + 3.0 * shown[..., 1:-2] - shown[..., :-3]  # twice a step
+    at_border = (torch.arange(third.shape[-1]) + 2) % BLOCK[1] == 0
+    seams, elsewhere = (float(third[..., part].square().mean()) for part in (at_border, ~at_border))
+    assert 0.5 * math.sqrt(max(seams - elsewhere, 0.0)) < 1.5 / 255
+
+
+def test_where_the_viewer_looks_and_elsewhere_the_frame_keeps_its_tolerance() -> None:
+    image, coc = torch.rand(1, 3, 40, 60), torch.full((1, 1, 40, 60), 2.0)
+    looked_at = blur_by_coc(image, coc, table=TABLE, attention=(4.0, 4.0, 2.0))
+    assert torch.equal(looked_at, blur_by_coc(image, coc, table=TABLE))
+
+
+def test_a_graph_refuses_cats_eyes() -> None:
+    image = torch.rand(1, 3, 8, 12)
     dof = DepthOfField(Camera(), TABLE, check=False, depth_edges="as given")
     with pytest.raises(Exception, match="take a table without vignetting"):
         torch.export.export(dof, (image, torch.ones(1, 1, 8, 12)), strict=False)

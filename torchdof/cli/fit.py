@@ -15,11 +15,13 @@ from rich.table import Table
 from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.arguments import AsJson
 from torchdof.cli.printed import json_line
+from torchdof.fit.photo.across import table_of_dots
 from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
 from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.photo.target import SQUARE_MM, Paper, write_target
 from torchdof.fit.problems import FitError, FitWarning
+from torchdof.validation import number
 
 __all__ = ["fit"]
 
@@ -48,9 +50,9 @@ def fit(
         float, typer.Option(help="PSNR on a natural image that auto asks for.", rich_help_panel=_CAPTURE)
     ] = 45.0,
     dots: Annotated[
-        Literal["manifest", "one", "centre", "each"],
+        Literal["manifest", "one", "centre", "each", "field"],
         typer.Option(
-            help="One dot; the centre of a grid; or each dot of it, one table a field position.",
+            help="One dot; the centre of a grid; each dot of it, a table a place; or one table across the field.",
             rich_help_panel=_CAPTURE,
         ),
     ] = "manifest",
@@ -72,7 +74,7 @@ def fit(
     root: Annotated[
         Path | None,
         typer.Option(
-            help="Folder that capture.toml and all its pictures must lie in; by default they may lie anywhere.",
+            help="Folder that capture.toml and all pictures must lie in; by default they may lie anywhere.",
             rich_help_panel=_CAPTURE,
         ),
     ] = None,
@@ -143,7 +145,7 @@ def fit(
             _draw_table(table, plots, out.stem, console)
         return
     if captures is not None and captures.is_dir() and not (captures / MANIFEST).is_file():
-        photographs = read_photographs(captures, square_mm=square_mm)
+        photographs = read_photographs(captures, square_mm=square_mm, root=root)
         _tell(photographs, console)
         command = f"torchdof fit {captures.name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(photographs.captures, family, accuracy_db, command, None, console)
@@ -161,6 +163,8 @@ def fit(
         root=root,
     )
     first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
+    across = capture_sets[0].notes["dots"] == "field"
+    fitted = []
     for i, capture_set in enumerate(capture_sets):
         table_file = out if len(capture_sets) == 1 else out.with_name(f"{out.stem}_{i:02d}.json")
         if len(capture_sets) > 1:
@@ -168,13 +172,17 @@ def fit(
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
         first = first or result
+        fitted.append((capture_set, result))
         _summary(capture_set, result, messages, console)
-        _write(result.table, table_file, console)
+        if not across:
+            _write(result.table, table_file, console)
         if as_json:
             typer.echo(json_line({"out": str(table_file), **_facts(capture_set, result, messages)}))
         if plots is not None:
             _draw_fits(capture_set, result, plots, table_file.stem, console)
             _draw_table(result.table, plots, table_file.stem, console)
+    if across:
+        _write(table_of_dots(fitted), out, console)
 
 
 def _trace(
@@ -197,7 +205,8 @@ def _trace(
     if not 0 <= field_deg < 90:
         raise FitError(f"--field-deg must be 0 to 90 degrees from the axis, got {field_deg:g}")
     focal = lens.paraxial().focal_length
-    image_mm = focal if math.isinf(focus_m) else focal / (1 - focal / 1000 / focus_m)
+    number("--focus-m", focus_m, low=focal / 1000, unit="metres", infinite=True)
+    image_mm = focal / (1 - focal / 1000 / focus_m)
     with console.status("tracing the lens"):
         return trace_table(
             lens,

@@ -49,9 +49,10 @@ def _divide(colour: Tensor, alpha: Tensor) -> Tensor:
 def _srgb_to_linear(encoded: Tensor) -> Tensor:
     """IEC 61966-2-1; negative values by symmetry."""
     size = encoded.abs()
-    return torch.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4) * encoded.sign()
+    return torch.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4).copysign(encoded)
 
 
 def _linear_to_srgb(linear: Tensor) -> Tensor:
     size = linear.abs()
-    return torch.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055) * linear.sign()
+    curved = 1.055 * size.clamp_min(0.0031308) ** (1 / 2.4) - 0.055  # of 0 the root's gradient would be infinite
+    return torch.where(size <= 0.0031308, size * 12.92, curved).copysign(linear)

@@ -291,7 +291,7 @@ def _check(name: str, value: Any, low: float, high: float) -> None:
         good = value.ndim == 0 and value.is_floating_point()
     else:
         good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or not low <= _plain(value) <= high:
+    if not good or not low <= value <= high:
         raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {show(value)}")
 
 

@@ -20,6 +20,7 @@ UNITS = ("fraction", "mm", "relative")
 _MOST_NODES = 4096
 _COC_RANGE = (1e-9, 1e6)
 _WIDEST = 1e4  # times the circle of confusion; a blur that is not of the focus shows at small ones
+_SMALLEST, _LARGEST = 1e-100, 1e100  # of parameters: their sums and products are numbers too
 _STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
 _SEEN_PX = 1.5  # around a spot, in which pixels see some of it
 _RIM_POWER = 4.0  # of the radius, with which a rim grows
@@ -496,9 +497,10 @@ class BlurTable:
             low = -1.0 if name == "b" else 0.0
             if bool((value < low).any()):
                 raise ValueError(f"params.{name} must be >= {low:g}, got {float(value.min()):g}")
-            if name == "m" and bool((value > _STEEPEST).any()):
-                raise ValueError(f"params.m must be <= {_STEEPEST:g}, got {float(value.max()):g}")
-            if name == "values" and (value.shape[-1] < 2 or bool((value.sum(-1) == 0).any())):
+            high = _STEEPEST if name == "m" else _LARGEST
+            if bool((value > high).any()):
+                raise ValueError(f"params.{name} must be <= {high:g}, got {float(value.max()):g}")
+            if name == "values" and (value.shape[-1] < 2 or bool((value.amax(-1) < _SMALLEST).any())):
                 raise ValueError("params.values must hold at least two values a node, not all of them 0")
             checked[name] = value
         channels = max(v.shape[0] for v in checked.values())
@@ -519,6 +521,20 @@ class BlurTable:
             raise ValueError("a table with a field must state its unit as 'fraction' (of the image's width) or 'mm'")
         if field.channels != self.channels:
             raise ValueError(f"field must have {self.channels} channels, as params have, got {field.channels}")
+        low, high = _COC_RANGE
+        for name, ends in (("coc", field.coc[[0, -1]].abs()), ("radius", field.radius[-1:])):
+            if not low <= float(ends.min()) <= float(ends.max()) <= high:
+                raise ValueError(
+                    f"field.{name} must reach somewhere from {low:g} to {high:g} ({self.unit}), "
+                    f"got {' and '.join(f'{end:g}' for end in ends.tolist())}"
+                )
+        for side in (field.coc[field.coc <= 0], field.coc[field.coc >= 0]):
+            largest, reach = float(side.abs().max()), float(field.reach(side).max())
+            if reach > _WIDEST * largest:
+                raise ValueError(
+                    "field.box must be lengths in the unit of field.coc, got such as "
+                    f"reach to {reach:g} where coc is {largest:g}"
+                )
         return field
 
     def _try_kernels(self) -> None:

@@ -28,7 +28,7 @@ from ..validation import real_tensor, show
 __all__ = ["Field"]
 
 _STEPS = 65535  # that the brightest cell of a spot counts in a file
-_MOST_CELLS = 2**28  # in a file
+_MOST_CELLS = 2**25  # in a file
 _LIT = 1e-3  # of the brightest cell
 _LEAST_SIDE = 1e-6  # of the largest box: a spot has a size
 

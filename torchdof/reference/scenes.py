@@ -24,13 +24,17 @@ from torch import Tensor
 from ..optics.camera import Camera
 from .lens_samples import spread_points
 
-__all__ = ["Plane", "Scene", "camera_of", "plane_scene", "posts", "read_scenes", "waves"]
+__all__ = ["Plane", "Rays", "Scene", "camera_of", "plane_scene", "plane_views", "posts", "read_scenes", "waves"]
 
 Light = Callable[[Tensor, Tensor], Tensor]
 """Linear light ``[C, ...]`` at places x, y ``[...]``, in pixels of the frame."""
 
 Shape = Callable[[Tensor, Tensor], Tensor]
 """Whether a surface is there (bool ``[...]``) at places x, y ``[...]``, in pixels of the frame."""
+
+Rays = Callable[[int, Tensor, Tensor], tuple[Sequence[tuple[Tensor, Tensor]], Tensor]]
+"""The n-th ray of each place x, y ``[...]``, in pixels of the frame, back into the scene: where the sharp image shows
+what it meets of each plane, far to near (x, y ``[...]``), and the light it carries ``[...]``, 0 where it is stopped."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,11 +180,16 @@ def plane_scene(
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in size), indexing="ij")
     rho, angle = spread_points(samples)
     points = torch.stack([rho * angle.cos(), rho * angle.sin()], -1).tolist()
-    index = torch.arange(samples, dtype=torch.float64)
-    # Additive recurrences keep place in the pixel and point of the lens apart.
-    places = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1).tolist()
-    sharp, covers = _average(planes, x, y, places, [(0.0, 0.0)] * samples, cocs)
-    truth, _ = _average(planes, x, y, places, points, cocs)
+
+    def pinhole(_: int, x: Tensor, y: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
+        return [(x, y)] * len(planes), torch.ones_like(x)
+
+    def thin_lens(i: int, x: Tensor, y: Tensor) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
+        ux, uy = points[i]
+        return [(x - coc * ux, y - coc * uy) for coc in cocs], torch.ones_like(x)
+
+    sharp, covers = _average(planes, x, y, pinhole, samples)
+    truth, _ = _average(planes, x, y, thin_lens, samples)
     depth = torch.full((height, width), math.inf, dtype=torch.float64)
     surfaces = []
     for plane, cover in zip(planes, covers, strict=True):
@@ -192,26 +201,43 @@ def plane_scene(
     return Scene(name, *images, margin_px, tuple(surfaces))
 
 
-def _average(
-    planes: Sequence[Plane],
-    x: Tensor,
-    y: Tensor,
-    places: Sequence[Sequence[float]],
-    points: Sequence[Sequence[float]],
-    cocs: Sequence[float],
-) -> tuple[Tensor, list[Tensor]]:
+def plane_views(
+    planes: Sequence[Plane], rays: Rays, size: tuple[int, int], window: tuple[slice, slice], samples: int = 256
+) -> Tensor:
+    """A part of what a lens makes of planes, ray by ray: the truth where the lens is not the same all over the frame.
+
+    Args:
+        planes: As :func:`plane_scene` takes them.
+        rays: Of the lens, such as :func:`torchdof.fit.lens.views.rays_of` traces.
+        size: Height and width of the frame.
+        window: Rows and columns of the part.
+        samples: Rays a pixel.
+
+    Returns:
+        ``[1, C, rows, columns]``, linear light: the mean of what rays see, so a white plane is white everywhere.
+    """
+    planes = sorted(planes, key=lambda plane: -plane.depth_m)
+    axes = (torch.arange(n, dtype=torch.float64)[part] + 0.5 for n, part in zip(size, window, strict=True))
+    y, x = torch.meshgrid(*axes, indexing="ij")
+    return _average(planes, x, y, rays, samples)[0].float()[None]
+
+
+def _average(planes: Sequence[Plane], x: Tensor, y: Tensor, rays: Rays, samples: int) -> tuple[Tensor, list[Tensor]]:
     """Mean light ``[C, H, W]`` of what is seen, and premultiplied light and cover of each plane ``[C + 1, H, W]``."""
-    total, wholes = torch.zeros(()), [torch.zeros(()) for _ in planes]
-    for (px, py), (ux, uy) in zip(places, points, strict=True):
+    index = torch.arange(samples, dtype=torch.float64)
+    # Additive recurrences keep place in the pixel and point of the lens apart.
+    places = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1).tolist()
+    total, carried, wholes = torch.zeros(()), torch.zeros(()), [torch.zeros(()) for _ in planes]
+    for i, (px, py) in enumerate(places):
         seen = torch.zeros(())
-        for k, (plane, coc) in enumerate(zip(planes, cocs, strict=True)):
-            place = (x + px - coc * ux, y + py - coc * uy)
+        met, weight = rays(i, x + px, y + py)
+        for k, (plane, place) in enumerate(zip(planes, met, strict=True)):
             light = plane.light(*place)
             is_covered = torch.ones_like(x, dtype=torch.bool) if plane.shape is None else plane.shape(*place)
             seen = torch.where(is_covered, light, seen)
-            wholes[k] = wholes[k] + torch.cat([light * is_covered, is_covered[None]])
-        total = total + seen
-    return total / len(places), [whole / len(places) for whole in wholes]
+            wholes[k] = wholes[k] + weight * torch.cat([light * is_covered, is_covered[None]])
+        total, carried = total + weight * seen, carried + weight
+    return total / carried, [whole / carried for whole in wholes]
 
 
 def waves(seed: int, mean: Sequence[float] = (0.4, 0.4, 0.4), contrast: float = 0.8, shortest_px: float = 6.0) -> Light:

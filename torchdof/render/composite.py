@@ -106,7 +106,8 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Ten
     light = frame.surfaces[0].light
     each = kernels.shape[1]
     light = torch.cat([light, torch.ones_like(light[:, :each])], 1)
-    summed = fold(light, kernels.repeat(1, min(2, each), 1, 1), halo, weights)
+    shares = None if blurs[0].shares is None else [b.shares for b in blurs if b.shares is not None]
+    summed = fold(light, kernels.repeat(1, min(2, each), 1, 1), halo, weights, shares, frame.size)
     summed = summed[..., : frame.size[0], : frame.size[1]]
     return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
 
@@ -181,7 +182,11 @@ def _scattered(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: lis
     terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1, -1) for term in layers[: 2 + visibility]], 1)
     terms, kinds = downsampled(terms.flatten(1, 2), scale), terms.shape[1]
     if shares is not None:  # one layer
-        scattered = field.scattered(shares, terms, blurs[group[0]].kernel, half, scale, frame.size)
+        kernel = blurs[group[0]].kernel
+        if scatter is fold:
+            scattered = fold(terms, kernel.repeat(kinds // each, 1, 1), half, None, [shares], frame.size)
+        else:
+            scattered = field.scattered(shares, terms, kernel, half, scale, frame.size)
         return scattered.unflatten(1, (kinds, 1))
     kernels = blurs[group[0]].kernel
     if len(group) > 1 or each > 1:

@@ -4,7 +4,8 @@ Where a foreground blurs, what is behind it shows through, and no pixel of the i
 with a weight so small that it speaks only where nothing visible does.
 """
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,12 +17,22 @@ from .downsampling import downsampled
 from .exporting import exported_graph
 from .matting import NEVER_PX
 
-__all__ = ["BEHIND_STEP", "HIDDEN_WEIGHT", "behind_pixels", "behind_size", "fill_hidden"]
+__all__ = [
+    "BEHIND_PX",
+    "BEHIND_STEP",
+    "HIDDEN_WEIGHT",
+    "Level",
+    "Looking",
+    "behind_pixels",
+    "behind_size",
+    "fill_hidden",
+    "search",
+]
 
 HIDDEN_WEIGHT = 0.003
 """Weight of a hidden sample against 1 of a visible one."""
 
-_BEHIND_PX = 1.0  # a hidden surface lies about so much farther, in coc: from half a pixel less to half a pixel more
+BEHIND_PX = 1.0  # a hidden surface lies about so much farther, in coc: from half a pixel less to half a pixel more
 _FALL = 0.35  # weight of a level of the pyramid against the finer one before
 _FINE_LEVELS = 2  # of the pyramid that each pixel looks at; the coarser ones are looked at from cells as large as these
 _SURE = 0.1  # weight of what a level shows from which on it has a whole vote
@@ -34,7 +45,7 @@ Samples = Iterable[tuple[Tensor, Tensor]]
 """Samples around places, ``[P, C + 2]`` or maps ``[B, C + 2, h, w]``, and their shares of the linear mean of them."""
 
 
-class _Level(NamedTuple):
+class Level(NamedTuple):
     """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
 
     ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
@@ -47,9 +58,25 @@ class _Level(NamedTuple):
     least_px: float
 
 
+class Looking(NamedTuple):
+    """Who looks at levels: signed coc of pixels and which of them count, ``[B, 1, H, W]``.
+
+    The last two tell the same of cells of :data:`BEHIND_STEP` pixels, counted from the image's centre: the nearest coc.
+    """
+
+    coc_px: Tensor
+    mask: Tensor
+    nearest: Tensor
+    cells: Tensor
+
+
+Seen = Callable[..., tuple[Tensor, Tensor]]
+"""``(levels, coc_px, mask, step=1, farthest=False)`` to what levels show behind a map: light and coc, and votes."""
+
+
 def _is_behind(distance_px: Tensor) -> Tensor:
     """How surely a surface that is so much farther, in coc, is another one."""
-    return (distance_px - _BEHIND_PX + 0.5).clamp(0.0, 1.0)
+    return (distance_px - BEHIND_PX + 0.5).clamp(0.0, 1.0)
 
 
 def behind_size(size: int, levels: int) -> int:
@@ -149,27 +176,26 @@ def fill_hidden(
     pyramid = [_first_level(far_light, far_coc, far_weight, whole[0] // 2, whole[1] // 2)]
     for _ in range(1, levels):
         pyramid.append(_farthest(*pyramid[-1]))
-    size = (height, width)
-    searched = [_Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
+    searched = [Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
 
     # what coarse levels show behind cells is one level of such cells; and the farthest of all is behind both surfaces
     size = (height, width)
     wanted = (coc_px.abs() > 0.5) & (other_weight < HIDDEN_WEIGHT)
     # a graph looks at all pixels, others only where they may find something
-    may_hide = wanted if exported_graph() else _may_hide(coc_px, [far_coc for _, far_coc, _ in pyramid])
+    graph = exported_graph()
+    may_hide = wanted if graph else _may_hide(coc_px, [far_coc for _, far_coc, _ in pyramid])
     cell_rows, cell_columns = whole[0] // BEHIND_STEP, whole[1] // BEHIND_STEP
     nearest = -_largest(-coc_px, cell_rows, cell_columns, BEHIND_STEP)
     cells = torch.cat([may_hide, wanted], 1).to(coc_px.dtype)
     cells = _largest(cells, cell_rows, cell_columns, BEHIND_STEP).amin(1, keepdim=True) > 0
-    seen, total = _seen(searched, nearest, cells, size, BEHIND_STEP, farthest=True)
-    behind = torch.where(total > 0, seen[:, :-1], searched[_FINE_LEVELS - 1].values[:, :-2])
-    if levels > _FINE_LEVELS:
-        coarse = torch.cat(_seen(searched[_FINE_LEVELS:], nearest, cells, size, BEHIND_STEP), 1)
-        searched = [*searched[:_FINE_LEVELS], _Level(coarse, BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)]
+    maps = Looking(coc_px, may_hide & wanted, nearest, cells)
+    if graph is None:
+        seen, total, behind = _look(searched, maps, functools.partial(_seen, size=size))
+    else:
+        seen, total, behind = graph.look(searched, maps, _look)
 
-    # each pixel behind which these levels show something gets it as its second sample
-    seen, total = _seen(searched, coc_px, may_hide & wanted, size)
-    # together with a surface that is hardly mixed in: the more of that, the less of what is hidden
+    # each pixel behind which these levels show something gets it as its second sample, together with a surface that is
+    # hardly mixed in: the more of that, the less of what is hidden
     hidden = (total / _CERTAIN).clamp(max=1.0) * (HIDDEN_WEIGHT - other_weight).clamp_min(0.0)
     weight = hidden + (1.0 - hidden / HIDDEN_WEIGHT) * other_weight
     part = hidden / weight.clamp_min(1e-12)
@@ -192,9 +218,10 @@ def _first_level(
     around = []
     for row in range(3):
         for column in range(3):
-            plane = planes[:, :, row % 2 * 2 + column % 2, row // 2 :, column // 2 :]
+            plane = planes[:, :, row % 2 * 2 + column % 2]
+            plane = plane.narrow(-2, row // 2, height).narrow(-1, column // 2, width)
             share = shares[1][:, row, None] * shares[0][:, column]
-            around.append((plane[..., :height, :width], share / 4.0))
+            around.append((plane, share / 4.0))
     # on an axis of even size the last of three has no share
     farthest = torch.stack([torch.where(share > 0, v[:, -2:-1], -NEVER_PX) for v, share in around]).amax(0)
     summed = values.new_zeros(())
@@ -226,12 +253,30 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
             samples = around.shape[dim]
             place = _place(torch.arange(size, device=near.device).to(near.dtype), size, samples, 2**level)
             around = around.index_select(dim, place.round().clamp(0, samples - 1).long())
-        may_hide = may_hide | ((around > near + (_BEHIND_PX - 0.5)) & (near.abs() > _least_px(level)))
+        may_hide = may_hide | ((around > near + (BEHIND_PX - 0.5)) & (near.abs() > _least_px(level)))
     return may_hide
 
 
+def _look(levels: Sequence[Level], maps: Looking, seen: Seen) -> tuple[Tensor, Tensor, Tensor]:
+    """What lies behind each pixel: light and coc ``[B, C + 1, H, W]`` and the votes for it; and the light behind both.
+
+    ``seen`` is :func:`_seen` of an image, or that of one of its tiles.
+    """
+    shown, total = seen(levels, maps.nearest, maps.cells, step=BEHIND_STEP, farthest=True)
+    behind = torch.where(total > 0, shown[:, :-1], levels[_FINE_LEVELS - 1].values[:, :-2])
+    if len(levels) > _FINE_LEVELS:
+        coarse = torch.cat(seen(levels[_FINE_LEVELS:], maps.nearest, maps.cells, step=BEHIND_STEP), 1)
+        levels = [*levels[:_FINE_LEVELS], Level(coarse, BEHIND_STEP, None, levels[_FINE_LEVELS].least_px)]
+    return *seen(levels, maps.coc_px, maps.mask), behind
+
+
 def _seen(
-    levels: list[_Level], coc_px: Tensor, mask: Tensor, size: tuple[int, int], step: int = 1, farthest: bool = False
+    levels: Sequence[Level],
+    coc_px: Tensor,
+    mask: Tensor,
+    size: tuple[int, int],
+    step: int = 1,
+    farthest: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """What levels show behind the surfaces of a map: light and coc ``[B, C + 1, h, w]``, and the sum of their votes.
 
@@ -239,24 +284,21 @@ def _seen(
     outside of a mask. With ``farthest``, of two surfaces only the farther one counts.
     """
     height, width = coc_px.shape[-2:]
-    graph = exported_graph()
-    if graph is not None:
-        maps = [graph.samples(level.values, (height, width), level.step / step) for level in levels]
-        seen, total = _search(levels, maps, coc_px, farthest)
-        return seen, total * mask.to(total.dtype)
     places = pixels.indices(mask)
     item, row, column = pixels.places(places, height, width)
     row = (row - _centre(height, coc_px)) * step + _centre(size[0], coc_px)
     column = (column - _centre(width, coc_px)) * step + _centre(size[1], coc_px)
     lists = [_samples(level, item, row, column, size) for level in levels]
-    seen, total = _search(levels, lists, pixels.pick(coc_px, places).t(), farthest)
+    seen, total = search(levels, lists, pixels.pick(coc_px, places).t(), farthest)
     batch, channels = coc_px.shape[0], levels[0].values.shape[1]
     values = pixels.put(coc_px.new_zeros(batch, channels, height, width), places, torch.cat([seen, total], 1).t())
     return values[:, :-1], values[:, -1:]
 
 
-def _search(levels: list[_Level], samples: list[Samples], coc_px: Tensor, farthest: bool) -> tuple[Tensor, Tensor]:
-    """:func:`_seen` of places ``[P, 1]`` or of whole maps, given the samples of each level around each of them."""
+def search(
+    levels: Sequence[Level], samples: Sequence[Samples], coc_px: Tensor, farthest: bool
+) -> tuple[Tensor, Tensor]:
+    """What levels show behind places ``[P, 1]`` or whole maps, given the samples of each level around each of them."""
     total, seen = torch.zeros_like(coc_px), coc_px.new_zeros(levels[0].values.shape[1], *(1,) * (coc_px.ndim - 2))
     for level, around in zip(levels, samples, strict=True):
         # of the samples only those that lie behind: plain interpolation would mix in the foreground's own colour
@@ -277,7 +319,7 @@ def _search(levels: list[_Level], samples: list[Samples], coc_px: Tensor, farthe
     return seen[:, :-1], total
 
 
-def _samples(level: _Level, item: Tensor, row: Tensor, column: Tensor, size: tuple[int, int]) -> Samples:
+def _samples(level: Level, item: Tensor, row: Tensor, column: Tensor, size: tuple[int, int]) -> Samples:
     """The four samples of a level around places ``[P]`` of an image of a size, and their shares of the linear mean."""
     height, width = level.values.shape[-2:]
     row, column = _place(row, size[0], height, level.step), _place(column, size[1], width, level.step)

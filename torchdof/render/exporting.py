@@ -1,6 +1,6 @@
 """What whoever exports a graph puts in: a graph cannot look at numbers and then choose its work, as eager code does."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -8,10 +8,14 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:  # these look at what is exported themselves
+    from .disocclusion import Level, Looking, Seen
     from .plan import Blur
     from .surfaces import Frame
 
 __all__ = ["Graph", "exported_graph", "graph_context", "where_needed"]
+
+
+Result = tuple[Tensor, Tensor, Tensor]
 
 
 class Graph(NamedTuple):
@@ -20,15 +24,15 @@ class Graph(NamedTuple):
     Args:
         align: What the frame must be a multiple of, given the pixels that the widest kernel reaches.
         render: The picture of a frame, from it, its kernels and what renders one piece of it.
-        samples: The samples around each pixel of a map of a size, from their own map at every ``ratio``-th of its
-            pixels, with the same centre; each with its share of their linear mean.
+        look: What lies behind the pixels of a frame, from levels of a pyramid, the pixels that look, and what looks for
+            them at one piece of these; as :mod:`torchdof.render.disocclusion` does it for the frame.
         choose: ``(needed, result, given)`` to the result where it is needed, else what is given. What only the result
             needs is computed only then.
     """
 
     align: Callable[[int], int]
     render: "Callable[[Frame, Sequence[Blur], Callable[[Frame, Sequence[Blur]], Tensor]], Tensor]"
-    samples: Callable[[Tensor, tuple[int, int], float], Iterable[tuple[Tensor, Tensor]]]
+    look: "Callable[[Sequence[Level], Looking, Callable[[Sequence[Level], Looking, Seen], Result]], Result]"
     choose: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 

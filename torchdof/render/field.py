@@ -29,7 +29,17 @@ from ..optics.blur_table import BlurTable
 from ..optics.field import deviations
 from ..optics.kernel_cache import KernelCache
 
-__all__ = ["BLOCK", "DISTANCES", "Shares", "layer_shares", "own_kernels", "placed", "ray_shares", "scattered"]
+__all__ = [
+    "BLOCK",
+    "DISTANCES",
+    "Shares",
+    "layer_shares",
+    "own_kernels",
+    "of_pixels",
+    "placed",
+    "ray_shares",
+    "scattered",
+]
 
 BLOCK = (8, 16)
 """Rows and columns of a layer whose pixels share a kernel."""
@@ -218,6 +228,30 @@ def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x
     cut = kernel * share
     light, left = (k.sum((-2, -1), keepdim=True) for k in (kernel, cut))
     return torch.where(left > _LEAST * light, cut * (light / left.clamp_min(1e-30)), kernel)
+
+
+def of_pixels(
+    kernel: Tensor, shares: Shares, first: tuple[int, int], count: tuple[int, int], size: tuple[int, int]
+) -> Tensor:
+    """Each pixel's own kernel, ``[n, 1 or C, k, k]``.
+
+    Args:
+        kernel: The table's own ``[1 or C, k, k]``, or several times those of C colours.
+        shares: At the frame's resolution.
+        first: Row and column of the first pixel.
+        count: Rows and columns of them.
+        size: Height and width of the frame.
+    """
+    half_diagonal = 0.5 * math.hypot(*size)
+    y, x = (
+        (torch.arange(n, dtype=kernel.dtype, device=kernel.device) + (start + 0.5 - side / 2)) / half_diagonal
+        for n, start, side in zip(count, first, size, strict=True)
+    )
+    y, x = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
+    each = kernel[: shares.values.shape[0]] if shares.values.shape[0] > 1 else kernel
+    return placed(each[None], [(shares.to(kernel), kernel.new_ones(()))], y, x).repeat(
+        1, len(kernel) // len(each), 1, 1
+    )
 
 
 def scattered(

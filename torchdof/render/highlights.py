@@ -64,7 +64,7 @@ def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
     level = torch.topk(cells, cells.shape[1] // 5, dim=1)[0][:, -1:]
     level = FACTOR * level.clamp(0.0, torch.finfo(light.dtype).max / FACTOR)
     level = functional.interpolate(level, scale_factor=float(side), mode="bilinear", align_corners=False)
-    return level[..., top : top + height, left : left + width]
+    return level.narrow(-2, top, height).narrow(-1, left, width)
 
 
 def _cells(size: int, side: int, device: torch.device) -> tuple[int, Tensor]:

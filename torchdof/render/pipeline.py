@@ -70,6 +70,8 @@ def blur_attended(
     if attention is None:
         return blur(image, coc_px, plan, options, behind)
     weight = weight_map(attention, image)
+    if options.table.depends_on_place:  # a part by itself would have another middle: all of it keeps the tolerance
+        return blur(image, coc_px, plan, options, behind)
     loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED["draft"]))
     known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
     box = box_around(weight, _REACH * float(known.abs().amax()))

@@ -3,19 +3,29 @@
 Light scattered over the frame's border is lost, nothing comes in.
 """
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from ..validation import is_traced
 from .convolution import DIRECT_TAPS, widest_float
+from .field import Shares, of_pixels
 
 __all__ = ["fold"]
 
 _COLUMN_BYTES = 256 * 2**20
 
 
-def fold(light: Tensor, kernels: Tensor, halo: int = 0, weights: Tensor | None = None) -> Tensor:
+def fold(
+    light: Tensor,
+    kernels: Tensor,
+    halo: int = 0,
+    weights: Tensor | None = None,
+    shares: Sequence[Shares] | None = None,
+    frame: tuple[int, int] = (0, 0),
+) -> Tensor:
     """Columns of pixel light times kernel, summed where they fall by ``fold``.
 
     Works on so many rows at once that the columns stay within 256 MB. Sums of large kernels are taken in float64.
@@ -25,6 +35,8 @@ def fold(light: Tensor, kernels: Tensor, halo: int = 0, weights: Tensor | None =
         kernels: ``[1 or C, k, k]``, k odd; or, with weights, a bank of them ``[n, 1 or C, k, k]``.
         halo: Pixels on each side that scatter into the result ``[B, C, H - 2 halo, W - 2 halo]`` but are not in it.
         weights: How much of each kernel of the bank a pixel is scattered with, ``[B, n, H, W]``.
+        shares: What becomes of each kernel of the bank across the frame; None: they are alike everywhere.
+        frame: Height and width of the frame, which begins ``halo`` pixels after the light; with ``shares`` only.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3, steps (a) to (c). The adjoint is ``unfold``.
@@ -35,12 +47,21 @@ def fold(light: Tensor, kernels: Tensor, halo: int = 0, weights: Tensor | None =
     size, wide = kernels.shape[-1], widest_float(light.device)
     half = size // 2
     if size * size > DIRECT_TAPS and light.dtype != wide and not is_traced():
-        return fold(light.to(wide), kernels.to(wide), halo, weights.to(wide)).to(light.dtype)
+        return fold(light.to(wide), kernels.to(wide), halo, weights.to(wide), shares, frame).to(light.dtype)
     rows = max(1, _COLUMN_BYTES // (batch * channels * size * size * width * light.element_size()))
     strips = []
     for top in range(0, height, rows):
         strip, weight = (t[:, :, top : top + rows] for t in (light, weights))
-        taps = torch.einsum("bnp,nct->bctp", weight.flatten(2), kernels.flatten(2))  # every pixel's own kernel
+        # every pixel's own kernel
+        if shares is None:
+            taps = torch.einsum("bnp,nct->bctp", weight.flatten(2), kernels.flatten(2))
+        else:
+            taps = light.new_zeros(())
+            for kernel, share, part in zip(kernels, shares, weight.flatten(2).unbind(1), strict=True):
+                each = of_pixels(
+                    kernel, share, (top - halo, -halo), (strip.shape[-2], width), frame
+                )  # [pixels, C, k, k]
+                taps = taps + torch.einsum("bp,pct->bctp", part, each.flatten(2))
         columns = strip.flatten(2).unsqueeze(2) * taps  # [B, C, k*k, pixels]
         area = (strip.shape[-2] + 2 * half, width + 2 * half)
         strips.append((top, functional.fold(columns.flatten(1, 2), area, (size, size))))

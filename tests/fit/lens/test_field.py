@@ -6,17 +6,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from torchdof import BlurTable, blur_by_coc
+from examples.benchmarks import across_field
+from torchdof import BlurTable
 from torchdof.fit import trace_table
 from torchdof.fit.lens import Lens
-from torchdof.fit.lens.field import field_height_mm, spot_of_place
 from torchdof.fit.lens.spot import focus_sensor
-from torchdof.fit.lens.trace import signed_coc_mm
+from torchdof.fit.lens.views import rays_of
 from torchdof.optics.aperture import Aperture
+from torchdof.reference.scenes import Plane, plane_views, waves
 
-WIDTH, HEIGHT, SENSOR_MM = 960, 640, 36.0
-PLACES = ((7.0, 2.2), (14.0, -2.6), (20.0, 0.55))  # mm from the middle of the frame, and azimuth
+WIDTH, HEIGHT = 960, 640
+PLACES_MM, AZIMUTHS = (7.0, 14.0, 20.0), (2.2, -2.6, 0.55)
 RADII = (0.0, 6.0, 8.0, 13.0, 15.0, 19.0, 21.0)
 
 
@@ -30,47 +32,43 @@ def table(gauss: Lens) -> BlurTable:
     return trace_table(gauss, 2.0, 2.0, nodes=5, points=17, rays=400, field=RADII, field_nodes=4, field_rays=40_000)
 
 
-def traced(lens: Lens, z_m: float, radius_mm: float, azimuth: float, half: int) -> Any:
-    """What pixels get of the spot of a point whose sharp image is a Gaussian of 0.7 px."""
-    stopped = lens.with_f_number(2.0)
-    sensor = focus_sensor(stopped, 2.0)
-    height = field_height_mm(stopped, z_m, sensor, radius_mm, "principal")
-    u, v, weight = spot_of_place(stopped, z_m, sensor, height, 90_000)
-    u, v = u * (WIDTH / SENSOR_MM), v * (WIDTH / SENSOR_MM)
-    y, x = u * math.sin(azimuth) + v * math.cos(azimuth), u * math.cos(azimuth) - v * math.sin(azimuth)
-    edges = np.linspace(-half - 0.5, half + 0.5, 5 * (2 * half + 1) + 1)
-    fine = np.histogram2d(y, x, [edges, edges], weights=weight)[0]
-    step = np.arange(-20, 21) / 5
-    seen = np.convolve(np.exp(-0.5 * (step / 0.7) ** 2), np.ones(5))
-    for axis in (0, 1):
-        fine = np.apply_along_axis(np.convolve, axis, fine, seen / seen.sum(), mode="same")
-    return fine[2::5, 2::5] * 25
-
-
 @pytest.mark.parametrize(("z_m", "least"), [(0.9, 37.0), (1e9, 34.0)])
-def test_rendered_points_are_the_traced_spots(gauss: Lens, table: BlurTable, z_m: float, least: float) -> None:
-    focal = gauss.paraxial().focal_length
-    coc_px = signed_coc_mm(z_m, focal, 2.0, 2.0) * WIDTH / SENSOR_MM
-    edges = torch.erf(torch.linspace(-3.5, 3.5, 8) / (0.7 * math.sqrt(2.0))).diff()
-    blob = edges[:, None] * edges / edges.sum() ** 2
-    image, half, spots = torch.zeros(1, 1, HEIGHT, WIDTH), math.ceil(1.1 * abs(coc_px)) + 2, []
-    for radius, azimuth in PLACES:
-        away = radius * WIDTH / SENSOR_MM
-        row = round(HEIGHT / 2 + away * math.sin(azimuth) - 0.5)
-        column = round(WIDTH / 2 + away * math.cos(azimuth) - 0.5)
-        image[0, 0, row - 3 : row + 4, column - 3 : column + 4] = blob
-        dy, dx = row + 0.5 - HEIGHT / 2, column + 0.5 - WIDTH / 2
-        spot = traced(gauss, z_m, math.hypot(dy, dx) * SENSOR_MM / WIDTH, math.atan2(dy, dx), half)
-        spots.append((slice(row - half, row + half + 1), slice(column - half, column + half + 1), spot))
+def test_rendered_points_are_the_traced_spots(table: BlurTable, z_m: float, least: float) -> None:
+    tables = {"field": table, "cut": table.replace(field=None).with_aperture(Aperture(vignetting=0.8))}
+    found = across_field.rendered_spots_db(tables, z_m, PLACES_MM, AZIMUTHS, WIDTH)
+    assert min(found["field"]) > least
+    assert max(found["cut"]) < 27.0
 
-    def decibels(table: BlurTable) -> list[float]:
-        with torch.no_grad():
-            picture = blur_by_coc(image, torch.full_like(image, coc_px), table=table)[0, 0].double().numpy()
-        errors = [((picture[rows, columns] - spot) ** 2).mean() / spot.max() ** 2 for rows, columns, spot in spots]
-        return [-10.0 * math.log10(error) for error in errors]
 
-    assert min(decibels(table)) > least
-    assert max(decibels(table.replace(field=None).with_aperture(Aperture(vignetting=0.8)))) < 27.0
+def test_rays_traced_from_pixels_back_through_the_lens_see_the_spot(gauss: Lens) -> None:
+    z_m, half, samples, size = 1e5, 8, 900, (HEIGHT, WIDTH)
+    y, x = HEIGHT / 2 + 14.0 * WIDTH / 36.0 * math.sin(-2.6), WIDTH / 2 + 14.0 * WIDTH / 36.0 * math.cos(-2.6)
+    row, column = round(y - 0.5), round(x - 0.5)
+    dy, dx = row + 0.5 - HEIGHT / 2, column + 0.5 - WIDTH / 2
+    spot = across_field.traced_spot(z_m, math.hypot(dy, dx) * 36.0 / WIDTH, math.atan2(dy, dx), half, WIDTH)
+
+    def light(x: Tensor, y: Tensor) -> Tensor:
+        away = (x - column - 0.5) ** 2 + (y - row - 0.5) ** 2
+        return torch.exp(-0.5 * away / 0.7**2)[None] / (2.0 * math.pi * 0.7**2)
+
+    stopped = gauss.with_f_number(2.0)
+    rays = rays_of(stopped, [z_m], focus_sensor(stopped, 2.0), size, samples=samples)
+    window = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
+    seen = plane_views([Plane(z_m, light)], rays, size, window, samples)[0, 0].double().numpy()
+
+    def decibels(seen: Any) -> float:
+        return float(-10.0 * np.log10(((seen - spot) ** 2).mean() / spot.max() ** 2))
+
+    assert seen.sum() == pytest.approx(1.0, abs=0.01)
+    assert decibels(seen) > 36.0  # of so many rays
+    assert decibels(seen[::-1, ::-1]) < 28.0  # it does not lie inwards
+
+
+def test_a_picture_across_the_field_is_what_rays_through_the_lens_make(table: BlurTable) -> None:
+    tables = {"field": table, "round": table.replace(field=None)}
+    found = across_field.views_db(tables, [Plane(0.9, waves(11))], (14.0,), 360, 20, 100)
+    assert found["field"][0] > 52.0
+    assert found["round"][0] < 42.0
 
 
 def test_on_the_axis_spots_are_round_and_lie_on_it(table: BlurTable) -> None:

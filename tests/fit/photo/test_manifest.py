@@ -93,7 +93,12 @@ def test_a_pair_of_files_is_read(folder):
         ("focus_m = 0.5", "focus_m = nan", p.ManifestError, "focus_m must be a positive number"),
         ("focus_m = 0.5", "focus_m = 0.5\nfocal = 50", p.ManifestError, "'focal' is not a field; known are focus_m"),
         ("focus_m = 0.5", 'focus_m = 0.5\ntransfer = "gamma"', p.ManifestError, "'linear' or 'srgb', got 'gamma'"),
-        ("focus_m = 0.5", 'focus_m = 0.5\ndots = "two"', p.ManifestError, "'one', 'centre' or 'each', got 'two'"),
+        (
+            "focus_m = 0.5",
+            'focus_m = 0.5\ndots = "two"',
+            p.ManifestError,
+            "'one', 'centre', 'each' or 'field', got 'two'",
+        ),
         ("focus_m = 0.5", "focus_m = ", p.ManifestError, "is not TOML"),
         ("focus_m = 0.5", "focus_m = true", p.ManifestError, "positive number, got True"),
         ('file = "0400mm.png"', "", p.ManifestError, "file must be a text, got None"),

@@ -13,15 +13,17 @@ constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones
 constexpr int STEP = 1 << FINE_LEVELS;
 constexpr float SURE = 0.1f;      // weight of what a level shows from which on it has a whole vote
 constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight, or a farther one counts alone
+constexpr float LEAST_SEEN = 1e-4f;  // weight of what lies behind up to which nothing is seen
 constexpr float MIXED = 0.05f;  // least share of a second surface that the pyramid takes
 
 // Farthest surfaces, at every step-th pixel: light of each channel, coc, weight, and what fills the stride.
 struct Level {
   int height, width, step, stride, channels;
   float vote;  // weight against other levels; 0: it is in the weights
-  float least_px;  // blur from which on a pixel looks so far, and wholly from twice of it
+  float least_px, per_least_px;  // blur from which on a pixel looks so far, and wholly from twice of it
   Buffer<float> values;
   float centre_y, centre_x;  // of the image, in its pixels; the map has the same centre
+  void look_from(float px) { least_px = px, per_least_px = 1.0f / px; }
   float place_y(float y) const { return (y - centre_y) / step + 0.5f * (height - 1); }
   float place_x(float x) const { return (x - centre_x) / step + 0.5f * (width - 1); }
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
@@ -50,49 +52,76 @@ void farthest(const float *const *child, int channels, int stride, float *out) {
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
 
-inline void between(float at, int size, int &before, float &part) {
+// A place along an axis of a level: the sample before it, and how far it is from there to the next.
+struct Place {
+  int before;
+  float part;
+};
+
+inline Place place_in(float at, int size) {
   at = clamp(at, 0.0f, (float)(size - 1));
-  before = std::min((int)at, std::max(0, size - 2));
-  part = at - before;
+  const int before = std::min((int)at, std::max(0, size - 2));
+  return {before, at - before};
 }
 
-// Mean of the four samples of a level around a place, of those only that lie behind it; returns their weight.
+// The four samples of a level around a place.
+struct Corners {
+  const float *of[4];
+  Corners(const Level &level, int row, int column) {
+    const float *first = level.at(row, column);
+    const size_t below = level.height > 1 ? (size_t)level.width * level.stride : 0, beside = level.width > 1 ? level.stride : 0;
+    of[0] = first, of[1] = first + beside, of[2] = first + below, of[3] = first + below + beside;
+  }
+  // Whether one of them lies behind a place of that coc.
+  bool behind(float here, int channels) const {
+    return std::max(std::max(of[0][channels], of[1][channels]), std::max(of[2][channels], of[3][channels])) - here > BEHIND_PX - 0.5f;
+  }
+};
+
+// Mean of the four samples of a level around a place, of those only that lie behind it; returns their weight, and writes
+// nothing where that is 0.
 template <int VECTORS>
-float behind(const Level &level, float row, float column, float here, f8 *seen) {
+float behind(const Level &level, Place row, Place column, float here, f8 *seen) {
   const int count = VECTORS ? VECTORS : level.stride / F8, C = level.channels;
-  int y, x;
-  float down, right;
-  between(level.place_y(row), level.height, y, down);
-  between(level.place_x(column), level.width, x, right);
-  const float *first = level.at(y, x);
-  const size_t below = level.height > 1 ? (size_t)level.width * level.stride : 0, beside = level.width > 1 ? level.stride : 0;
-  const float *corner[4] = {first, first + beside, first + below, first + below + beside};
+  const Corners corner(level, row.before, column.before);
+  if (!corner.behind(here, C)) return 0;
+  const float down = row.part, right = column.part;
   const float share[4] = {(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right};
   float total = 0, counts[4];
-  for (int k = 0; k < 4; k++) total += counts[k] = share[k] * corner[k][C + 1] * is_behind(corner[k][C] - here);
-  for (int i = 0; i < count; i++) seen[i] = f8{};
-  if (!(total > 1e-4f)) return 0;
+  for (int k = 0; k < 4; k++) total += counts[k] = share[k] * corner.of[k][C + 1] * is_behind(corner.of[k][C] - here);
+  if (!(total > LEAST_SEEN)) return 0;
   const float each = 1.0f / total;
+  for (int i = 0; i < count; i++) seen[i] = f8{};
   for (int k = 0; k < 4; k++)
-    for (int i = 0; i < count; i++) seen[i] += load<f8>(corner[k] + F8 * i) * (counts[k] * each);
+    for (int i = 0; i < count; i++) seen[i] += load<f8>(corner.of[k] + F8 * i) * (counts[k] * each);
   return total;
 }
 
-// What levels show behind a place: light, coc; returns the sum of their votes. With farthest, of two surfaces only the
-// farther one counts.
+// What one level shows behind a place, and how much it counts: nothing where `any` is 0.
+struct Seen {
+  float looked, any;
+  f8 *sample;
+  template <int VECTORS>
+  void see(const Level &level, Place row, Place column, float here) {
+    looked = clamp01(std::fabs(here) * level.per_least_px - 1.0f);
+    any = looked > 0 ? behind<VECTORS>(level, row, column, here, sample) : 0.0f;
+  }
+};
+
+// What levels show together: light, coc; returns the sum of their votes. With farthest, of two surfaces only the farther
+// one counts.
 template <int VECTORS>
-float look(const Level *const *levels, int n, float row, float column, float here, bool farthest, float *out, f8 *b) {
+float mix(const Level *const *levels, const Seen *seen, int n, bool farthest, float *out) {
   const int count = VECTORS ? VECTORS : levels[0]->stride / F8, C = levels[0]->channels;
   float total = 0;
   for (int i = 0; i < F8 * count; i++) out[i] = 0;
   for (int l = 0; l < n; l++) {
     const Level &level = *levels[l];
-    const float looked = clamp01(std::fabs(here) / level.least_px - 1.0f);
-    if (!(looked > 0)) continue;
-    const float any = behind<VECTORS>(level, row, column, here, b);
+    const float any = seen[l].any, looked = seen[l].looked;
+    if (!(any > 0)) continue;
     float vote = looked * (level.vote > 0 ? level.vote * std::min(any / SURE, 1.0f) : any);
     if (farthest) {
-      const float apart = ((const float *)b)[C] - out[C];
+      const float apart = ((const float *)seen[l].sample)[C] - out[C];
       if (total > 0) vote *= 1.0f - is_behind(-apart);
       total *= 1.0f - std::min(looked * any / CERTAIN, 1.0f) * is_behind(apart);
     }
@@ -101,7 +130,7 @@ float look(const Level *const *levels, int n, float row, float column, float her
     const float part = vote / std::max(total, 1e-9f);
     for (int i = 0; i < count; i++) {
       const f8 o = load<f8>(out + F8 * i);
-      store(out + F8 * i, o + (b[i] - o) * part);
+      store(out + F8 * i, o + (seen[l].sample[i] - o) * part);
     }
   }
   return total;
@@ -129,7 +158,7 @@ class Filling {
       l.channels = C_;
       centre(l);
       l.vote = (float)std::pow((double)FALL, i + 1);
-      l.least_px = (float)std::pow(2.0, i - 1);
+      l.look_from((float)std::pow(2.0, i - 1));
       l.values = Buffer<float>((size_t)l.height * l.width * stride_);
     }
     near_.resize(cell_rows_ * cell_columns_);
@@ -333,10 +362,17 @@ class Filling {
     return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < HIDDEN_WEIGHT;
   }
 
+  // Where pixels `first`, `first + step`, ... lie in a level.
+  static std::vector<Place> places(float first, int step, int count, int size, float (Level::*place)(float) const, const Level &level) {
+    std::vector<Place> at(count);
+    for (int i = 0; i < count; i++) at[i] = place_in((level.*place)(first + (float)i * step), size);
+    return at;
+  }
+
   template <int VECTORS>
   void fill() {
-    const int levels = job_.levels, H = job_.height, W = job_.width, C = C_;
-    const int rows = area_height_ / STEP, columns = area_width_ / STEP;
+    const int levels = job_.levels, H = job_.height, W = job_.width, C = C_, count = stride_ / F8;
+    const int rows = area_height_ / STEP, columns = area_width_ / STEP, coarse = std::max(levels - FINE_LEVELS, 0);
     const int first_y = first_pixel(H, rows, STEP), first_x = first_pixel(W, columns, STEP);
     job_.behind_height = rows;
     job_.behind_width = columns;
@@ -349,18 +385,28 @@ class Filling {
     together.channels = C;
     centre(together);
     together.vote = 0;
-    together.least_px = levels > FINE_LEVELS ? pyramid_[FINE_LEVELS].least_px : 0;
-    if (levels > FINE_LEVELS) together.values = Buffer<float>((size_t)rows * columns * stride_);
+    if (coarse) {
+      together.look_from(pyramid_[FINE_LEVELS].least_px);
+      together.values = Buffer<float>((size_t)rows * columns * stride_);
+    }
     std::vector<const Level *> every;
-    for (const Level &l : pyramid_) every.push_back(&l);
+    std::vector<std::vector<Place>> ys, xs;  // of the cells in each level
+    for (const Level &l : pyramid_) {
+      every.push_back(&l);
+      ys.push_back(places(0.5f * (H - 1) - 0.5f * (rows - 1) * STEP, STEP, rows, l.height, &Level::place_y, l));
+      xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * STEP, STEP, columns, l.width, &Level::place_x, l));
+    }
     const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
     job_.parallel(rows, [&](int row, int) {
-      std::vector<float> seen(stride_);
-      std::vector<f8> sample(stride_ / F8);
+      std::vector<float> shows(stride_);
+      std::vector<f8> samples((size_t)levels * count);
+      std::vector<Seen> seen(levels);
+      for (int i = 0; i < levels; i++) seen[i].sample = samples.data() + i * count;
       for (int column = 0; column < columns; column++) {
         const size_t at = (size_t)row * columns + column;
         const float *shown = base.at(row, column);
-        if (levels > FINE_LEVELS) memset(together.values.data() + at * stride_, 0, stride_ * sizeof(float));
+        float *const coarsely = coarse ? together.at(row, column) : nullptr;
+        if (coarse) memset(coarsely, 0, stride_ * sizeof(float));
         const int top = first_y + row * STEP, left = first_x + column * STEP;
         const int y0 = std::clamp(top, 0, H - 1), y1 = std::clamp(top + STEP - 1 + H % 2, 0, H - 1);
         const int x0 = std::clamp(left, 0, W - 1), x1 = std::clamp(left + STEP - 1 + W % 2, 0, W - 1);
@@ -376,50 +422,53 @@ class Filling {
               any = any || wanted(y, x);
             }
           if (any) {
-            const float y = (row - 0.5f * (rows - 1)) * STEP + 0.5f * (H - 1), x = (column - 0.5f * (columns - 1)) * STEP + 0.5f * (W - 1);
-            if (levels > FINE_LEVELS) {
-              float *to = together.at(row, column);
-              const float total = look<VECTORS>(every.data() + FINE_LEVELS, levels - FINE_LEVELS, y, x, near, false, to, sample.data());
-              to[C + 1] = total;
-            }
-            if (look<VECTORS>(every.data(), levels, y, x, near, true, seen.data(), sample.data()) > 0) shown = seen.data();
+            for (int i = 0; i < levels; i++) seen[i].see<VECTORS>(pyramid_[i], ys[i][row], xs[i][column], near);
+            if (coarse) coarsely[C + 1] = mix<VECTORS>(every.data() + FINE_LEVELS, seen.data() + FINE_LEVELS, coarse, false, coarsely);
+            if (mix<VECTORS>(every.data(), seen.data(), levels, true, shows.data()) > 0) shown = shows.data();
           }
         }
         for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = shown[c];
       }
     });
-    const Level *looks[FINE_LEVELS + 1];
-    for (int i = 0; i < FINE_LEVELS; i++) looks[i] = &pyramid_[i];
-    looks[FINE_LEVELS] = &together;
+    const int fine = std::min(levels, FINE_LEVELS), looks = fine + (coarse > 0);  // what pixels look at
+    const Level *look[FINE_LEVELS + 1];
+    for (int i = 0; i < looks; i++) look[i] = i < fine ? &pyramid_[i] : &together;
+    for (int i = 0; i < looks; i++) {
+      ys[i] = places(0, 1, H, look[i]->height, &Level::place_y, *look[i]);
+      xs[i] = places(0, 1, W, look[i]->width, &Level::place_x, *look[i]);
+    }
     job_.parallel(s_.block_rows, [&](int by, int) {
-      std::vector<float> seen(stride_);
-      std::vector<f8> sample(stride_ / F8);
+      std::vector<float> shows(stride_);
+      std::vector<f8> samples((size_t)looks * count);
+      Seen seen[FINE_LEVELS + 1];
+      for (int i = 0; i < looks; i++) seen[i].sample = samples.data() + i * count;
       for (int bx = 0; bx < s_.block_columns; bx++)
         for (int y = by * BLOCK; y < std::min(H, (by + 1) * BLOCK); y++)
           for (int x = bx * BLOCK; x < std::min(W, (bx + 1) * BLOCK); x++) {
             const size_t cell = (size_t)(y / cell_) * cell_columns_ + x / cell_;
-            if (!found_[cell]) {
+            const int first = fine_[cell] ? 0 : fine;
+            if (!found_[cell] || first == looks) {
               x = x / cell_ * cell_ + cell_ - 1;
               continue;
             }
-            if (!wanted(y, x)) continue;
             const float here = s_.coc[(size_t)y * W + x];
-            float total;
-            if (fine_[cell])
-              total = look<VECTORS>(looks, levels > FINE_LEVELS ? FINE_LEVELS + 1 : FINE_LEVELS, y, x, here, false, seen.data(), sample.data());
-            else if (levels > FINE_LEVELS)
-              total = look<VECTORS>(looks + FINE_LEVELS, 1, y, x, here, false, seen.data(), sample.data());
-            else
-              continue;
+            if (!wanted(y, x)) continue;
+            bool any = false;
+            for (int i = first; i < looks; i++) {
+              seen[i].see<VECTORS>(*look[i], ys[i][y], xs[i][x], here);
+              any |= seen[i].any > 0;
+            }
+            if (!any) continue;
+            const float total = mix<VECTORS>(look + first, seen + first, looks - first, false, shows.data());
             if (!(total > 0)) continue;
             const Block b = s_.make_block(by * s_.block_columns + bx);
             const int within = y % BLOCK * BLOCK + x % BLOCK;
             // together with a surface that is hardly mixed in: the more of that, the less of what is hidden
             const float mixed = b.weight[within], hidden = std::min(total / CERTAIN, 1.0f) * (HIDDEN_WEIGHT - mixed);
             const float weight = hidden + (1.0f - hidden / HIDDEN_WEIGHT) * mixed, part = hidden / std::max(weight, 1e-12f);
-            auto mix = [&](float &other, float hidden_one) { other = part < 1 ? other + part * (hidden_one - other) : hidden_one; };
-            for (int c = 0; c < C; c++) mix(b.other[c * BLOCK_PIXELS + within], seen[c]);
-            mix(b.coc[within], seen[C]);
+            auto blend = [&](float &other, float hidden_one) { other = part < 1 ? other + part * (hidden_one - other) : hidden_one; };
+            for (int c = 0; c < C; c++) blend(b.other[c * BLOCK_PIXELS + within], shows[c]);
+            blend(b.coc[within], shows[C]);
             b.weight[within] = weight * (s_.valid ? s_.valid[(size_t)y * W + x] : 1.0f);
           }
     });

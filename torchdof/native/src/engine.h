@@ -387,7 +387,8 @@ class Turned {
     int columns;
     float last_row, last_column, per_u, first_u, per_v;
     float at(float u, float v) const {
-      const float row = std::min(std::max(u * per_u + first_u, 0.0f), last_row), column = std::min(v * per_v, last_column);
+      // what is no number is 0
+      const float row = std::min(std::max(0.0f, u * per_u + first_u), last_row), column = std::min(std::max(0.0f, v * per_v), last_column);
       const int i = std::min((int)row, (int)last_row - 1), j = std::min((int)column, (int)last_column - 1);
       const float down = row - i, right = column - j, *p = values.data() + i * columns + j;
       const float upper = p[0] + right * (p[1] - p[0]), lower = p[columns] + right * (p[columns + 1] - p[columns]);
