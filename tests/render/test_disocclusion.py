@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
-from torchdof.render.disocclusion import HIDDEN_WEIGHT, behind_pixels
+from torchdof.render.disocclusion import HIDDEN_WEIGHT, behind_pixels, fill_hidden
 from torchdof.render.highlights import threshold
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Surface, framed, surfaces_of_image
@@ -67,11 +67,34 @@ def test_behind_two_blurred_surfaces_lies_the_farthest_around() -> None:
     green = torch.tensor([0.1, 0.6, 0.1])
     image, coc = edge(1.0, near_px=-18.0)
     image, coc = image.clone(), coc.clone()
-    image[..., 24:40], coc[..., 24:40] = green[:, None, None], -12.0  # red in front of green, and a blue wall
-    image[..., 40:], coc[..., 40:] = BLUE[:, None, None], 0.0
-    _, (_, _, weight), behind = surfaces(image, coc, levels=5)
-    assert weight is not None and float(weight[0, 0, 24, 20]) > 0
-    assert torch.allclose(behind[0, :, 24, 20], BLUE, atol=0.02), "the wall, not the surface in between"
+    image[..., 20:28], coc[..., 20:28] = green[:, None, None], -12.0  # red in front of green, and a blue wall
+    image[..., 28:], coc[..., 28:] = BLUE[:, None, None], 0.0
+    _, (_, _, weight), behind = surfaces(image, coc, levels=6)
+    assert weight is not None and float(weight[0, 0, 24, 16]) > 0
+    assert torch.allclose(behind[0, :, 24, 16], BLUE, atol=0.02), "the wall, not the surface in between"
+
+
+def test_one_level_more_changes_nothing_where_no_blur_looks_so_far() -> None:
+    made = torch.Generator().manual_seed(1)
+    image, coc = torch.rand(1, 3, 51, 66, generator=made), 16.0 * torch.rand(1, 1, 7, 9, generator=made) - 8.0
+    coc = functional.interpolate(coc, scale_factor=8.0)[..., :51, :66]
+    fewer, more = (surfaces(image, coc, levels=levels) for levels in (4, 5))
+    torch.testing.assert_close(fewer, more, rtol=0, atol=1e-6)
+
+
+def test_what_is_hidden_takes_the_place_of_a_surface_that_is_hardly_mixed_in_smoothly() -> None:
+    image, coc = edge(1.0, near_px=-12.0)
+    most = threshold(image)
+    weights = torch.linspace(0.0, 1.2 * HIDDEN_WEIGHT, 40)
+    light, found = [], []
+    for mixed in weights.tolist():
+        own_weight = torch.full_like(coc, mixed)
+        other, _, weight, _ = fill_hidden(image, coc, torch.zeros_like(image), coc, own_weight, None, most, 5)
+        light.append((other * weight)[0, :, 24, 30])
+        found.append(float(weight[0, 0, 24, 30]))
+    assert found[0] == pytest.approx(HIDDEN_WEIGHT) and found[-1] == pytest.approx(float(weights[-1]))
+    steps = torch.stack(light).diff(dim=0).abs().max() / HIDDEN_WEIGHT, torch.tensor(found).diff().abs().max()
+    assert float(steps[0]) < 0.1 and float(steps[1]) < 0.1 * HIDDEN_WEIGHT, "no step, in 40 of them"
 
 
 @pytest.mark.parametrize("size", [(20, 30), (150, 170), (128, 64)])

@@ -38,6 +38,16 @@ def test_a_mixed_pixel_is_split_between_its_two_surfaces(share: float) -> None:
     assert float(other_coc) == (0.0 if share >= 0.5 else -12.0)
 
 
+def test_surfaces_that_look_alike_are_hardly_told_apart() -> None:
+    """A contrast of 1/255 of the light around is trusted by half; of 1e-7, which is rounding, not at all."""
+    for contrast, trusted in ((0.1, 1.0), (1 / 255, 0.5), (1e-7, 0.0)):
+        image, coc = edge(0.6)
+        image, coc = torch.where(coc < 0, 1.0, 1.0 - contrast).double(), coc.double()
+        image[..., 31] = 1.0 - 0.4 * contrast
+        weight = matte(image, coc).other_weight[0, 0, 24, 31]
+        assert float(weight) == pytest.approx(0.4 * trusted, abs=0.01)
+
+
 def test_no_light_is_lost_in_a_split() -> None:
     image, coc = random_scene()
     own, other, _, share = matte(image, coc)

@@ -194,10 +194,12 @@ def fill_hidden(
     else:
         seen, total, behind = graph.look(searched, maps, _look)
 
-    # each pixel behind which these levels show something gets it as its second sample
-    weight = HIDDEN_WEIGHT * (total / _CERTAIN).clamp(max=1.0)
-    hidden, visible = (seen[:, :-1], seen[:, -1:], weight), (other_light, other_coc_px, other_weight)
-    light, coc_px, weight = (torch.where(total > 0, *pair) for pair in zip(hidden, visible, strict=True))
+    # each pixel behind which these levels show something gets it as its second sample, together with a surface that is
+    # hardly mixed in: the more of that, the less of what is hidden
+    hidden = (total / _CERTAIN).clamp(max=1.0) * (HIDDEN_WEIGHT - other_weight).clamp_min(0.0)
+    weight = hidden + (1.0 - hidden / HIDDEN_WEIGHT) * other_weight
+    part = hidden / weight.clamp_min(1e-12)
+    light, coc_px = torch.lerp(other_light, seen[:, :-1], part), torch.lerp(other_coc_px, seen[:, -1:], part)
     return light, coc_px, weight, behind
 
 
@@ -333,6 +335,7 @@ def _least_px(level: int) -> float:
 
 
 def _continued(size: int, step: int) -> int:
-    """Pixels of an image that is continued for a pyramid."""
-    # in this form exported code knows that the sizes are multiples, and with one more that none of them is 1
-    return (size + 2 * step - 1) // step * step
+    """Pixels of an image that is continued for a pyramid: half a cell to each side, and whole pairs on every level."""
+    # so that the image's centre lies between two samples however many levels there are; exported code knows from this
+    # form that the sizes are multiples
+    return (size + BEHIND_STEP + 2 * step - 1) // (2 * step) * (2 * step)

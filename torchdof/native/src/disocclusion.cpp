@@ -141,9 +141,9 @@ class Filling {
   Filling(Job &job) : job_(job), s_(job.surfaces), C_(job.channels), stride_((job.channels + 2 + F8 - 1) / F8 * F8) {}
 
   void run() {
-    const int levels = job_.levels, step = 1 << levels;
-    area_height_ = (job_.height + 2 * step - 1) / step * step;
-    area_width_ = (job_.width + 2 * step - 1) / step * step;
+    const int levels = job_.levels, step = 2 << levels;  // half a cell to each side, and whole pairs on every level
+    area_height_ = ceil_div(job_.height + STEP, step) * step;
+    area_width_ = ceil_div(job_.width + STEP, step) * step;
     coarsest_ = std::min(levels, CELL_LEVEL);
     cell_ = 1 << coarsest_;
     cell_rows_ = ceil_div(job_.height, cell_);
@@ -463,9 +463,13 @@ class Filling {
             if (!(total > 0)) continue;
             const Block b = s_.make_block(by * s_.block_columns + bx);
             const int within = y % BLOCK * BLOCK + x % BLOCK;
-            for (int c = 0; c < C; c++) b.other[c * BLOCK_PIXELS + within] = shows[c];
-            b.coc[within] = shows[C];
-            b.weight[within] = HIDDEN_WEIGHT * std::min(total / CERTAIN, 1.0f) * (s_.valid ? s_.valid[(size_t)y * W + x] : 1.0f);
+            // together with a surface that is hardly mixed in: the more of that, the less of what is hidden
+            const float mixed = b.weight[within], hidden = std::min(total / CERTAIN, 1.0f) * (HIDDEN_WEIGHT - mixed);
+            const float weight = hidden + (1.0f - hidden / HIDDEN_WEIGHT) * mixed, part = hidden / std::max(weight, 1e-12f);
+            auto blend = [&](float &other, float hidden_one) { other = part < 1 ? other + part * (hidden_one - other) : hidden_one; };
+            for (int c = 0; c < C; c++) blend(b.other[c * BLOCK_PIXELS + within], shows[c]);
+            blend(b.coc[within], shows[C]);
+            b.weight[within] = weight * (s_.valid ? s_.valid[(size_t)y * W + x] : 1.0f);
           }
     });
   }
