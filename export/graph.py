@@ -4,6 +4,7 @@ import copy
 import dataclasses
 
 import torch
+import torch._dynamo.config
 from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
@@ -135,5 +136,7 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     free = torch.export.Dim.AUTO
     batch, frame = {0: free}, {0: free, 2: free, 3: free}
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
-    with torch.no_grad(), in_tiles():
+    # what torch would keep of each operator, to know one like it again, takes longer than it saves: sizes are symbols
+    uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
+    with torch.no_grad(), in_tiles(), uncached:
         return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)

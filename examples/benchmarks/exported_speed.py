@@ -9,6 +9,7 @@ to the largest radius of each file. ``--web FOLDER`` adds onnxruntime-web under 
 
 import argparse
 import base64
+import functools
 import importlib.util
 import json
 import os
@@ -88,17 +89,14 @@ def main() -> None:
         facts = runner.get_modelmeta().custom_metadata_map
         camera, options = Camera(**json.loads(facts["torchdof.camera"])), json.loads(facts["torchdof.options"])
         feed, focused = (feed_of(options, camera, (height, width), in_focus) for in_focus in (False, True))
-        works[f"{name}, onnxruntime"] = lambda runner=runner, feed=feed: runner.run(None, feed)
-        works[f"{name}, onnxruntime, in focus"] = lambda runner=runner, feed=focused: runner.run(None, feed)
+        works[f"{name}, onnxruntime"] = functools.partial(runner.run, None, feed)
+        works[f"{name}, onnxruntime, in focus"] = functools.partial(runner.run, None, focused)
         on_web[f"{name}, onnxruntime-web"] = (model, feed)
         if importlib.util.find_spec("openvino") is not None:
-            rendered = openvino_model(model, arguments.threads)
-            works[f"{name}, OpenVINO"] = lambda rendered=rendered, feed=feed: rendered(feed)
+            works[f"{name}, OpenVINO"] = functools.partial(openvino_model(model, arguments.threads), feed)
         scene = shipped(height, width).blurred(options["max_coc_px"])
         called = {key: options[key] for key in ("occlusion", "tolerance")}
-        works[f"{name}, the module"] = lambda scene=scene, called=called: blur_by_coc(
-            scene.image, scene.coc_px, **called
-        )
+        works[f"{name}, the module"] = functools.partial(blur_by_coc, scene.image, scene.coc_px, **called)
 
     taken: dict[str, list[float]] = {name: [] for name in works}
     with torch.inference_mode():
