@@ -176,7 +176,7 @@ def cost(tables: dict[str, BlurTable], reach_px: float, lamps: bool, rounds: int
 
 def draw(path: Path) -> None:
     """A street at night, the left half of it, through the middle of the lens all over and through the lens."""
-    from bokeh import street
+    from examples.bokeh import street
 
     options: dict[str, Any] = {"wavelengths_um": RGB_UM, "field": FIELD_MM[::2] + FIELD_MM[-1:], "field_rays": 30_000}
     table = trace_table(lens(), F_NUMBER, FOCUS_M, nodes=9, field_nodes=8, **options)
@@ -199,7 +199,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.picture:
-        sys.path.insert(0, os.fspath(Path(__file__).parents[1]))
+        sys.path.insert(0, os.fspath(Path(__file__).parents[2]))
         draw(arguments.picture)
         return
     start = time.process_time()

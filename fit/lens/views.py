@@ -104,12 +104,11 @@ def rays_of(
         for z, image in planes:
             across, down = traced.at(z)
             scale = image(across**2 + down**2) / pixel
-            met.append(
-                tuple(
-                    torch.from_numpy(side / 2 + v * scale).reshape(x.shape)
-                    for side, v in zip(size[::-1], (across, down), strict=True)
-                )
+            columns, rows = (
+                torch.from_numpy(side / 2 + v * scale).reshape(x.shape)
+                for side, v in ((size[1], across), (size[0], down))
             )
+            met.append((columns, rows))
         return met, torch.from_numpy(traced.alive / length**4).reshape(x.shape)
 
     return rays

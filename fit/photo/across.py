@@ -50,10 +50,11 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
         if not same or fitted.table.channels != first.channels:
             where = captures.notes.get("position_px")
             raise FitError(f"the dot at {where} px must be fitted at the distances and colours of the first one")
-    places = [tuple(v * per_px for v in captures.pairs[0].position_px) for captures, _ in dots]
+    centres = [captures.pairs[0].position_px for captures, _ in dots]
+    places = [(x * per_px, y * per_px) for x, y in centres]
     shrunk = [dots[0][0].focus_m / pair.distance_m for pair in dots[0][0]]
     field = field_of_dots([fitted.table for _, fitted in dots], places, shrunk)
-    found = {"dots_px": [list(captures.pairs[0].position_px) for captures, _ in dots]}
+    found = {"dots_px": [list(place) for place in centres]}
     return first.replace(aperture=None, field=field, provenance=first.provenance | found)
 
 
@@ -82,9 +83,9 @@ def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, flo
     for k in range(len(coc)):
         middle = _spot(tables, places, groups[0], k, everywhere=True)
         spots = [middle, *(_spot(tables, places, ring, k) for ring in rings)]
-        low, part = _between(rising * shrunk[k], radius)
+        low, share = _between(rising * shrunk[k], radius)
         reach, seen = torch.tensor([spot[0] for spot in spots]).double(), torch.stack([spot[1] for spot in spots])
-        part = torch.from_numpy(part)
+        part = torch.from_numpy(share)
         boxes.append(torch.lerp(reach[low], reach[low + 1], part))
         light.append(torch.lerp(seen[low], seen[low + 1], part[:, None, None, None]))
     sizes, cells = torch.stack(boxes), torch.stack(light)  # [K, F], [K, F, C, U, V]
