@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -132,13 +133,14 @@ def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, 
 def coc_nodes(near_mm: float, far_mm: float, count: int) -> list[float]:
     """Signed coc from the nearest to the farthest, closer to each other near focus; so many on either side on average.
 
-    The side that reaches farther has more of them, two at least.
+    The side that reaches farther has more of them, by the square root of how far.
 
     Example:
-        >>> [round(coc, 3) for coc in coc_nodes(-0.4, 0.2, 3)]
-        [-0.4, -0.26, -0.141, -0.05, 0.0, 0.071, 0.2]
+        >>> [round(coc, 3) for coc in coc_nodes(-0.8, 0.2, 3)]
+        [-0.8, -0.52, -0.283, -0.1, 0.0, 0.071, 0.2]
     """
-    of_far = min(max(2, round(2 * count * far_mm / (far_mm - near_mm))), 2 * count - 2) if far_mm > 0 else 0
+    share = math.sqrt(far_mm) / (math.sqrt(far_mm) + math.sqrt(-near_mm)) if far_mm > 0 else 0.0
+    of_far = min(max(2, round(2 * count * share)), 2 * count - 2) if far_mm > 0 else 0
     nodes = [0.0]
     for end, of_side in ((near_mm, 2 * count - of_far if of_far else count), (far_mm, of_far)):
         nodes += [end * (i / of_side) ** _GROWING for i in range(1, of_side + 1)]

@@ -40,7 +40,7 @@ def trace_table(
     width_px: int = 1920,
     rays: int | None = None,
     field: Sequence[float] | None = None,
-    field_nodes: int = 12,
+    field_nodes: int = 14,
     field_rays: int = 160_000,
     name: str | None = None,
 ) -> BlurTable:

@@ -41,6 +41,8 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     Raises:
         FitError: There are no two dots at different distances from the middle, or they were not fitted alike.
     """
+    if len(dots) < 2:
+        raise FitError(f"dots must be those of a grid, two at least, got {len(dots)}")
     first = dots[0][1].table
     per_px = float(first.coc[-1]) / dots[0][1].coc_px[-1]
     for captures, fitted in dots:

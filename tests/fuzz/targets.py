@@ -179,7 +179,7 @@ def _field_seeds(folder: Path) -> None:
         light = torch.rand(colours, 3, 3, 6, 4, generator=torch.Generator().manual_seed(colours))
         in_unit = {"unit": "mm", "sensor_width_mm": 36.0} if unit == "mm" else {"unit": unit}
         sigma = {"sigma": torch.full((colours, 2), 0.2)}
-        lens = BlurTable("gaussian", [-0.4, 0.5], sigma, field=Field(coc, radius, box, light), **in_unit)  # type: ignore[arg-type]
+        lens = BlurTable("gaussian", [-0.4, 0.5], sigma, field=Field(coc, radius, box, light), **in_unit)
         lens.save(folder / f"{unit}{colours}.json")
 
 
@@ -338,7 +338,8 @@ def _repair(path: Path) -> None:
         assert torch.equal(one.nan_to_num()[~known], nearness.nan_to_num()[~known]), f"{name}: what is unknown changes"
         assert float(one[known].abs().amax() if known.any() else 0.0) <= 10.0 * span, f"{name}: far beyond the map"
     usual = float(image.nan_to_num(0.0, 0.0, 0.0).abs().amax()) < 1e6 and span < 1e6
-    same = torch.isclose(*mended, rtol=1e-3, atol=1e-3 * span, equal_nan=True).float().mean()
+    plain, compiled = mended
+    same = torch.isclose(plain, compiled, rtol=1e-3, atol=1e-3 * span, equal_nan=True).float().mean()
     assert not usual or float(same) > 0.9, f"the engines agree on {float(same):.2f} of the pixels"
 
 

@@ -18,17 +18,36 @@ from pathlib import Path
 import torch
 
 from torchdof import BlurTable, Camera, DepthOfField
-from torchdof.render import compiled, plan
+from torchdof.optics import psf
+from torchdof.optics.field import Field
+from torchdof.render import compiled, downsampling, field, plan
 
-TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15"), BlurTable.load("wide_22mm_f4")]
+CACHES = [plan._kernels, compiled._kernels, field._shares, psf._quadrants, downsampling._factors]
+
+
+def lens_with_a_field() -> BlurTable:
+    """A lens whose spots grow towards the corners and lean outwards."""
+    box = torch.tensor([0.1, 0.5, 0.4]) * torch.linspace(1.0, 1.5, 3)[:, None].expand(2, 3, 1)
+    light = torch.linspace(1.0, 2.0, 8)[:, None].expand(1, 2, 3, 8, 6)
+    spots = Field(torch.tensor([-0.5, 0.5]), torch.tensor([0.0, 10.0, 20.0]), box, light)
+    return BlurTable("disc", [-0.5, 0.5], {"radius": [0.5, 0.5]}, unit="mm", sensor_width_mm=36.0, field=spots)
+
+
+TABLES = [
+    BlurTable.disc(),
+    BlurTable.gaussian(),
+    BlurTable.load("sato_j15"),
+    BlurTable.load("wide_22mm_f4"),
+    BlurTable.polygon(7, 15.0, vignetting=0.4),
+    lens_with_a_field(),
+]
 
 
 def resident_mb() -> float:
     """Memory that this process holds, without the kernels that it keeps on purpose, which are bounded."""
     gc.collect()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    kept = plan._kernels.bytes + compiled._kernels.bytes
-    return (pages * os.sysconf("SC_PAGE_SIZE") - kept) / 2**20
+    return (pages * os.sysconf("SC_PAGE_SIZE") - sum(cache.bytes for cache in CACHES)) / 2**20
 
 
 def rendering(seed: int) -> torch.Tensor:
@@ -45,6 +64,7 @@ def rendering(seed: int) -> torch.Tensor:
         tolerance=rng.choice(("draft", "preview", "final")),
         occlusion=rng.random() < 0.7,
         check=rng.random() < 0.7,
+        depth_edges=rng.choice(("auto", "repair", "as given")),
     )
     with torch.inference_mode():
         return dof(image, depth)

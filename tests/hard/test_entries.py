@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
-from torchdof.depth import depth_from_values, fill_holes
+from torchdof.depth import depth_from_values, fill_holes, repair_edges
 from torchdof.io.images import Picture, write_image
 from torchdof.optics import psf
 from torchdof.reference.lens_views import lens_views
@@ -32,7 +32,26 @@ def slope() -> Tensor:
     return torch.linspace(1.2, 6.0, 32).expand(1, 1, 24, 32)
 
 
+def posts() -> Tensor:
+    """Posts three pixels wide before a wall."""
+    depth = torch.full((1, 1, 24, 32), 2.5)
+    depth[..., 12:15] = depth[..., 4:16, 24:27] = 1.2
+    return depth
+
+
+def soft_posts() -> Tensor:
+    """The same as resampling leaves it: ramps swallow part of what is thin."""
+    return 1.0 / torch.nn.functional.avg_pool2d(1.0 / posts(), 3, 1, 1, count_include_pad=False)
+
+
+def lit_posts() -> Tensor:
+    return 0.1 * light() + (posts() < 2.0)
+
+
 ENTRIES: dict[str, Callable[[], Tensor]] = {
+    "repair_edges": lambda: repair_edges(lit_posts(), soft_posts()),
+    "forward, edges repaired": lambda: DepthOfField(CAMERA, depth_edges="repair")(lit_posts(), soft_posts()),
+    "forward, cat's eyes": lambda: DepthOfField(CAMERA, BlurTable.polygon(5, vignetting=0.4))(light(), slope()),
     "forward": lambda: DOF(light(), slope()),
     "forward with a plan": lambda: DOF(light(), slope(), plan=DOF.plan(light(), slope())),
     "forward with a background": lambda: DOF(light(), slope(), background=light(), background_depth=2 * slope()),

@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
+from rich.console import Console
 from torch import Tensor
 from typer.testing import CliRunner
 
 from torchdof import BlurTable, blur_by_coc
+from torchdof.cli.fit import _draw_table
 from torchdof.cli.main import app
 from torchdof.depth.edges import repair
 from torchdof.fit.lens.glass import Glass
@@ -80,8 +83,9 @@ def test_a_field_that_inflates_without_end_is_refused() -> None:
 
 @pytest.mark.parametrize("name", ["blades", "rotation_deg", "curvature", "squeeze", "vignetting"])
 def test_openings_of_a_number_of_400_digits_are_refused(name: str) -> None:
+    given: dict[str, Any] = {"blades": 5, name: HUGE}
     with pytest.raises(ValueError, match=name):
-        Aperture(**{"blades": 5, name: HUGE})
+        Aperture(**given)
 
 
 @pytest.mark.parametrize(
@@ -199,3 +203,31 @@ def test_a_root_holds_photographs_without_a_description_as_well(tmp_path: Path) 
     said: Callable[[Path], str] = lambda root: CliRunner().invoke(app, [*call, str(root)]).output  # noqa: E731
     assert "lies outside of" in said(tmp_path / "photographs")
     assert "show the target" in said(tmp_path)
+
+
+def test_a_plot_that_cannot_be_finished_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(_: Figure, path: Path) -> None:
+        Path(path).write_bytes(b"half of a picture")
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        _draw_table(BlurTable.disc(), tmp_path, "disc", Console(quiet=True))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("engine", ["torch", "native"])
+@pytest.mark.parametrize(
+    "table",
+    [field_table(), BlurTable.polygon(5, 15.0, vignetting=0.4), BlurTable.from_aperture(torch.eye(5), squeeze=2.0)],
+    ids=["field", "polygon", "image"],
+)
+def test_light_of_1e30_beside_a_step_is_as_in_float64_through_any_lens(
+    table: BlurTable, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    image, coc_px = torch.full((1, 3, 12, 16), 0.1), torch.full((1, 1, 12, 16), -4.0)
+    image[..., 6, 8], coc_px[..., 8:] = 1e30, 3.0
+    truth = blur_by_coc(image.double(), coc_px.double(), table=table)
+    out = blur_by_coc(image, coc_px, table=table)
+    assert float((out.double() - truth).abs().max() / truth.abs().max()) < 1e-5

@@ -30,21 +30,7 @@ def exported(layered: Any) -> Any:
     return exported_module.Exported(layered.path, layered.dof)
 
 
-ROUNDED = {  # where light in front is far brighter than what shows past it, float32 rounds what it leaves
-    "1e30 in 0.1, 3 x 3 pixels, beside a depth step (float16: 65504)",
-}
-
-
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param(case, marks=pytest.mark.xfail(strict=True, reason="float32 rounds what bright light leaves"))
-        if case.name in ROUNDED
-        else case
-        for case in cases.CASES
-    ],
-    ids=lambda case: f"{case.group}: {case.name}",
-)
+@pytest.mark.parametrize("case", cases.CASES, ids=lambda case: f"{case.group}: {case.name}")
 def test_the_file_renders_every_hard_case_as_the_module(exported: Any, case: Any) -> None:
     assert exported_module.worst_error(exported, cases, case) <= case.onnx_limit
 

@@ -67,10 +67,11 @@ def feed(session: onnxruntime.InferenceSession, size: tuple[int, int], scene: st
 
 
 def session(path: str, threads: int) -> onnxruntime.InferenceSession:
-    """On the CPU, with so many threads, and with what a frame needed given back after it."""
+    """On the CPU, with so many threads, without a second block of memory of the size that the first frame took."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
+    options.enable_mem_pattern = False
     return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
 
 

@@ -19,6 +19,7 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
+from ..io.atomic import whole_file
 from ..module import DepthOfField, blur_by_coc
 from ..optics.camera import Camera
 from ..options import Method
@@ -422,4 +423,5 @@ def _plot(path: Path, rows: Sequence[SettingCost], scene: BenchScene) -> None:
     axes.set_title(_title(scene), fontsize=9)
     axes.grid(True, which="both", lw=0.3)
     axes.legend(fontsize=8, title="filled: Pareto front", title_fontsize=7)
-    figure.savefig(path)
+    with whole_file(path) as part:
+        figure.savefig(part)

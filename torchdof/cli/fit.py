@@ -21,6 +21,7 @@ from torchdof.fit.photo.photographs import Photographs, read_photographs
 from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.photo.target import SQUARE_MM, Paper, write_target
 from torchdof.fit.problems import FitError, FitWarning
+from torchdof.io.atomic import whole_file
 from torchdof.validation import number
 
 __all__ = ["fit"]
@@ -240,13 +241,11 @@ def _draw_sheet(photographs: Photographs, result: TableFit, target: Path, consol
     try:
         from torchdof.fit.sheet import sheet_of_photographs
 
-        sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2])).savefig(
-            target
-        )
+        sheet = sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2]))
     except ModuleNotFoundError as error:
         console.print(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
         return
-    console.print(str(target), markup=False, highlight=False)
+    _save(sheet, target, console)
 
 
 def _fit_with_progress(
@@ -365,8 +364,7 @@ def _draw_fits(captures: Captures, result: TableFit, folder: Path, stem: str, co
 
     for pair, fitted in zip(captures, result.fits, strict=True):
         target = folder / f"{stem}_{pair.distance_m * 1000:.0f}mm.png"
-        picture_of_fit(fitted).savefig(target)
-        console.print(str(target), markup=False, highlight=False)
+        _save(picture_of_fit(fitted), target, console)
 
 
 def _draw_table(table: BlurTable, folder: Path, stem: str, console: Console) -> None:
@@ -374,11 +372,16 @@ def _draw_table(table: BlurTable, folder: Path, stem: str, console: Console) -> 
     from torchdof.fit.plots import picture_of_table, picture_of_texture
 
     target = folder / f"{stem}_table.png"
-    picture_of_table(table).savefig(target)
-    console.print(str(target), markup=False, highlight=False)
+    _save(picture_of_table(table), target, console)
     width = 1920
     largest = float(table.coc[table.coc.abs().argmax()])
     scale = {"fraction": float(width), "mm": width / (table.sensor_width_mm or 36.0), "relative": 16.0}[table.unit]
     target = folder / f"{stem}_texture.png"
-    picture_of_texture(table, largest * scale, width).savefig(target)
+    _save(picture_of_texture(table, largest * scale, width), target, console)
+
+
+def _save(figure: Any, target: Path, console: Console) -> None:
+    """Writes a figure, whole or not at all."""
+    with whole_file(target) as part:
+        figure.savefig(part)
     console.print(str(target), markup=False, highlight=False)

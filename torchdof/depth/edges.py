@@ -146,6 +146,10 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
     Returns:
         ``[B, 1, H, W]``, constant to autograd; where nothing is repaired, the given values themselves.
     """
+    device = image.device.type
+    if torch.is_autocast_enabled(device):  # it would convolve in half precision
+        with torch.autocast(device, enabled=False):
+            return repair(image, nearness, step, auto)
     light, given = image.detach().float(), nearness.detach().float().expand(len(image), -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():

@@ -132,8 +132,8 @@ class Field:
         return torch.where(lit, torch.hypot(farthest[..., None], v[..., None, :]), 0.0).amax((0, 2, 3, 4))
 
     def finest(self, coc: float) -> float:
-        """Radius of the disc about as fine as the finest of the spots of a signed coc, up to halfway to the corner."""
-        box, light = self.spots(coc, self.radius[-1] * torch.linspace(0.0, 0.5, 5, dtype=torch.float64))
+        """Radius of the disc about as fine as the spot of a signed coc in the middle of the frame."""
+        box, light = self.spots(coc, self.radius[:1])
         return float(2.0 * deviations(box, light).amin())
 
     def fingerprint(self) -> str:

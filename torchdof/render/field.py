@@ -47,7 +47,7 @@ BLOCK = (8, 16)
 DISTANCES = 17
 """Distances from the middle of the frame to its corner at which shares are told."""
 
-_FINE = 2.0, 4.0  # samples a pixel: of a layer, and of highlights, whose outlines one sees
+_FINE = 4.0  # samples a pixel
 _MOST = 64  # samples on each side of the origin
 _LEAST_SEEN = 0.5  # px around a sample
 _MARGIN = 1.0  # px around a spot: none of its light is at the border of the samples
@@ -111,7 +111,7 @@ def layer_shares(table: BlurTable, coc_px: float, scale: int, size: tuple[int, i
         size: Height and width of the image.
     """
     key = ("layer", table.fingerprint(), coc_px, scale, size)
-    values, boxes = _shares.get(key, lambda: _made(table, coc_px, scale, size, _FINE[0]))
+    values, boxes = _shares.get(key, lambda: _made(table, coc_px, scale, size))
     return Shares(values, boxes, coc_px / scale, _squeeze(table))
 
 
@@ -123,7 +123,7 @@ def ray_shares(table: BlurTable, coc_px: Sequence[float], size: tuple[int, int])
         steps |= {(coc < 0, step), (coc < 0, step + 1)}
     radii = sorted(math.copysign(_RAY_STEP**step, -1.0 if near else 1.0) for near, step in steps)
     keys = [("ray", table.fingerprint(), radius, 1, size) for radius in radii]
-    made = _shares.get_all(keys, lambda missing: [_made(table, key[2], 1, size, _FINE[1]) for key in missing])
+    made = _shares.get_all(keys, lambda missing: [_made(table, key[2], 1, size) for key in missing])
     squeeze = _squeeze(table)
     return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(made, radii, strict=True)]
 
@@ -133,7 +133,7 @@ def _squeeze(table: BlurTable) -> float | Tensor:
 
 
 @torch.inference_mode(False)  # what is kept must serve autograd as well
-def _made(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int], fine: float) -> tuple[Tensor, Tensor]:
+def _made(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Values and boxes of :class:`Shares`, float64."""
     half_diagonal = 0.5 * math.hypot(*size)
     distance = torch.linspace(0.0, 1.0, DISTANCES, dtype=torch.float64)
@@ -150,7 +150,7 @@ def _made(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int], fi
     smaller = (1.0 - added / spread.clamp_min(1e-12)).clamp_min(_LEAST_SIZE**2).sqrt()
     boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * smaller], -1)
     around = boxes + torch.tensor([0.0, _MARGIN, _MARGIN], dtype=torch.float64)
-    rows, columns = (min(_MOST, math.ceil(fine * float(side))) for side in around[:, 1:].amax(0))
+    rows, columns = (min(_MOST, math.ceil(_FINE * float(side))) for side in around[:, 1:].amax(0))
     along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64) * around[:, 1:2] + around[:, :1]
     across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64) * around[:, 2:]
     length, width = light.shape[-2:]

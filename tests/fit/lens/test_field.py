@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from examples.benchmarks import across_field
-from torchdof import BlurTable
+from torchdof import BlurTable, blur_by_coc
 from torchdof.fit import trace_table
 from torchdof.fit.lens import Lens
+from torchdof.fit.lens.field import field_height_mm, spot_of_place
+from torchdof.fit.lens.lens import RGB_UM
 from torchdof.fit.lens.spot import focus_sensor
 from torchdof.fit.lens.views import rays_of
 from torchdof.optics.aperture import Aperture
@@ -69,6 +71,27 @@ def test_a_picture_across_the_field_is_what_rays_through_the_lens_make(table: Bl
     found = across_field.views_db(tables, [Plane(0.9, waves(11))], (14.0,), 360, 20, 100)
     assert found["field"][0] > 52.0
     assert found["round"][0] < 42.0
+
+
+def test_lateral_colour_draws_colours_beside_each_other(gauss: Lens) -> None:
+    options: dict[str, Any] = {"nodes": 5, "points": 9, "rays": 200, "field": (0, 16.5), "field_nodes": 2}
+    table = trace_table(gauss, 4.0, 2.0, wavelengths_um=RGB_UM, field_rays=3_000, **options)
+    assert table.field is not None
+    stopped, width, column = gauss.with_f_number(4.0), 3840, 3680  # 16.5 mm from the middle of 36
+    sensor = focus_sensor(stopped, 2.0)
+    height = field_height_mm(stopped, 2.0, sensor, 16.5, "principal")
+    centres = []
+    for wavelength in RGB_UM:
+        u, _, weight = spot_of_place(stopped, math.inf, sensor, height, 3_000, wavelength)
+        centres.append(float(weight @ u) * width / 36.0)
+    image = torch.zeros(1, 3, 48, width)
+    image[..., 24, column] = 1.0
+    coc_px = float(table.field.coc[-1]) * width / 36.0
+    with torch.no_grad():
+        picture = blur_by_coc(image, torch.full_like(image[:, :1], coc_px), table=table)[0].double()
+    across = picture.sum(1) @ (torch.arange(width) - column).double() / picture.sum((1, 2))
+    assert centres[2] - centres[0] > 0.2  # px
+    assert (across - across[1]).tolist() == pytest.approx([c - centres[1] for c in centres], abs=0.05)
 
 
 def test_on_the_axis_spots_are_round_and_lie_on_it(table: BlurTable) -> None:

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from torchdof import BlurTable
 from torchdof.cli.main import app
-from torchdof.fit.photo.across import field_of_dots
+from torchdof.fit.photo.across import field_of_dots, table_of_dots
 from torchdof.fit.problems import FitError
 from torchdof.optics.field import deviations
 
@@ -78,3 +78,8 @@ def test_dots_at_one_distance_are_refused():
     table = BlurTable("disc", coc=[1.0], params={"radius": [1.0]}, unit="fraction")
     with pytest.raises(FitError, match="at two distances from the middle"):
         field_of_dots([table], [(0.0, 0.0)], [1.0])
+
+
+def test_no_dots_are_refused():
+    with pytest.raises(FitError, match="two at least, got 0"):
+        table_of_dots([])

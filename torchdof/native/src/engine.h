@@ -364,14 +364,14 @@ class Turned {
       Samples &s = samples_[k];
       const int rows = of[k]->rows, count = rows * of[k]->columns;
       s.columns = of[k]->columns;
+      s.near = near;
       s.last_row = (float)(rows - 1);
       s.last_column = (float)(s.columns - 1);
       s.per_u = s.last_row / (2.0f * box[1]);
       s.first_u = 0.5f * s.last_row - box[0] * s.per_u;
       s.per_v = s.last_column / box[2];
-      s.values.resize(count);
-      const float *p = of[k]->values + ((size_t)(of[k]->colours > 1 ? colour : 0) * scene.distances + low) * count, *q = p + count;
-      for (int i = 0; i < count; i++) s.values[i] = p[i] + near * (q[i] - p[i]);
+      s.values = of[k]->values + ((size_t)(of[k]->colours > 1 ? colour : 0) * scene.distances + low) * count;
+      s.next = s.values + count;
     }
   }
   float share(float dy, float dx) const {
@@ -383,16 +383,21 @@ class Turned {
  private:
   static constexpr float ASIDE = 1e-6f;
   struct Samples {
-    std::vector<float> values;
+    const float *values, *next;  // of the distance before the place and of the one after it
     int columns;
-    float last_row, last_column, per_u, first_u, per_v;
+    float near, last_row, last_column, per_u, first_u, per_v;
     float at(float u, float v) const {
       // what is no number is 0
       const float row = std::min(std::max(0.0f, u * per_u + first_u), last_row), column = std::min(std::max(0.0f, v * per_v), last_column);
       const int i = std::min((int)row, (int)last_row - 1), j = std::min((int)column, (int)last_column - 1);
-      const float down = row - i, right = column - j, *p = values.data() + i * columns + j;
-      const float upper = p[0] + right * (p[1] - p[0]), lower = p[columns] + right * (p[columns + 1] - p[columns]);
-      return clamp01(upper + down * (lower - upper));
+      const float down = row - i, right = column - j;
+      float mean[2];
+      for (int k = 0; k < 2; k++) {
+        const float *p = (k ? next : values) + i * columns + j;
+        const float upper = p[0] + right * (p[1] - p[0]), lower = p[columns] + right * (p[columns + 1] - p[columns]);
+        mean[k] = upper + down * (lower - upper);
+      }
+      return clamp01(mean[0] + near * (mean[1] - mean[0]));
     }
   };
   Samples samples_[2];
