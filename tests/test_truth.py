@@ -21,7 +21,7 @@ SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parent / "da
 GAIN_DB = {"planes/0": 3.5, "room/1": 4.0, "highlights/0": 3.0}
 """How much nearer the truth than Ikoma's formula: floors a little below what was measured (5.0, 4.4 and 3.5 dB)."""
 MEASURED_DB = {
-    "highlights/0": (20.358, 32.792),
+    "highlights/0": (20.358, 32.786),
     "planes/0": (31.374, 30.247),
     "portrait/0": (22.217, 20.536),
     "room/1": (40.800, 47.284),

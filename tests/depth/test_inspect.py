@@ -66,11 +66,11 @@ def test_a_slope_is_no_edge() -> None:
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
 def test_exact_depth_is_told_from_damaged(scene: Scene) -> None:
-    exact, *damaged = (
+    exact, soft, shifted = (
         inspect_depth(scene.image, degrade(scene.depth, kind), scene.camera).doubtful
         for kind in ("exact", "half-res", "shift 1px")
     )
-    assert exact == 0.0 and min(damaged) > 0.05
+    assert exact == 0.0 < shifted and soft > 0.05  # where edges are in doubt, not how far they are off
 
 
 def test_ranges_holes_and_shares_are_those_of_the_map() -> None:

@@ -41,6 +41,7 @@ _PLACES = 2 * _RINGS + _LEVELS
 _TRUSTED = 0.05  # share of wrong pixels that a map is assumed to have
 _ROUNDS = 10
 _SHARPNESS = 1.6  # how much surer colours are than their likelihoods say, which count witnesses on the wrong side
+_UNSEEN = 0.05  # likelihood of a colour on a surface that is not in sight
 _MOST = 4.0  # times its own step, a thin structure stands out at most
 _BLUR_REACH = 9
 _MIDDLE = (0.3, 0.2)  # part of a step by which a level lies off the middle, up to which it is in the middle half
@@ -50,7 +51,7 @@ _PIXELS = 0.25  # variance that differences between pixels add to a blur, in pix
 _BETTER = 0.5  # part of what a shape leaves unexplained that its blur explains, where it is blurred
 _LEAN = 2.0  # by how much likelier the far surface must be, as a logarithm: foreground left behind is seen more
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
-_FADE = 0.2  # of a logarithm of likelihoods: a pixel that is not surer of its surface lies between both
+_FADE = 0.03  # of a logarithm of likelihoods: a pixel that is not surer of its surface lies between both
 _SUREST = 13.0  # no pixel is surer than this
 # what decides fades in between these
 _EXACT = (0.02, 0.03)  # share of wrong pixels up to which a map's steps count as exact
@@ -61,6 +62,7 @@ _CLEAR = (0.28, 0.32)  # part of a step by which a level lies off the middle, wh
 _OF_SIDE = (0.3, 0.2)  # the same by which a witness of a surface is off it
 _STANDS = (1.0, 1.2)  # times the least step
 _ENDS = (0.3, 0.24)  # part of its own slope that a ramp has left where it ends
+_KNOWN = (1e-3, 2e-3)  # weight of witnesses
 _LAMP, _GLOW = (4.0, 5.0), (2.0, 2.5)  # times the usual brightness around
 _SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
 _BLOCK = 32
@@ -209,10 +211,10 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
 
     # which surface they show
     firmness = pixels.put(torch.zeros_like(given), edge_pixels, strength)
-    score, evidence, near, far = _judge(light, given, valid, edges, firmness, edge_pixels)
+    score, evidence, near, far = _judge(light, given, valid, edges, firmness, edge_pixels, one_counts=True)
     shows_near = score + torch.logit(prior)
     if auto:  # else steps that prove right are asked as well, and would be moved
-        shows_near = shows_near + _LEAN
+        shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
     is_near = level > 0.5
     stays = torch.where(is_ramp, 0.0, _SUREST * (1.0 - strength))
     shows_near = (0.5 + (shows_near + torch.where(is_near, stays, -stays)) / _FADE).clamp(0.0, 1.0)
@@ -323,7 +325,7 @@ def _learn(light: Tensor, nearness: Tensor, valid: Tensor, edges: _Edges, auto: 
     rows, columns = (torch.arange(n, device=nearness.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + 3 * columns) % every == 0))
     strength = pixels.pick(edges.strength, sampled)[0]
-    score = _judge(light, nearness, valid, edges, edges.strength, sampled)[0]
+    score = _judge(light, nearness, valid, edges, edges.strength, sampled, one_counts=False)[0]
     shares = _calibrate(nearness, edges, sampled, score)
     habits = _Habits(shares, *[shares.new_zeros(len(nearness), 1, 1, 1)] * 5)
 
@@ -351,9 +353,17 @@ def _learn(light: Tensor, nearness: Tensor, valid: Tensor, edges: _Edges, auto: 
 
 
 def _judge(
-    light: Tensor, nearness: Tensor, valid: Tensor, edges: _Edges, firmness: Tensor, edge_pixels: Tensor
+    light: Tensor,
+    nearness: Tensor,
+    valid: Tensor,
+    edges: _Edges,
+    firmness: Tensor,
+    edge_pixels: Tensor,
+    one_counts: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Which of two surfaces pixels ``[P]`` show, by their colour; neighbours are heard as far as they are firm.
+
+    Where only one of the surfaces is in sight, as in the middle of wide ramps, whether it is that one counts if asked.
 
     Returns:
         ``[P]`` each: the logarithm of how much likelier the near one is; how surely the colours of the two tell, 0 to
@@ -376,7 +386,7 @@ def _judge(
 
         # what the surfaces look like: mean colours, and how far colours stray from these
         sums = [side.sum(0) for side in sides]
-        known = _fade(torch.minimum(*sums), (1e-3, 2e-3))
+        known = _fade(torch.minimum(*sums), _KNOWN)
         totals = [total + 1e-9 for total in sums]
         means = [(others * side).sum(1) / total for side, total in zip(sides, totals, strict=True)]
         spreads = [
@@ -396,6 +406,12 @@ def _judge(
             for side, total, mean in zip(sides, totals, means, strict=True)
         ]
         score = known * torch.log(likelihoods[0] / likelihoods[1]).clamp(-8.0, 8.0)
+        alone = (1.0 - known) * one_counts
+        for sign, side, total, spread, mean in zip((1.0, -1.0), sides, totals, spreads, means, strict=True):
+            spread = spread + 9e-4 * mean.square().sum(0) + 1e-30
+            alike_one = (1.0 + (others - own[:, None]).square().sum(0) / (0.3 * spread)).pow(-2)
+            vote = torch.log(((side * alike_one).sum(0) / total + 0.02) / _UNSEEN).clamp(-3.0, 3.0)
+            score = score + sign * alone * _fade(total, _KNOWN) * vote
         surfaces = []
         for side, end in zip(sides, (near, far), strict=True):
             share = side * (alike + 1e-3)

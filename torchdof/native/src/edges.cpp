@@ -15,7 +15,7 @@ namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, ROUNDS = 10;
 constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, SHARPNESS = 1.6f, MOST = 4.0f, WHOLE = 1.1f, MIDDLE_HALF = 1.22f, PIXELS = 0.25f, BETTER = 0.5f, LEAN = 2.0f, FADE = 0.2f, SUREST = 13.0f;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, SHARPNESS = 1.6f, MOST = 4.0f, WHOLE = 1.1f, MIDDLE_HALF = 1.22f, PIXELS = 0.25f, BETTER = 0.5f, LEAN = 2.0f, UNSEEN = 0.05f, FADE = 0.03f, SUREST = 13.0f;
 constexpr float EXACT[2] = {0.02f, 0.03f}, DOUBTFUL[2] = {0.04f, 0.06f}, SOFT[2] = {0.1f, 0.15f}, RELATED[2] = {0.78f, 0.82f}, CLEAR[2] = {0.28f, 0.32f}, MIDDLE[2] = {0.3f, 0.2f}, OF_SIDE[2] = {0.3f, 0.2f}, STANDS[2] = {1.0f, 1.2f}, ENDS[2] = {0.3f, 0.24f}, LAMP[2] = {4.0f, 5.0f}, GLOW[2] = {2.0f, 2.5f};
 constexpr float KNOWN[2] = {1e-3f, 2e-3f}, OF_PEAK[2] = {0.1f, 0.12f}, SPAN[2] = {0.5f, 0.6f}, SPREAD[2] = {0.004f, 0.005f};
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
@@ -177,7 +177,7 @@ class Repair {
     std::vector<Group> sampled = blocks(every);
     spares ? find_around(sampled) : find();
     list(sampled, [](int) { return true; });
-    judge(sampled);
+    judge(sampled, false);
     decide(sampled);
     calibrate(sampled);
     const float heard = map_.automatic ? fade(agreement(sampled), RELATED) : 1.0f;
@@ -189,7 +189,7 @@ class Repair {
       if (map_.automatic) strength_[i] *= marks_[i] & RAMP ? softness : inexactness * fade(wrong(i), DOUBTFUL);
       return strength_[i] > 0;
     });
-    judge(groups);
+    judge(groups, true);
     decide(groups);
     const float sigma = blur();
     const float lost_px = choose(groups);
@@ -587,8 +587,8 @@ class Repair {
     }
   }
 
-  // Which of two surfaces pixels show, by their colour.
-  void judge(std::vector<Group> &groups) const {
+  // Which of two surfaces pixels show, by their colour; also where only one of the two is in sight, if that counts.
+  void judge(std::vector<Group> &groups, bool one_counts) const {
     std::vector<float> falloff(SIDE * ACROSS, 0.0f);
     for (int v = -REACH; v <= REACH; v++)
       for (int u = -REACH; u <= REACH; u++) falloff[(v + REACH) * ACROSS + u + REACH] = std::exp(-(float)(v * v + u * u) / 12.5f);
@@ -596,10 +596,10 @@ class Repair {
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].pixels.empty()) return;
       switch (channels_) {
-        case 1: return judge<1>(groups[g], falloff.data());
-        case 3: return judge<3>(groups[g], falloff.data());
-        case 4: return judge<4>(groups[g], falloff.data());
-        default: judge<0>(groups[g], falloff.data());
+        case 1: return judge<1>(groups[g], falloff.data(), one_counts);
+        case 3: return judge<3>(groups[g], falloff.data(), one_counts);
+        case 4: return judge<4>(groups[g], falloff.data(), one_counts);
+        default: judge<0>(groups[g], falloff.data(), one_counts);
       }
     });
   }
@@ -634,7 +634,7 @@ class Repair {
 
   // C: channels, or 0 for any number.
   template <int C>
-  void judge(Group &group, const float *falloff) const {
+  void judge(Group &group, const float *falloff, bool one_counts) const {
     const int channels = C ? C : channels_;
     const Part around = bounds(group).grown(REACH);
     const Grid given(around), witness(around), colour(around, channels + 1);
@@ -684,7 +684,28 @@ class Repair {
       Judgement &judged = group.judged[k];
       judged = {0.0f, 1.0f, near, far, 0.0f};
       const float known = fade(std::min(sums[0], sums[1]), KNOWN);
-      if (!(known > 0)) continue;  // the neighbours tell
+      float alone = 0;  // what one surface tells where only that one is in sight
+      if (one_counts && known < 1.0f)
+        for (int side = 0; side < 2; side++) {
+          const float seen = fade(sums[side], KNOWN);
+          if (!(seen > 0)) continue;
+          float of_mean = 0;
+          for (int c = 0; c < channels; c++) {
+            const float mean = sum(C ? few[side][c] : load<vec>(many + (side * channels + c) * LANES)) / sums[side];
+            of_mean += mean * mean;
+          }
+          const float wide = std::max(sum(square[side]) / sums[side] - of_mean, 0.0f) + 9e-4f * of_mean + 1e-30f;
+          const float per_wide = 1.0f / (0.3f * wide);
+          vec likely = {};
+          for (int n = 0; n < SIDE * ACROSS / LANES; n++) {
+            const vec t = 1.0f + apart[n] * per_wide;
+            likely += weights[side][n] / (t * t);
+          }
+          const float vote = clamp(std::log((sum(likely) / sums[side] + 0.02f) / UNSEEN), -3.0f, 3.0f);
+          alone += (side ? -1.0f : 1.0f) * (1.0f - known) * seen * vote;
+        }
+      judged.score = alone;
+      if (!(known > 0)) continue;  // else the neighbours tell
       float spread = 0, contrast = 0, noise = 0, from_mean[2] = {0, 0};
       for (int side = 0; side < 2; side++) {
         float of_mean = 0;
@@ -720,7 +741,7 @@ class Repair {
         surface[side] = (side ? far : near) + known * (sum(value[side]) / std::max(sum(share[side]), 1e-12f));
       }
       const float tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
-      judged = {known * clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), 1.0f + known * (tells - 1.0f), surface[0], surface[1], 0.0f};
+      judged = {alone + known * clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), 1.0f + known * (tells - 1.0f), surface[0], surface[1], 0.0f};
     }
   }
 
@@ -895,7 +916,7 @@ class Repair {
         const int i = groups[g].pixels[k];
         const float score = groups[g].judged[k].score, share = prior(i);
         const float stays = marks_[i] & RAMP ? 0.0f : SUREST * (1.0f - strength_[i]);
-        const float surely = score + std::log(share / (1.0f - share)) + lean + (is_near(i) ? stays : -stays);
+        const float surely = score + std::log(share / (1.0f - share)) + lean * clamp01(std::fabs(score) - 1.0f) + (is_near(i) ? stays : -stays);
         score_[i] = clamp01(0.5f + surely / FADE);
       }
       const Part &part = groups[g].part;
