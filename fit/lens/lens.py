@@ -30,7 +30,7 @@ RGB_UM = (C_UM, 0.54607, F_UM)
 _SHIPPED = Path(__file__).parent / "lenses"
 _NORMAL = 0.6438, -0.001682  # P_gF of normal glasses at V = 0, and its slope
 _LARGEST = 1e12  # mm, of focal lengths and what else first-order optics tells of a lens
-_MOST_CONIC, _DEEPEST_MM = 1e6, 1e5  # of a surface's shape
+_MOST_CONIC, _DEEPEST_MM = 1e6, 1e15  # of a surface's shape
 _MARKED = 1.03  # a lens is sold by a rounded f-number: f/2.03 is marked f/2
 
 

@@ -31,7 +31,6 @@ from ..validation import floating, is_traced, pixels_wide, real_tensor, show, wh
 
 __all__ = ["CAMERA_NUMBERS", "Camera"]
 
-_FARTHEST = 2.0**126  # metres: so far is as good as infinitely far
 _MAY_BE_INFINITE = ("focus_m", "focus_range_m")
 CAMERA_NUMBERS = ("focal_length_mm", "f_number", "focus_m", "sensor_width_mm")
 
@@ -362,11 +361,10 @@ class Camera:
 
 def _dioptres_behind(z: Tensor, s: Tensor) -> Tensor:
     """``1/s - 1/z``, exactly 0 at ``z = s``, for finite and infinite distances."""
-    # (z - s) / z / s, or (z / _FARTHEST - 1) / z where s is infinite; _FARTHEST stands for infinite z
-    z = z.clamp(max=_FARTHEST)
-    finite = torch.isfinite(s)
-    divisor = torch.where(finite, s, 1.0)
-    return torch.addcmul(-divisor, z, torch.where(finite, 1.0, 1.0 / _FARTHEST).to(z.dtype)) / z / divisor
+    both_finite = torch.isfinite(z) & torch.isfinite(s)
+    z_safe = torch.where(both_finite, z, 1.0)
+    s_safe = torch.where(both_finite, s, 1.0)
+    return torch.where(both_finite, (z_safe - s_safe) / z_safe / s_safe, 1.0 / s - 1.0 / z)
 
 
 def _weighted_median(values: Tensor, weights: Tensor) -> Tensor:

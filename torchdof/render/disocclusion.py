@@ -176,6 +176,10 @@ def fill_hidden(
     pyramid = [_first_level(far_light, far_coc, far_weight, whole[0] // 2, whole[1] // 2)]
     for _ in range(1, levels):
         pyramid.append(_farthest(*pyramid[-1]))
+    # a cell that holds no pixel with light has the mean of those that do
+    light, coc, weight = pyramid[_FINE_LEVELS - 1]
+    mean = (light * weight).sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp_min(1e-12)
+    pyramid[_FINE_LEVELS - 1] = torch.where(weight > 0, light, mean), coc, weight
     searched = [Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
 
     # what coarse levels show behind cells is one level of such cells; and the farthest of all is behind both surfaces

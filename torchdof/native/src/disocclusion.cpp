@@ -397,6 +397,18 @@ class Filling {
       xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * STEP, STEP, columns, l.width, &Level::place_x, l));
     }
     const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
+    std::vector<float> mean(C, 0.0f);  // of cells that hold light, for those that hold none
+    if (s_.valid) {
+      std::vector<double> sums(C + 1, 0.0);
+      for (int row = 0; row < rows; row++)
+        for (int column = 0; column < columns; column++) {
+          const float *of = base.at(row, column), weight = of[C + 1];
+          if (!(weight > 0)) continue;
+          for (int c = 0; c < C; c++) sums[c] += (double)weight * of[c];
+          sums[C] += weight;
+        }
+      for (int c = 0; c < C; c++) mean[c] = (float)(sums[c] / std::max(sums[C], 1e-12));
+    }
     job_.parallel(rows, [&](int row, int) {
       std::vector<float> shows(stride_);
       std::vector<f8> samples((size_t)levels * count);
@@ -405,6 +417,7 @@ class Filling {
       for (int column = 0; column < columns; column++) {
         const size_t at = (size_t)row * columns + column;
         const float *shown = base.at(row, column);
+        if (!(shown[C + 1] > 0)) shown = mean.data();
         float *const coarsely = coarse ? together.at(row, column) : nullptr;
         if (coarse) memset(coarsely, 0, stride_ * sizeof(float));
         const int top = first_y + row * STEP, left = first_x + column * STEP;

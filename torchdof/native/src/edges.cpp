@@ -13,11 +13,9 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, ROUNDS = 10;
+constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
 constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, SHARPNESS = 1.6f, MOST = 4.0f, WHOLE = 1.1f, MIDDLE_HALF = 1.22f, PIXELS = 0.25f, BETTER = 0.5f, LEAN = 2.0f, UNSEEN = 0.05f, FADE = 0.03f, SUREST = 13.0f;
-constexpr float EXACT[2] = {0.02f, 0.03f}, DOUBTFUL[2] = {0.04f, 0.06f}, SOFT[2] = {0.1f, 0.15f}, RELATED[2] = {0.78f, 0.82f}, CLEAR[2] = {0.28f, 0.32f}, MIDDLE[2] = {0.3f, 0.2f}, OF_SIDE[2] = {0.3f, 0.2f}, STANDS[2] = {1.0f, 1.2f}, ENDS[2] = {0.3f, 0.24f}, LAMP[2] = {4.0f, 5.0f}, GLOW[2] = {2.0f, 2.5f};
-constexpr float KNOWN[2] = {1e-3f, 2e-3f}, OF_PEAK[2] = {0.1f, 0.12f}, SPAN[2] = {0.5f, 0.6f}, SPREAD[2] = {0.004f, 0.005f};
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 64, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
@@ -63,12 +61,6 @@ inline float sum(vec v) {
   return (total[0] + total[1]) + (total[2] + total[3]);
 }
 inline vec size_of(vec v) { return most(v, -v); }
-
-// 0 up to the first bound, 1 from the second on.
-inline float fade(float v, const float (&bounds)[2]) { return clamp01((v - bounds[0]) / (bounds[1] - bounds[0])); }
-inline vec fade(vec v, const float (&bounds)[2]) {
-  return least(most((v - bounds[0]) * (1.0f / (bounds[1] - bounds[0])), vec{}), all(1.0f));
-}
 
 // Calls body(y, x) for each vector of a part; the last of a row goes beyond it.
 template <typename Body>
@@ -157,11 +149,6 @@ struct Group {
   std::vector<Judgement> judged;
 };
 
-// Sums over the slopes of all edges, in parts of their steps.
-struct Slopes {
-  double length = 0, squares = 0, middles = 0;
-};
-
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
@@ -177,25 +164,21 @@ class Repair {
     std::vector<Group> sampled = blocks(every);
     spares ? find_around(sampled) : find();
     list(sampled, [](int) { return true; });
-    judge(sampled, false);
+    judge(sampled);
     decide(sampled);
     calibrate(sampled);
-    const float heard = map_.automatic ? fade(agreement(sampled), RELATED) : 1.0f;
-    const float softness = heard * fade(ramps_of(sampled), SOFT), inexactness = heard * std::max(fade(wrong_of(sampled), EXACT), softness);
-    if (map_.automatic && inexactness == 0) return;
+    const bool is_soft = ramps_of(sampled) > SOFT;
+    if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return;
     if (spares) find();
     std::vector<Group> groups = tiles();
-    list(groups, [&](int i) {
-      if (map_.automatic) strength_[i] *= marks_[i] & RAMP ? softness : inexactness * fade(wrong(i), DOUBTFUL);
-      return strength_[i] > 0;
-    });
-    judge(groups, true);
+    list(groups, [&](int i) { return !map_.automatic || (marks_[i] & RAMP ? is_soft : wrong(i) > DOUBTFUL); });
+    judge(groups);
     decide(groups);
     const float sigma = blur();
     const float lost_px = choose(groups);
-    unmix(groups, WHOLE * sigma, lost_px);
+    unmix(groups, sigma, lost_px);
     move(groups);
-    if (softness > 0) lift_lamps(softness, sigma, lost_px);
+    if (is_soft) lift_lamps(sigma, lost_px);
   }
 
  private:
@@ -205,50 +188,31 @@ class Repair {
   }
 
   float step(size_t i) const { return map_.steps ? map_.steps[i] : map_.step; }
-  float level(size_t i) const { return (map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f); }
-  bool is_near(size_t i) const { return level(i) > 0.5f; }
-  float wrong(size_t i) const { return is_near(i) ? 1.0f - prior(i) : prior(i); }
-  // How far a pixel of a ramp is from its place to the next one.
-  float between(size_t i) const {
-    return marks_[i] & RAMP ? std::min(std::max(level(i) * LEVELS - 0.5f, 0.0f), LEVELS - 1.0f) - (float)(place_[i] - 2 * RINGS) : 0.0f;
-  }
-  // Share of the pixels like one that show the near surface.
-  float prior(size_t i) const {
-    const float across = std::fabs(across_[i]), along = std::fabs(along_[i]), part = between(i);
-    float found[2];
-    for (int k = 0; k < 2; k++) {
-      const float *shares = &shares_[(place_[i] + k) * DIRECTIONS];
-      found[k] = across * shares[across_[i] > 0] + along * shares[2 + (along_[i] > 0)] + (1.0f - across - along) * shares[4];
-      if (part == 0) return found[0];
-    }
-    return found[0] + part * (found[1] - found[0]);
-  }
-  // How far an edge pixel shows the near surface.
-  float label(size_t i) const { return marks_[i] & LISTED ? score_[i] : marks_[i] & NEAR ? 1.0f : 0.0f; }
+  bool is_near(size_t i) const { return 2.0f * map_.nearness[i] > near_[i] + far_[i]; }
+  float wrong(size_t i) const { return is_near(i) ? 1.0f - shares_[kind_[i]] : shares_[kind_[i]]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
   static float colour(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Share of ramps among a sample's pixels.
-  float ramps_of(const std::vector<Group> &sampled) const {
-    double ramps = 0, total = 0;
-    for (const Group &group : sampled)
-      for (const int i : group.pixels) {
-        total += strength_[i];
-        if (marks_[i] & RAMP) ramps += strength_[i];
-      }
-    return (float)(ramps / std::max(total, 1e-12));
+  double ramps_of(const std::vector<Group> &sampled) const {
+    double ramps = 0, all = 0;
+    for (const Group &group : sampled) {
+      all += (double)group.pixels.size();
+      for (const int i : group.pixels) ramps += marks_[i] & RAMP ? 1 : 0;
+    }
+    return ramps / std::max(all, 1.0);
   }
 
-  // Share of a sample's pixels at steps that are on the wrong side.
-  float wrong_of(const std::vector<Group> &sampled) const {
-    double found = 0, total = 0;
+  // Whether more of a sample's pixels at steps are wrong than exact maps have.
+  bool is_inexact(const std::vector<Group> &sampled) const {
+    double found = 0, steps = 0;
     for (const Group &group : sampled)
       for (const int i : group.pixels)
         if (!(marks_[i] & RAMP)) {
-          found += strength_[i] * wrong(i);
-          total += strength_[i];
+          found += wrong(i);
+          steps++;
         }
-    return (float)(found / std::max(total, 1e-12));
+    return found > EXACT * steps;
   }
 
   // Parts of a grid of squares, cut to the frame.
@@ -293,10 +257,7 @@ class Repair {
     witness_ = Buffer<float>(area_);
     score_ = Buffer<float>(area_);
     marks_ = Buffer<uint8_t>(area_);
-    strength_ = Buffer<float>(area_);
-    across_ = Buffer<float>(area_);
-    along_ = Buffer<float>(area_);
-    place_ = Buffer<uint8_t>(area_);
+    kind_ = Buffer<uint8_t>(area_);
   }
 
   Part in_frame(const Part &part) const {
@@ -336,24 +297,25 @@ class Repair {
   // Ramps and steps, and the two surfaces that meet there.
   void find() {
     const std::vector<Group> all = tiles();
-    std::vector<Slopes> slopes(all.size());
-    parallel((int)all.size(), [&](int p) { find_in(all[p].part, slopes[p]); });
+    std::vector<double> length(all.size(), 0.0);
+    std::vector<int64_t> middles(all.size(), 0);
+    parallel((int)all.size(), [&](int p) { find_in(all[p].part, length[p], middles[p]); });
     for (size_t p = 0; p < all.size(); p++) {
-      slopes_.length += slopes[p].length;
-      slopes_.squares += slopes[p].squares;
-      slopes_.middles += slopes[p].middles;
+      length_ += length[p];
+      middles_ += middles[p];
     }
   }
 
   // The same, in the blocks of a sample and what is around them.
   void find_around(const std::vector<Group> &sampled) {
     parallel((int)sampled.size(), [&](int p) {
-      Slopes slopes;
-      find_in(in_frame(sampled[p].part.grown(REACH)), slopes);
+      double length;
+      int64_t middles;
+      find_in(in_frame(sampled[p].part.grown(REACH)), length, middles);
     });
   }
 
-  void find_in(const Part &part, Slopes &slopes) {
+  void find_in(const Part &part, double &length, int64_t &middles) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *nearness = map_.nearness + i;
@@ -363,7 +325,7 @@ class Repair {
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return;
-    if (!find_in(busy, STEP_HALO, slopes)) find_in(busy, HALO, slopes);
+    if (!find_in(busy, STEP_HALO, length, middles)) find_in(busy, HALO, length, middles);
   }
 
   // Where there may be edges.
@@ -410,7 +372,7 @@ class Repair {
   }
 
   // Returns whether the halo was wide enough.
-  bool find_in(const Part &inner, int halo, Slopes &of_all) {
+  bool find_in(const Part &inner, int halo, double &length, int64_t &middles) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -433,9 +395,8 @@ class Repair {
     highest<REACH>(down, low, rows, ramps);
     each_vector(ramps, [&](int y, int x) {
       const vec rise = load<vec>(slope.at(y, x)), span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x)), s = step_at(y, x);
-      const auto may_be = (span > s) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
-      const vec strength = fade(least(rise / (0.1f * s), rise / most(SHALLOW * span, all(1e-12f))), STANDS);
-      store(ramp.at(y, x), may_be ? strength : vec{});
+      const auto is_ramp = (rise > 0.1f * s) & (rise > SHALLOW * span) & (span > s) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
+      store(ramp.at(y, x), is_ramp ? all(1.0f) : vec{});
     });
     // ramps no farther away than this reach into the inner part
     float any = 0;
@@ -447,7 +408,7 @@ class Repair {
       each_vector(beside, [&](int y, int x) {
         const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
         const auto is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (near + far > step_at(y, x));
-        store(ramp.at(y, x), is_ramp ? load<vec>(ramp.at(y, x)) : vec{});
+        store(ramp.at(y, x), is_ramp ? all(1.0f) : vec{});
         store(up.at(y, x), is_ramp ? near : load<vec>(up.at(y, x)));
         store(down.at(y, x), is_ramp ? far : load<vec>(down.at(y, x)));
       });
@@ -468,7 +429,7 @@ class Repair {
     });
     sums<2>(slope, high, rows, means, 1.0f);
 
-    float near_row[AREA + LANES], far_row[AREA + LANES], witness_row[AREA + LANES], mark_row[AREA + LANES], strength_row[AREA + LANES];
+    float near_row[AREA + LANES], far_row[AREA + LANES], witness_row[AREA + LANES], mark_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
       for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
         const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {};
@@ -489,8 +450,7 @@ class Repair {
         store(near_row + k, near);
         store(far_row + k, far);
         store(witness_row + k, is_valid & (is_ramp <= none) ? sure : none);
-        const vec mark = (is_edge ? all((float)EDGE) : none) + (is_ramp > none ? all((float)RAMP) : none) + (2.0f * v > near + far ? all((float)NEAR) : none);
-        store(strength_row + k, fade((near - far) / s, STANDS) * (is_ramp > none ? is_ramp : all(1.0f)));
+        const vec mark = (is_edge ? all((float)EDGE) : none) + is_ramp * (float)RAMP + (2.0f * v > near + far ? all((float)NEAR) : none);
         store(mark_row + k, is_edge | (is_ramp > none) ? mark : none);
       }
       const size_t row = (size_t)y * width_ + inner.x0;
@@ -502,26 +462,17 @@ class Repair {
       for (int k = 0; k < inner.width; k++) {
         if (!(marks[k] & EDGE)) continue;
         const int x = inner.x0 + k;
-        const size_t i = row + k;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
         const bool is_ramp = marks[k] & RAMP;
-        const float x0 = valid(value[0] - value[-1]), x1 = valid(value[1] - value[0]);
-        const float y0 = valid(value[0] - value[-raw.pitch]), y1 = valid(value[raw.pitch] - value[0]);
-        float climb = 0;
-        for (const float dx : {x0, x1})
-          for (const float dy : {y0, y1}) climb += std::sqrt(dx * dx + dy * dy);
-        strength_[i] = strength_row[k];
-        of_all.length += strength_row[k] * 0.25f * climb / gap;
-        of_all.middles += strength_row[k] * fade(std::fabs(level - 0.5f), MIDDLE);
-        of_all.squares += strength_row[k] * 0.25f * ((x0 + x1) * (x0 + x1) + (y0 + y1) * (y0 + y1)) / (gap * gap);
-        const float right = (*high.at(y, x + 2) - *high.at(y, x - 2)) / 25.0f, below = (*high.at(y + 2, x) - *high.at(y - 2, x)) / 25.0f;
-        const float none = 0.05f * gap, whole = std::max(right * right + below * below + none * none, 1e-30f);
-        across_[i] = right * std::fabs(right) / whole;
-        along_[i] = below * std::fabs(below) / whole;
+        const float beside = valid(value[1] - value[0]), under = valid(value[raw.pitch] - value[0]);
+        length += std::sqrt(beside * beside + under * under) / gap;
+        middles += std::fabs(level - 0.5f) < 0.25f;
+        const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
+        const int direction = std::fabs(right) > std::fabs(below) ? right > 0 : 2 + (below > 0);
         int ring = 0;
         while (ring < RINGS - 1 && witness_row[k] > SURE[ring + 1]) ring++;
-        const int below_level = std::min((int)std::min(std::max(level * LEVELS - 0.5f, 0.0f), LEVELS - 1.0f), LEVELS - 2);
-        place_[i] = (uint8_t)(is_ramp ? 2 * RINGS + below_level : (level > 0.5f) * RINGS + ring);
+        const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
+        kind_[row + k] = (uint8_t)(place * 4 + direction);
       }
     }
     return true;
@@ -557,7 +508,7 @@ class Repair {
     std::vector<Piece> pieces;
     for (int y = inside.y0; y < inside.bottom(); y++)
       for (int x = ramps.x0; x < ramps.right(); x += LANES) {
-        vec is_ramp = load<vec>(ramp.at(y, x)) * fade(-load<vec>(low.at(y, x)) / most(load<vec>(slope.at(y, x)), all(1e-12f)), ENDS);
+        vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < 0.3f * load<vec>(slope.at(y, x))) ? all(1.0f) : vec{};
         for (int i = 0; i < LANES; i++)
           if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
         store(ramp.at(y, x), is_ramp);
@@ -587,8 +538,8 @@ class Repair {
     }
   }
 
-  // Which of two surfaces pixels show, by their colour; also where only one of the two is in sight, if that counts.
-  void judge(std::vector<Group> &groups, bool one_counts) const {
+  // Which of two surfaces pixels show, by their colour.
+  void judge(std::vector<Group> &groups) const {
     std::vector<float> falloff(SIDE * ACROSS, 0.0f);
     for (int v = -REACH; v <= REACH; v++)
       for (int u = -REACH; u <= REACH; u++) falloff[(v + REACH) * ACROSS + u + REACH] = std::exp(-(float)(v * v + u * u) / 12.5f);
@@ -596,10 +547,10 @@ class Repair {
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].pixels.empty()) return;
       switch (channels_) {
-        case 1: return judge<1>(groups[g], falloff.data(), one_counts);
-        case 3: return judge<3>(groups[g], falloff.data(), one_counts);
-        case 4: return judge<4>(groups[g], falloff.data(), one_counts);
-        default: judge<0>(groups[g], falloff.data(), one_counts);
+        case 1: return judge<1>(groups[g], falloff.data());
+        case 3: return judge<3>(groups[g], falloff.data());
+        case 4: return judge<4>(groups[g], falloff.data());
+        default: judge<0>(groups[g], falloff.data());
       }
     });
   }
@@ -634,7 +585,7 @@ class Repair {
 
   // C: channels, or 0 for any number.
   template <int C>
-  void judge(Group &group, const float *falloff, bool one_counts) const {
+  void judge(Group &group, const float *falloff) const {
     const int channels = C ? C : channels_;
     const Part around = bounds(group).grown(REACH);
     const Grid given(around), witness(around), colour(around, channels + 1);
@@ -659,7 +610,8 @@ class Repair {
         const size_t row = (size_t)(v - REACH) * colour.pitch;
         for (int u = 0; u < ACROSS; u += LANES, n++) {
           const vec value = load<vec>(given_row + u), level = (value - far) * per_gap, weight = load<vec>(fall + u) * load<vec>(witness_row + u);
-          const vec none = {}, w[2] = {weight * fade(size_of(level - 1.0f), OF_SIDE), weight * fade(size_of(level), OF_SIDE)}, squared = load<vec>(square_at + v * colour.pitch + u);
+          const auto is_near = size_of(level - 1.0f) < all(0.25f), is_far = size_of(level) < all(0.25f);
+          const vec none = {}, w[2] = {is_near ? weight : none, is_far ? weight : none}, squared = load<vec>(square_at + v * colour.pitch + u);
           vec stray = none;
           for (int c = 0; c < channels; c++) {
             const vec other = load<vec>(colour_at + c * colour.size + row + u - REACH), d = other - own[c];
@@ -676,36 +628,14 @@ class Repair {
             square[side] += w[side] * squared;
             weights[side][n] = w[side];
           }
-          values[n] = value;
+          values[n] = is_near | is_far ? value - near : none;
           apart[n] = stray;
         }
       }
       const float sums[2] = {sum(total[0]), sum(total[1])};
       Judgement &judged = group.judged[k];
       judged = {0.0f, 1.0f, near, far, 0.0f};
-      const float known = fade(std::min(sums[0], sums[1]), KNOWN);
-      float alone = 0;  // what one surface tells where only that one is in sight
-      if (one_counts && known < 1.0f)
-        for (int side = 0; side < 2; side++) {
-          const float seen = fade(sums[side], KNOWN);
-          if (!(seen > 0)) continue;
-          float of_mean = 0;
-          for (int c = 0; c < channels; c++) {
-            const float mean = sum(C ? few[side][c] : load<vec>(many + (side * channels + c) * LANES)) / sums[side];
-            of_mean += mean * mean;
-          }
-          const float wide = std::max(sum(square[side]) / sums[side] - of_mean, 0.0f) + 9e-4f * of_mean + 1e-30f;
-          const float per_wide = 1.0f / (0.3f * wide);
-          vec likely = {};
-          for (int n = 0; n < SIDE * ACROSS / LANES; n++) {
-            const vec t = 1.0f + apart[n] * per_wide;
-            likely += weights[side][n] / (t * t);
-          }
-          const float vote = clamp(std::log((sum(likely) / sums[side] + 0.02f) / UNSEEN), -3.0f, 3.0f);
-          alone += (side ? -1.0f : 1.0f) * (1.0f - known) * seen * vote;
-        }
-      judged.score = alone;
-      if (!(known > 0)) continue;  // else the neighbours tell
+      if (!(sums[0] > 1e-3f && sums[1] > 1e-3f)) continue;  // the neighbours tell
       float spread = 0, contrast = 0, noise = 0, from_mean[2] = {0, 0};
       for (int side = 0; side < 2; side++) {
         float of_mean = 0;
@@ -722,7 +652,7 @@ class Repair {
         noise += both * both;
         contrast += between * between;
       }
-      spread += 2.25e-4f * noise + 1e-30f;
+      spread += 2.25e-4f * noise + 1e-12f;
       const float per_spread = 1.0f / (0.3f * spread);
       vec likely[2] = {}, share[2] = {}, value[2] = {};
       for (int n = 0; n < SIDE * ACROSS / LANES; n++) {
@@ -731,17 +661,17 @@ class Repair {
           const vec part = weights[side][n] * (alike + 1e-3f);
           likely[side] += weights[side][n] * alike;
           share[side] += part;
-          value[side] += part * (values[n] - (side ? far : near));
+          value[side] += part * values[n];
         }
       }
       float likelihood[2], surface[2];
       for (int side = 0; side < 2; side++) {
         const float t = 1.0f + from_mean[side] * per_spread;
         likelihood[side] = sum(likely[side]) / sums[side] + 0.02f / (t * t) + 1e-9f;
-        surface[side] = (side ? far : near) + known * (sum(value[side]) / std::max(sum(share[side]), 1e-12f));
+        surface[side] = near + sum(value[side]) / std::max(sum(share[side]), 1e-12f);
       }
       const float tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
-      judged = {alone + known * clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), 1.0f + known * (tells - 1.0f), surface[0], surface[1], 0.0f};
+      judged = {clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), tells, surface[0], surface[1], 0.0f};
     }
   }
 
@@ -772,34 +702,32 @@ class Repair {
     });
   }
 
-  // What listed pixels said, 0 elsewhere; and how firm they are, 0 elsewhere.
-  void take_listed(const Grid &said, const Grid *firmness) const {
+  // What listed pixels said, 0 elsewhere; and 1 at them, 0 elsewhere.
+  void take_listed(const Grid &said, const Grid *is_listed) const {
     const int first = std::max(0, -said.x0), last = std::min(said.width, width_ - said.x0);
     said.clear();
-    if (firmness) firmness->clear();
+    if (is_listed) is_listed->clear();
     for (int y = said.y0; y < said.bottom(); y++) {
       const ptrdiff_t from = (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + said.x0;
       for (int x = first; x < last; x++)
         if (marks_[from + x] & LISTED) {
           said.at(y, said.x0)[x] = score_[from + x];
-          if (firmness) firmness->at(y, said.x0)[x] = strength_[from + x];
+          if (is_listed) is_listed->at(y, said.x0)[x] = 1.0f;
         }
     }
     go_on(said, said);
-    if (firmness) go_on(*firmness, *firmness);
+    if (is_listed) go_on(*is_listed, *is_listed);
   }
 
   void decide(Group &group) const {
     const Part part = bounds(group), around = part.grown(1);
-    const Grid said(around), firmness(around), score(part), evidence(part), colour(around, channels_ + 1);
+    const Grid said(around), is_listed(around), score(part), evidence(part), colour(around, channels_ + 1);
     take_colours(colour);
-    take_listed(said, &firmness);
-    score.clear();
-    evidence.clear();
+    take_listed(said, &is_listed);
     each_vector(part, [&](int y, int x) {
-      if (!(sum(load<vec>(firmness.at(y, x))) > 0)) return;
+      if (!(sum(load<vec>(is_listed.at(y, x))) > 0)) return;
       const float *own = colour.at(y, x);
-      const vec per_light = 1.0f / (0.0225f * load<vec>(own + channels_ * colour.size) + 1e-30f);
+      const vec per_light = 1.0f / (0.0225f * load<vec>(own + channels_ * colour.size) + 1e-12f);
       vec total{}, all_said{}, strongest{};
       for (int v = -1; v <= 1; v++)
         for (int u = -1; u <= 1; u++) {
@@ -809,10 +737,10 @@ class Repair {
             const vec d = load<vec>(own + c * colour.size + off) - load<vec>(own + c * colour.size);
             apart += d * d;
           }
-          const vec firm = load<vec>(firmness.at(y + v, x + u)), alike = firm / (1.0f + apart * per_light), s = load<vec>(said.at(y + v, x + u));
+          const vec alike = load<vec>(is_listed.at(y + v, x + u)) / (1.0f + apart * per_light), s = load<vec>(said.at(y + v, x + u));
           total += alike;
           all_said += alike * s;
-          strongest = most(strongest, firm * size_of(s));
+          strongest = most(strongest, size_of(s));
         }
       store(score.at(y, x), all_said / most(total, all(1e-12f)));
       store(evidence.at(y, x), strongest);
@@ -825,75 +753,61 @@ class Repair {
     }
   }
 
-  // Share of clear cases in which what colours say agrees with the map.
-  float agreement(const std::vector<Group> &groups) const {
+  // Whether what colours say agrees with the map where that is hardly in doubt.
+  bool is_related(const std::vector<Group> &groups) const {
     double total = 0, agreed = 0;
     for (const Group &group : groups)
       for (size_t k = 0; k < group.pixels.size(); k++) {
         const int i = group.pixels[k];
-        const float score = group.judged[k].score;
-        const float clear = marks_[i] & RAMP ? fade(std::fabs(level(i) - 0.5f), CLEAR) : place_[i] % RINGS == RINGS - 1;
-        const float weight = strength_[i] * clear * std::min(0.5f * std::fabs(score), 1.0f);
+        const float score = group.judged[k].score, level = (map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f);
+        if (marks_[i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : kind_[i] / 4 % RINGS != RINGS - 1) continue;
+        const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         total += weight;
-        if ((score > 0) == is_near(i)) agreed += weight;
+        if ((score > 0) == (level > 0.5f)) agreed += weight;
       }
-    return (float)((agreed + 0.5f * PRIOR_COUNT) / (total + PRIOR_COUNT));
+    return (agreed + 0.5f * PRIOR_COUNT) / (total + PRIOR_COUNT) > RELATED;
   }
 
-  struct Witness {
-    int group;
-    float weight, odds;
-  };
-
-  // Share of pixels that show the near surface, by place and direction; the last of all directions.
+  // Share of pixels that show the near surface, by kind.
   void calibrate(const std::vector<Group> &groups) {
     std::vector<float> assumed(PLACES), start(PLACES);
     for (int p = 0; p < PLACES; p++) {
       assumed[p] = p < RINGS ? TRUSTED : p < 2 * RINGS ? 1.0f - TRUSTED : (p - 2 * RINGS + 0.5f) / LEVELS;
       start[p] = p < 2 * RINGS ? 0.5f : assumed[p];
     }
-    std::vector<Witness> of_place, of_direction;
-    const auto add = [](std::vector<Witness> &witnesses, int group, float weight, float odds) {
-      if (weight > 0) witnesses.push_back({group, weight, odds});
-    };
-    for (const Group &group : groups)
-      for (size_t k = 0; k < group.pixels.size(); k++) {
-        const int i = group.pixels[k];
-        const float score = group.judged[k].score, weight = strength_[i] * std::min(0.5f * std::fabs(score), 1.0f), odds = std::exp(-score);
-        const float part = between(i);
-        for (int next = 0; next < 2; next++) {
-          const int place = place_[i] + next;
-          const float here = weight * (next ? part : 1.0f - part);
-          add(of_place, place, here, odds);
-          add(of_direction, place * 4 + (across_[i] > 0), here * std::fabs(across_[i]), odds);
-          add(of_direction, place * 4 + 2 + (along_[i] > 0), here * std::fabs(along_[i]), odds);
-        }
-      }
-    const std::vector<float> together = fit(of_place, start, assumed);
-    std::vector<float> each(4 * PLACES);
-    for (int k = 0; k < 4 * PLACES; k++) each[k] = together[k / 4];
-    const std::vector<float> shares = fit(of_direction, std::vector<float>(4 * PLACES, 0.5f), each);
-    shares_.resize(PLACES * DIRECTIONS);
-    for (int p = 0; p < PLACES; p++)
-      for (int d = 0; d < DIRECTIONS; d++) shares_[p * DIRECTIONS + d] = d < 4 ? shares[p * 4 + d] : together[p];
+    const std::vector<float> together = fit(groups, 4, start, assumed);
+    std::vector<float> each(KINDS);
+    for (int k = 0; k < KINDS; k++) each[k] = together[k / 4];
+    shares_ = fit(groups, 1, std::vector<float>(KINDS, 0.5f), each);
     // where the pixels beside a step are right those farther away are too
     for (int r = 1; r < RINGS; r++)
-      for (int d = 0; d < DIRECTIONS; d++) {
-        float *far = &shares_[r * DIRECTIONS + d], *near = &shares_[(RINGS + r) * DIRECTIONS + d];
-        *far = std::min(*far, far[-DIRECTIONS]);
-        *near = std::max(*near, near[-DIRECTIONS]);
+      for (int d = 0; d < 4; d++) {
+        float *far = &shares_[r * 4 + d], *near = &shares_[(RINGS + r) * 4 + d];
+        *far = std::min(*far, far[-4]);
+        *near = std::max(*near, near[-4]);
       }
   }
 
-  static std::vector<float> fit(const std::vector<Witness> &witnesses, std::vector<float> share, const std::vector<float> &assumed) {
+  std::vector<float> fit(const std::vector<Group> &groups, int together, std::vector<float> share, const std::vector<float> &assumed) const {
     const size_t count = share.size();
     std::vector<double> total(count, 0.0), found(count);
-    for (const Witness &w : witnesses) total[w.group] += w.weight;
+    struct Witness {
+      int kind;
+      float weight, odds;
+    };
+    std::vector<Witness> witnesses;
+    for (const Group &group : groups)
+      for (size_t k = 0; k < group.pixels.size(); k++) {
+        const float score = group.judged[k].score, weight = std::min(0.5f * std::fabs(score), 1.0f);
+        const int kind = kind_[group.pixels[k]] / together;
+        total[kind] += weight;
+        if (weight > 0) witnesses.push_back({kind, weight, std::exp(-score)});
+      }
     for (int round = 0; round < ROUNDS; round++) {
       std::fill(found.begin(), found.end(), 0.0);
       std::vector<float> odds(count);
       for (size_t g = 0; g < count; g++) odds[g] = (1.0f - share[g]) / share[g];
-      for (const Witness &w : witnesses) found[w.group] += w.weight / (1.0f + odds[w.group] * w.odds);
+      for (const Witness &w : witnesses) found[w.kind] += w.weight / (1.0f + odds[w.kind] * w.odds);
       for (size_t g = 0; g < count; g++)
         share[g] = clamp((float)((found[g] + PRIOR_COUNT * assumed[g]) / (total[g] + PRIOR_COUNT)), 0.005f, 0.995f);
     }
@@ -901,32 +815,30 @@ class Repair {
   }
 
   // Standard deviation of the blur that made ramps of steps.
-  float blur() const {
-    const double length = std::max(slopes_.length, 1e-12), by_squares = length / std::max(slopes_.squares, 1e-12) / (2.0 * std::sqrt(3.14159265358979));
-    const double by_middles = slopes_.middles / (MIDDLE_HALF * length);
-    return std::sqrt(clamp((float)std::max(by_squares * by_squares - PIXELS, by_squares * by_middles - 1.2f * PIXELS), 0.04f, 9.0f));
-  }
+  float blur() const { return clamp((float)(middles_ / (MIDDLE_HALF * std::max(length_, 1e-12))), 0.2f, 3.0f); }
 
-  // Decides how far pixels show the near surface; returns how many pixels of it at each edge the map has as far ones.
+  // Marks the pixels that show the near surface; returns how many pixels of it at each edge the map has as far ones.
   float choose(std::vector<Group> &groups) {
     const float lean = map_.automatic ? LEAN : 0.0f;
+    float prior[KINDS];
+    for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<double> lost(groups.size(), 0.0);
     parallel((int)groups.size(), [&](int g) {
       for (size_t k = 0; k < groups[g].pixels.size(); k++) {
         const int i = groups[g].pixels[k];
-        const float score = groups[g].judged[k].score, share = prior(i);
-        const float stays = marks_[i] & RAMP ? 0.0f : SUREST * (1.0f - strength_[i]);
-        const float surely = score + std::log(share / (1.0f - share)) + lean * clamp01(std::fabs(score) - 1.0f) + (is_near(i) ? stays : -stays);
-        score_[i] = clamp01(0.5f + surely / FADE);
+        const float score = groups[g].judged[k].score;
+        const bool shows_near = score + prior[kind_[i]] > -lean * clamp01(std::fabs(score) - 1.0f);
+        marks_[i] = (uint8_t)((marks_[i] & ~NEAR) | (shows_near ? NEAR : 0));
       }
       const Part &part = groups[g].part;
       for (int y = part.y0; y < part.bottom(); y++)
         for (int i = y * width_ + part.x0, end = i + part.width; i < end; i++)
-          if (marks_[i] & EDGE) lost[g] += label(i) - clamp01(level(i));
+          if (marks_[i] & EDGE)
+            lost[g] += (marks_[i] & NEAR ? 1.0f : 0.0f) - clamp01((map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f));
     });
     double total = 0;
     for (const double here : lost) total += here;
-    return (float)(total / std::max(slopes_.length, 1e-12));
+    return (float)(total / std::max(length_, 1e-12));
   }
 
   // How far thin structures can have lost nearness, 0 to 1: none where the map's surfaces are too large.
@@ -937,14 +849,9 @@ class Repair {
       for (size_t k = 0; k < groups[g].pixels.size(); k++) {
         const int i = groups[g].pixels[k];
         const Judgement &judged = groups[g].judged[k];
-        const float shows_near = score_[i];
-        const bool was_near = is_near(i), is_ramp = marks_[i] & RAMP;
-        const float moved = is_ramp ? judged.evidence * strength_[i] : was_near ? 1.0f - shows_near : shows_near;
-        const float shown = is_ramp ? judged.far + shows_near * (judged.near - judged.far) : was_near ? judged.far : judged.near;
-        if (moved == 1.0f)
-          map_.out[i] = shown;
-        else if (moved > 0)
-          map_.out[i] += moved * (shown - map_.out[i]);
+        const bool shows_near = marks_[i] & NEAR;
+        const float moved = marks_[i] & RAMP ? judged.evidence : (float)(shows_near != is_near(i));
+        if (moved > 0) map_.out[i] += moved * ((shows_near ? judged.near : judged.far) - map_.out[i]);
       }
     });
   }
@@ -989,7 +896,7 @@ class Repair {
       explained[i] = both[i] * both[i] / std::max(of_x[i] * of_y, 1e-12f);
     }
     const float b = both[0] / std::max(of_x[0], 1e-9f), better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
-    return {mean_y - b * mean_x[0] + own, b, fade(of_x[0], SPREAD) * clamp01((explained[0] - 0.5f) / 0.3f) * better};
+    return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - 0.5f) / 0.3f) * better : 0.0f};
   }
 
   // The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best.
@@ -999,9 +906,8 @@ class Repair {
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
       if (group.pixels.empty()) return;
-      std::vector<float> thinness[2];
-      for (const int far : {0, 1}) thinness[far] = thin(group, far);
-      const Part part = bounds(group, [&](size_t k) { return thinness[0][k] + thinness[1][k] > 0; });
+      const std::vector<uint8_t> is_thin = thin(group);
+      const Part part = bounds(group, [&](size_t k) { return is_thin[k]; });
       if (part.height <= 0) return;
       const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
       const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
@@ -1016,54 +922,70 @@ class Repair {
       });
       const Part inside = in_frame(labelled);
       for (int y = inside.y0; y < inside.bottom(); y++) {
-        const size_t row = (size_t)y * width_;
-        float *labels = high.at(y, 0);
-        for (int x = inside.x0; x < inside.right(); x++) labels[x] = marks_[row + x] & EDGE ? label(row + x) : labels[x];
+        const uint8_t *marks = marks_.data() + (size_t)y * width_;
+        float *label = high.at(y, 0);
+        for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
       }
       go_on(high, labelled);
       gaussian(high, blurred, rows, around, sigma);
       for (size_t k = 0; k < group.pixels.size(); k++) {
-        const float of_near = thinness[0][k] * is_lost(lost_px), of_far = thinness[1][k] * is_lost(-lost_px);
-        if (!(of_near + of_far > 0)) continue;
+        if (!is_thin[k]) continue;
         const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
-        const Line line = regress(given, high, blurred, weights.data(), y, x);
+        Line line = regress(given, high, blurred, weights.data(), y, x);
+        line.fit *= is_lost(marks_[group.pixels[k]] & NEAR ? lost_px : -lost_px);
         float &near = group.judged[k].near, &far = group.judged[k].far;
         const float gap = near - far;
-        near += of_near * line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
-        if (of_far * line.fit > 0)
-          far += of_far * line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
+        if (marks_[group.pixels[k]] & NEAR)
+          near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
+        else if (line.fit > 0)
+          far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
       }
     });
   }
 
-  // How far a group's pixels that show a surface belong to a part of it that no 5 x 5 pixels near them show whole.
-  std::vector<float> thin(const Group &group, bool far) const {
-    const Part part = bounds(group), beside = part.grown(2), around = part.grown(4);
-    const Grid missing(around), least_of(beside), whole(part), rows(around);
-    missing.clear();
+  // Which of a group's pixels belong to a surface that no 5 x 5 pixels near them show whole.
+  std::vector<uint8_t> thin(const Group &group) const {
+    const Part part = bounds(group), around = part.grown(4);
+    const int pitch = around.width;
+    const size_t size = (size_t)around.height * pitch;
+    std::vector<uint8_t> memory(2 * size + 4 * pitch, 3);
+    uint8_t *shape = memory.data(), *rows = shape + size + 2 * pitch;  // a bit for each surface: near, far
     const Part inside = in_frame(around);
     for (int y = inside.y0; y < inside.bottom(); y++)
       for (int x = inside.x0; x < inside.right(); x++) {
-        const size_t i = (size_t)y * width_ + x;
-        if (marks_[i] & EDGE) *missing.at(y, x) = far ? label(i) : 1.0f - label(i);
+        const uint8_t marks = marks_[(size_t)y * width_ + x];
+        shape[(y - around.y0) * pitch + x - around.x0] = marks & EDGE ? (marks & NEAR ? 1 : 2) : 3;
       }
-    highest<2>(missing, least_of, rows, beside);
-    each_vector(beside, [&](int y, int x) { store(least_of.at(y, x), 1.0f - load<vec>(least_of.at(y, x))); });
-    for (int y = beside.y0; y < beside.bottom(); y++)  // beyond the frame there is none
-      for (int x = beside.x0; x < beside.right(); x++)
-        if (y < 0 || y >= height_ || x < 0 || x >= width_) *least_of.at(y, x) = 0.0f;
-    highest<2>(least_of, whole, rows, part);
-    std::vector<float> found(group.pixels.size());
+    for (int y = 0; y < around.height; y++)
+      for (int x = 2; x < pitch - 2; x++) {
+        const uint8_t *p = shape + y * pitch + x;
+        rows[y * pitch + x] = p[-2] & p[-1] & p[0] & p[1] & p[2];
+      }
+    for (int y = 2; y < around.height - 2; y++)
+      for (int x = 2; x < pitch - 2; x++) {
+        const uint8_t *p = rows + y * pitch + x;
+        shape[y * pitch + x] = p[-2 * pitch] & p[-pitch] & p[0] & p[pitch] & p[2 * pitch];
+      }
+    for (int y = 0; y < around.height; y++)  // beyond the frame there is none
+      for (int x = 0; x < pitch; x++)
+        if (y + around.y0 < 0 || y + around.y0 >= height_ || x + around.x0 < 0 || x + around.x0 >= width_) shape[y * pitch + x] = 0;
+    for (int y = 2; y < around.height - 2; y++)
+      for (int x = 4; x < pitch - 4; x++) {
+        const uint8_t *p = shape + y * pitch + x;
+        rows[y * pitch + x] = p[-2] | p[-1] | p[0] | p[1] | p[2];
+      }
+    std::vector<uint8_t> found(group.pixels.size());
     for (size_t k = 0; k < found.size(); k++) {
       const int i = group.pixels[k];
-      const bool shows = far ? label(i) < 1 : label(i) > 0;
-      found[k] = shows ? 1.0f - *whole.at(i / width_, i % width_) : 0.0f;
+      const uint8_t *p = rows + (i / width_ - around.y0) * pitch + i % width_ - around.x0;
+      const uint8_t thick = p[-2 * pitch] | p[-pitch] | p[0] | p[pitch] | p[2 * pitch];
+      found[k] = !(thick & (marks_[i] & NEAR ? 1 : 2));
     }
     return found;
   }
 
   // Lamps of a few pixels, whose nearness a soft map spreads around them.
-  void lift_lamps(float softness, float sigma, float lost_px) const {
+  void lift_lamps(float sigma, float lost_px) const {
     const std::vector<float> weights = window();
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
@@ -1077,25 +999,24 @@ class Repair {
         low = least(low, load<vec>(near.at(y, x)));
       });
       if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * map_.step)) return;
-      std::vector<float> strengths;
-      const Group group{part, lamps_of(part, near, strengths), {}};
-      if (group.pixels.empty()) return;
+      const std::vector<int> lamps = lamps_of(part, near);
+      if (lamps.empty()) return;
+      const Group group{part, lamps, {}};
       const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
       const Grid bright(whole), usual(whole), rows(whole), peak(covered), blurred(around), given(around);
       brightest(bright, usual, rows, covered);
       highest<2>(bright, peak, rows, covered);
       each_vector(covered, [&](int y, int x) {
         const vec own = load<vec>(bright.at(y, x));
-        const vec glow = fade(own / most(load<vec>(usual.at(y, x)), all(1e-30f)), GLOW);
-        store(usual.at(y, x), glow * own / most(load<vec>(peak.at(y, x)), all(1e-30f)));
+        store(usual.at(y, x), own > 2.0f * load<vec>(usual.at(y, x)) ? own / most(load<vec>(peak.at(y, x)), all(1e-30f)) : vec{});
       });
       go_on(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
       fetch(map_.nearness, given, valid);
-      for (size_t k = 0; k < group.pixels.size(); k++) {
-        const int i = group.pixels[k];
-        const Line line = regress(given, usual, blurred, weights.data(), i / width_, i % width_);
-        map_.out[i] += line.fit * softness * strengths[k] * is_lost(lost_px) * std::max(line.least + std::max(line.difference, 0.0f) - map_.out[i], 0.0f);
+      for (const int i : lamps) {
+        Line line = regress(given, usual, blurred, weights.data(), i / width_, i % width_);
+        line.fit *= is_lost(lost_px);
+        map_.out[i] += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - map_.out[i], 0.0f);
       }
     });
   }
@@ -1114,13 +1035,13 @@ class Repair {
     each_vector(part, [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
   }
 
-  // The pixels of lamps in a part, and how clearly they are; up: its nearness, and that of what is REACH around.
-  std::vector<int> lamps_of(const Part &part, const Grid &up, std::vector<float> &strengths) const {
+  // The pixels of lamps in a part; up: its nearness, and that of what is REACH around.
+  std::vector<int> lamps_of(const Part &part, const Grid &up) const {
     const Part whole = part.grown(USUAL_REACH);
     const Grid bright(whole), usual(part), rows(whole);
     brightest(bright, usual, rows, part);
     vec any{};
-    each_vector(part, [&](int y, int x) { any = most(any, load<vec>(bright.at(y, x)) > LAMP[0] * load<vec>(usual.at(y, x)) ? all(1.0f) : vec{}); });
+    each_vector(part, [&](int y, int x) { any = most(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? all(1.0f) : vec{}); });
     std::vector<int> found;
     if (!(largest(any) > 0)) return found;
     const Part &around = up;
@@ -1133,12 +1054,8 @@ class Repair {
       for (int x = part.x0; x < part.right(); x++) {
         const size_t i = (size_t)y * width_ + x;
         const float own = *bright.at(y, x);
-        if (!(own > LAMP[0] * *usual.at(y, x)) || !(std::fabs(map_.nearness[i]) <= LARGEST)) continue;
-        const float strength = fade(own / std::max(*usual.at(y, x), 1e-30f), LAMP) * fade(own / std::max(*peak.at(y, x), 1e-30f), OF_PEAK) *
-                               fade((*high.at(y, x) + *low.at(y, x)) / step(i), SPAN);
-        if (!(strength > 0)) continue;
-        found.push_back((int)i);
-        strengths.push_back(strength);
+        if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) && *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
+          found.push_back((int)i);
       }
     return found;
   }
@@ -1171,11 +1088,11 @@ class Repair {
   const torchdof_map &map_;
   const int height_, width_, channels_;
   const size_t area_;
-  Buffer<float> near_, far_, witness_, score_, strength_;
-  Buffer<float> across_, along_;  // where the near surface lies: left < 0 < right, up < 0 < down; shares of 1
-  Buffer<uint8_t> marks_, place_;
+  Buffer<float> near_, far_, witness_, score_;
+  Buffer<uint8_t> marks_, kind_;
   std::vector<float> shares_;
-  Slopes slopes_;
+  double length_ = 0;  // of all steps, in pixels
+  int64_t middles_ = 0;
 };
 
 }  // namespace
