@@ -131,6 +131,7 @@ struct Scene {
 
 // What came of it, and the picture if that is TORCHDOF_OK.
 int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vector<float> &picture) {
+  scene.squeeze = 1.0f;
   scene.threads = threads;
   scene.cancelled = cancelled;
   torchdof_job *job = nullptr;
@@ -148,7 +149,7 @@ int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vec
   }
   for (const std::vector<float> &kernel : kernels) kernels_at.push_back(kernel.data());
   picture.assign(size_t(scene.channels) * scene.height * scene.width, -1.0f);
-  const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), picture.data());
+  const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), nullptr, 0, picture.data());
   torchdof_free(job);
   return finished;
 }
