@@ -9,6 +9,7 @@ street at night through tables in three colours, of the lens's middle and of all
 """
 
 import argparse
+import functools
 import math
 import os
 import statistics
@@ -23,6 +24,7 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.bench.timer import in_turns, processor_seconds
 from torchdof.fit import trace_table
 from torchdof.fit.lens import Lens
 from torchdof.fit.lens.field import field_height_mm, spot_of_place
@@ -162,16 +164,11 @@ def cost(tables: dict[str, BlurTable], reach_px: float, lamps: bool, rounds: int
             image[0, :, row, column] = 300.0
     bands = torch.randint(-10, 11, (1, 1, 9, 16), generator=dice).float() / 10.0
     coc_px = torch.nn.functional.interpolate(bands, (540, 960)) * reach_px
-    times: dict[str, list[float]] = {name: [] for name in tables}
-    for turn in range(rounds + 1):
-        for name, table in tables.items():
-            start = time.process_time()
-            with torch.no_grad():
-                blur_by_coc(image, coc_px, table=table)
-            if turn:  # the first makes kernels, which are kept
-                times[name].append(time.process_time() - start)
-    first = statistics.median(times["round"])
-    return {name: statistics.median(of) / first for name, of in times.items()}
+    works = {name: functools.partial(blur_by_coc, image, coc_px, table=table) for name, table in tables.items()}
+    with torch.no_grad():
+        taken = in_turns(works, rounds, processor_seconds)
+    first = statistics.median(taken["round"])
+    return {name: statistics.median(of) / first for name, of in taken.items()}
 
 
 def draw(path: Path) -> None:

@@ -11,7 +11,6 @@ import argparse
 import functools
 import json
 import math
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from torch import Tensor
 from torchdof import Camera, DepthOfField
 from torchdof.augmentation import RandomDepthOfField
 from torchdof.bench.report import machine
-from torchdof.bench.timer import in_turns, median_and_spread
+from torchdof.bench.timer import in_turns, median_and_spread, processor_seconds
 from torchdof.depth.reading import read_depth
 from torchdof.io.images import read_image
 from torchdof.io.transfer import decode, encode
@@ -103,18 +102,12 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     compared = works(*crops(arguments.data, arguments.batch))
-    seconds = in_turns(compared, arguments.repeat, _processor_seconds)
+    seconds = in_turns(compared, arguments.repeat, processor_seconds)
     print(machine())
     print("| blur | images/s/core | interquartile range |\n| --- | --- | --- |")
     for name, taken in seconds.items():
         rate, spread = median_and_spread([arguments.batch / s for s in taken])
         print(f"| {name} | {rate:.0f} | {spread:.0f} |")
-
-
-def _processor_seconds(work: Callable[[], object]) -> float:
-    start = time.process_time()
-    work()
-    return time.process_time() - start
 
 
 if __name__ == "__main__":

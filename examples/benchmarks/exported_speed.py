@@ -16,7 +16,6 @@ import os
 import statistics
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from torchdof import Camera, blur_by_coc
 from torchdof.bench import exported
 from torchdof.bench.inputs import shipped
 from torchdof.bench.speed import unit_work
+from torchdof.bench.timer import in_turns, processor_seconds
 
 __all__ = ["feed_of", "main"]
 
@@ -80,7 +80,6 @@ def main() -> None:
     arguments = parser.parse_args()
     width, height = (int(n) for n in arguments.size.split("x"))
     torch.set_num_threads(arguments.threads)
-    clock = time.process_time if arguments.threads == 1 else time.perf_counter
 
     works: dict[str, Callable[[], Any]] = {"Y": unit_work()}
     on_web: dict[str, tuple[str, Feed]] = {}
@@ -98,14 +97,9 @@ def main() -> None:
         called = {key: options[key] for key in ("occlusion", "tolerance")}
         works[f"{name}, the module"] = functools.partial(blur_by_coc, scene.image, scene.coc_px, **called)
 
-    taken: dict[str, list[float]] = {name: [] for name in works}
+    clock = {"seconds_of": processor_seconds} if arguments.threads == 1 else {}
     with torch.inference_mode():
-        for number in range(arguments.runs + 1):
-            for name, work in works.items():
-                start = clock()
-                work()
-                if number:
-                    taken[name].append(clock() - start)
+        taken = in_turns(works, arguments.runs, **clock)
     if arguments.web is not None:
         for name, (model, feed) in on_web.items():
             taken[name] = web_seconds(model, feed, arguments.web.resolve(), arguments.runs)

@@ -4,7 +4,6 @@ import functools
 import json
 import math
 import shutil
-import time
 from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from examples.benchmarks import goals
 from examples.benchmarks.goals import Figure
 from torchdof.bench import speed
 from torchdof.bench.inputs import BenchScene, shipped
-from torchdof.bench.timer import in_turns
+from torchdof.bench.timer import in_turns, processor_seconds
 from torchdof.reference.scenes import read_scenes
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
@@ -144,11 +143,7 @@ def test_errors_are_those_of_what_is_timed(small: None, monkeypatch: pytest.Monk
 
 
 def test_a_crop_and_its_gradients_are_measured(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    def processor_seconds(work: Callable[[], object]) -> float:  # the clock counts what else the machine does
-        start = time.process_time()
-        work()
-        return time.process_time() - start
-
+    # the clock counts what else the machine does
     monkeypatch.setattr(goals, "in_turns", functools.partial(in_turns, seconds_of=processor_seconds))
     figures = list(goals._crops(shipped(72, 128), 1))
     assert [figure.what for figure in figures] == [

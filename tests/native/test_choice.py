@@ -13,6 +13,7 @@ def test_the_compiled_engine_is_chosen_where_it_is(monkeypatch: pytest.MonkeyPat
 
 
 def test_an_engine_of_another_version_is_not_used_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
     monkeypatch.setattr(native, "_REVISION", -1)
     native._library.cache_clear()
     try:

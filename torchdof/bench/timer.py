@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import torch
 
-__all__ = ["in_turns", "median_and_spread", "timed", "times"]
+__all__ = ["in_turns", "median_and_spread", "processor_seconds", "timed", "times"]
 
 _Name = TypeVar("_Name", bound=Hashable)
 _Result = TypeVar("_Result")
@@ -20,6 +20,13 @@ def timed(work: Callable[[], _Result]) -> tuple[_Result, float]:
     return result, time.perf_counter() - start
 
 
+def processor_seconds(work: Callable[[], object]) -> float:
+    """Seconds of this process's processor time in a call, over all threads, without what other programs take."""
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
 def in_turns(
     works: Mapping[_Name, Callable[[], Any]],
     repeat: int,
@@ -30,7 +37,8 @@ def in_turns(
     Args:
         works: What is compared, by name.
         repeat: How many turns.
-        seconds_of: Calls one of them and tells its seconds: the clock, unless a tool times itself.
+        seconds_of: Calls one of them and tells its seconds: the clock, unless a tool times itself, or
+            :func:`processor_seconds`.
     """
     seconds: dict[_Name, list[float]] = {name: [] for name in works}
     for turn in range(repeat + 1):

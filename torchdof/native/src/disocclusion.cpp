@@ -20,10 +20,9 @@ constexpr float MIXED = 0.05f;  // least share of a second surface that the pyra
 struct Level {
   int height, width, step, stride, channels;
   float vote;  // weight against other levels; 0: it is in the weights
-  float least_px, per_least_px;  // blur from which on a pixel looks so far, and wholly from twice of it
+  float least_px;  // blur from which on a pixel looks so far, and wholly from twice of it
   Buffer<float> values;
   float centre_y, centre_x;  // of the image, in its pixels; the map has the same centre
-  void look_from(float px) { least_px = px, per_least_px = 1.0f / px; }
   float place_y(float y) const { return (y - centre_y) / step + 0.5f * (height - 1); }
   float place_x(float x) const { return (x - centre_x) / step + 0.5f * (width - 1); }
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
@@ -103,7 +102,7 @@ struct Seen {
   f8 *sample;
   template <int VECTORS>
   void see(const Level &level, Place row, Place column, float here) {
-    looked = clamp01(std::fabs(here) * level.per_least_px - 1.0f);
+    looked = clamp01(std::fabs(here) / level.least_px - 1.0f);
     any = looked > 0 ? behind<VECTORS>(level, row, column, here, sample) : 0.0f;
   }
 };
@@ -158,7 +157,7 @@ class Filling {
       l.channels = C_;
       centre(l);
       l.vote = (float)std::pow((double)FALL, i + 1);
-      l.look_from((float)std::pow(2.0, i - 1));
+      l.least_px = (float)std::pow(2.0, i - 1);
       l.values = Buffer<float>((size_t)l.height * l.width * stride_);
     }
     near_.resize(cell_rows_ * cell_columns_);
@@ -386,7 +385,7 @@ class Filling {
     centre(together);
     together.vote = 0;
     if (coarse) {
-      together.look_from(pyramid_[FINE_LEVELS].least_px);
+      together.least_px = pyramid_[FINE_LEVELS].least_px;
       together.values = Buffer<float>((size_t)rows * columns * stride_);
     }
     std::vector<const Level *> every;
