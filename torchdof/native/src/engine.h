@@ -425,7 +425,7 @@ class Turned {
       return clamp01(mean[0] + near * (mean[1] - mean[0]));
     }
     vec at(vec u, vec v) const {
-      const vec row = least(most(vec{}, u * per_u + first_u), all(last_row)), column = least(most(vec{}, v * per_v), all(last_column));
+      const vec row = least(most(u * per_u + first_u, vec{}), all(last_row)), column = least(most(v * per_v, vec{}), all(last_column));
       const ivec i = convert(least(row, all(last_row - 1.0f))), j = convert(least(column, all(last_column - 1.0f)));
       const vec down = row - convert(i), right = column - convert(j);
       const ivec first = i * columns + j;
