@@ -274,9 +274,7 @@ def read_metres(
     elif picture.depth is not None:
         values = picture.depth
     else:
-        raise ValueError(
-            f"{image}: has no depth channel; name a depth file after it: torchdof render IMAGE DEPTH -o OUT"
-        )
+        raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
     name = str(depth if depth is not None else image)
     kind = settings.depth_kind
     (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]

@@ -756,7 +756,7 @@ class Composite {
     const float per = per_half_diagonal(scene);
     const float y = (((block_row + 0.5f) * Turned::ROWS - before) * l.scale - 0.5f * H_) * per;
     const float x = (((block_column + 0.5f) * Turned::COLUMNS - before) * l.scale - 0.5f * W_) * per;
-    for (int e = 0; e < E_; e++) cut_kernel(l.kernels[e], Turned(scene, *l.shares, nullptr, 0.0f, e, y, x), cut.kernels[e]);
+    for (int e = 0; e < E_; e++) cut_kernel(l, e, Turned(scene, *l.shares, nullptr, 0.0f, e, y, x), cut.kernels[e]);
     return cut.kernels.data();
   }
 
