@@ -14,7 +14,6 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
-constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8;
@@ -27,8 +26,9 @@ constexpr float LARGEST = 1e15f, BRIGHTEST = 1e30f, FINITE = 3.402823466e38f;
 constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4, WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
 static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 
-// Marks of a pixel. NEAR: it shows the near surface; GIVEN_NEAR: it has its depth.
-constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, GIVEN_NEAR = 8, LISTED = 16;
+// Marks of a pixel. NEAR: it shows the near surface; GIVEN_NEAR: it has its depth. Above them how unsure a witness it is.
+constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, GIVEN_NEAR = 8, LISTED = 16, UNSURE = 32;
+constexpr float SURE[RINGS + 2] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};  // its weight: far from steps, RINGS from one, ..., beside it; none
 
 // A part of the frame, and what is around it, even beyond the frame.
 struct Part {
@@ -36,24 +36,63 @@ struct Part {
 
   int bottom() const { return y0 + height; }
   int right() const { return x0 + width; }
+  bool has(int y, int x) const { return y >= y0 && y < bottom() && x >= x0 && x < right(); }
   Part grown(int by) const { return {y0 - by, x0 - by, height + 2 * by, width + 2 * by}; }
 };
 
-// Values of a part, by their place in the frame. Rows are longer than the part, by two vectors that hold something.
+// Memory of a thread for what it looks at, given back in reverse order: so it stays in the processor's cache.
+class Scratch {
+ public:
+  float *take(size_t size) {
+    if (blocks_.empty() || blocks_[block_].size - blocks_[block_].used < size) {
+      const size_t next = blocks_.empty() ? 0 : block_ + 1, whole = std::max(size, BLOCK_SIZE);
+      if (next < blocks_.size() && blocks_[next].size < size) blocks_.erase(blocks_.begin() + next, blocks_.end());  // all are free
+      if (next == blocks_.size()) blocks_.push_back({Buffer<float>(whole), whole, 0});
+      block_ = next;
+    }
+    Block &block = blocks_[block_];
+    block.used += size;
+    return block.data.data() + block.used - size;
+  }
+  void give(size_t size) {
+    blocks_[block_].used -= size;
+    if (blocks_[block_].used == 0 && block_ > 0) block_--;
+  }
+
+  static thread_local Scratch *mine;
+
+ private:
+  static constexpr size_t BLOCK_SIZE = 1 << 19;
+  struct Block {
+    Buffer<float> data;
+    size_t size, used;
+  };
+  std::vector<Block> blocks_;
+  size_t block_ = 0;
+};
+thread_local Scratch *Scratch::mine = nullptr;
+
+// Values of a part, by their place in the frame, in the thread's scratch memory. Rows are longer than the part, by two
+// vectors that hold something.
 class Grid : public Part {
  public:
   explicit Grid(const Part &part, int planes = 1)
-      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), data_(size * planes + LANES) {
-    std::fill(data_.data() + size * planes, data_.data() + size * planes + LANES, 0.0f);
+      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), taken_((size * planes + LANES + 15) / 16 * 16), data_(Scratch::mine->take(taken_)) {
+    std::fill(data_ + size * planes, data_ + size * planes + LANES, 0.0f);
   }
-  float *at(int y, int x) const { return data_.data() + (size_t)(y - y0) * pitch + (x - x0); }
-  void clear() const { std::fill(data_.data(), data_.data() + size, 0.0f); }
+  Grid(const Grid &) = delete;
+  Grid &operator=(const Grid &) = delete;
+  ~Grid() { Scratch::mine->give(taken_); }
+
+  float *at(int y, int x) const { return data_ + (size_t)(y - y0) * pitch + (x - x0); }
+  void clear() const { std::fill(data_, data_ + size, 0.0f); }
 
   const int pitch;
   const size_t size;  // of a plane
 
  private:
-  Buffer<float> data_;
+  const size_t taken_;
+  float *const data_;
 };
 
 typedef float quad __attribute__((vector_size(16)));
@@ -157,21 +196,24 @@ void highest_beside(const Grid &in, const Grid &out, const Part &part) {
   }
 }
 
-// The sum of a square around each value of a part, times a factor.
+// The sum of a square around each value of a part, times a factor: of runs of values that lie side by side.
 template <int REACH_>
 void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float factor) {
-  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) {
-    const float *from = in.at(y, x);
-    vec total = load<vec>(from);
-    for (int d = 1; d <= REACH_; d++) total += load<vec>(from - d) + load<vec>(from + d);
-    store(rows.at(y, x), total);
-  });
-  each_vector(part, [&](int y, int x) {
-    const float *from = rows.at(y, x);
-    vec total = load<vec>(from);
-    for (int d = 1; d <= REACH_; d++) total += load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch);
-    store(out.at(y, x), total * factor);
-  });
+  constexpr int TAPS = 2 * REACH_ + 1, RUN = TAPS % 3 ? 1 : 3, LAST = TAPS - RUN;
+  const auto symmetric = [](const float *from, int stride, int taps, int step) {
+    const int middle = taps / 2 * stride;
+    vec total = load<vec>(from + middle);
+    for (int d = step; d <= taps / 2; d += step) total += load<vec>(from + middle - d * stride) + load<vec>(from + middle + d * stride);
+    return total;
+  };
+  for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
+    if (RUN > 1)
+      for (int x = part.x0; x < part.right() + LAST; x += LANES) store(rows.at(y, x), symmetric(in.at(y, x - REACH_), 1, RUN, 1));
+    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), symmetric(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1, LAST + 1, RUN));
+  }
+  if (RUN > 1)
+    each_vector({part.y0 - REACH_, part.x0, part.height + LAST, part.width}, [&](int y, int x) { store(rows.at(y, x), symmetric(rows.at(y, x), rows.pitch, RUN, 1)); });
+  each_vector(part, [&](int y, int x) { store(out.at(y, x), symmetric(rows.at(y - REACH_, x), rows.pitch, LAST + 1, RUN) * factor); });
 }
 
 // The largest value of the square of LOWEST_REACH around a place.
@@ -193,10 +235,17 @@ struct Around {
   float alike[8];  // how much the colours around a pixel are its own
 };
 
-// Pixels of a part that are looked at together, in the order of rows.
+// A pixel to look at.
+struct Edge {
+  int i;
+  float near, far;  // of the two surfaces that meet there
+  uint8_t kind;
+};
+
+// Edges of a part that are looked at together, in the order of rows.
 struct Group {
   Part part;
-  std::vector<int> pixels;
+  std::vector<Edge> edges;
   Part bounds = {};              // where they lie
   Judgement *judged = nullptr;  // of each
   Around *around = nullptr;
@@ -212,7 +261,7 @@ struct Found {
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width) {}
+      : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
 
   void run() {
     parallel(height_, [&](int y) {
@@ -221,34 +270,40 @@ class Repair {
     allocate();
     const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
     const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
-    std::vector<Group> sampled = blocks(every);
-    spares ? find_around(sampled) : find(false);
-    list(sampled, [](int) { return true; });
+    const auto is_sampled = [&](int y, int x) { return (y + 3 * x) % every == 0; };
+    std::vector<Group> groups, sampled;
+    if (spares) {
+      sampled = find_in(squares(SAMPLE_BLOCK, is_sampled), REACH, false);
+    } else {
+      sampled = groups = find_in(tiles(), 0, false);
+    }
+    list(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_ / SAMPLE_BLOCK, edge.i % width_ / SAMPLE_BLOCK); });
     judge(sampled);
     decide(sampled);
     calibrate(sampled);
     const bool is_soft = ramps_of(sampled) > SOFT;
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return;
-    if (spares) find(is_soft);
-    std::vector<Group> groups = tiles();
-    list(groups, [&](int i) { return !map_.automatic || (marks_[i] & RAMP ? is_soft : wrong(i) > DOUBTFUL); });
+    if (spares) groups = find_in(tiles(), 0, is_soft);
+    list(groups, [&](const Edge &edge) { return !map_.automatic || (marks_[edge.i] & RAMP ? is_soft : wrong(edge) > DOUBTFUL); });
     judge(groups);
     decide(groups);
     const float sigma = blur();
     const float lost_px = choose(groups);
-    unmix(groups, sigma, lost_px);
-    move(groups);
+    move(groups, sigma, lost_px);
     if (is_soft) lift_lamps(sigma, lost_px);
   }
 
  private:
   template <typename Body>
   void parallel(int count, const Body &body) const {
-    torchdof::parallel(map_.threads, count, map_.cancelled, [&](int i, int) { body(i); });
+    torchdof::parallel(map_.threads, count, map_.cancelled, [&](int i, int worker) {
+      Scratch::mine = &scratch_[worker];
+      body(i);
+    });
   }
 
   float step(size_t i) const { return map_.steps ? map_.steps[i] : map_.step; }
-  float wrong(size_t i) const { return marks_[i] & GIVEN_NEAR ? 1.0f - shares_[kind_[i]] : shares_[kind_[i]]; }
+  float wrong(const Edge &edge) const { return marks_[edge.i] & GIVEN_NEAR ? 1.0f - shares_[edge.kind] : shares_[edge.kind]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
@@ -256,8 +311,8 @@ class Repair {
   double ramps_of(const std::vector<Group> &sampled) const {
     double ramps = 0, all = 0;
     for (const Group &group : sampled) {
-      all += (double)group.pixels.size();
-      for (const int i : group.pixels) ramps += marks_[i] & RAMP ? 1 : 0;
+      all += (double)group.edges.size();
+      for (const Edge &edge : group.edges) ramps += marks_[edge.i] & RAMP ? 1 : 0;
     }
     return ramps / std::max(all, 1.0);
   }
@@ -266,9 +321,9 @@ class Repair {
   bool is_inexact(const std::vector<Group> &sampled) const {
     double found = 0, steps = 0;
     for (const Group &group : sampled)
-      for (const int i : group.pixels)
-        if (!(marks_[i] & RAMP)) {
-          found += wrong(i);
+      for (const Edge &edge : group.edges)
+        if (!(marks_[edge.i] & RAMP)) {
+          found += wrong(edge);
           steps++;
         }
     return found > EXACT * steps;
@@ -286,52 +341,47 @@ class Repair {
   std::vector<Group> tiles() const {
     return squares(AREA, [](int, int) { return true; });
   }
-  std::vector<Group> blocks(int every) const {
-    return squares(SAMPLE_BLOCK, [&](int y, int x) { return (y + 3 * x) % every == 0; });
-  }
-
-  // The pixels of groups that are edges and chosen.
+  // Marks chosen edges, and forgets the others.
   template <typename Chosen>
   void list(std::vector<Group> &groups, const Chosen &chosen) {
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
-      for (int y = group.part.y0; y < group.part.bottom(); y++)
-        each_marked(y, group.part.x0, group.part.right(), [&](int i) {
-          if (!(marks_[i] & EDGE)) return;
-          const bool is_listed = chosen(i);
-          marks_[i] = (uint8_t)((marks_[i] & ~LISTED) | (is_listed ? LISTED : 0));
-          if (is_listed) group.pixels.push_back(i);
-        });
+      size_t kept = 0;
+      for (const Edge &edge : group.edges) {
+        const bool is_listed = chosen(edge);
+        marks_[edge.i] = (uint8_t)((marks_[edge.i] & ~LISTED) | (is_listed ? LISTED : 0));
+        if (is_listed) group.edges[kept++] = edge;
+      }
+      group.edges.resize(kept);
       group.bounds = bounds(group, [](size_t) { return true; });
     });
     size_t count = 0;
-    for (const Group &group : groups) count += group.pixels.size();
+    for (const Group &group : groups) count += group.edges.size();
     judged_ = Buffer<Judgement>(count);
     around_ = Buffer<Around>(count);
     count = 0;
     for (Group &group : groups) {
       group.judged = judged_.data() + count;
       group.around = around_.data() + count;
-      count += group.pixels.size();
+      count += group.edges.size();
     }
   }
 
-  // Calls body(k, i, y, x) for each pixel of a group.
+  // Calls body(k, edge, y, x) for each of a group.
   template <typename Body>
-  void each_pixel(const Group &group, const Body &body) const {
+  void each_edge(const Group &group, const Body &body) const {
     int y = group.part.y0, row = y * width_;
-    for (size_t k = 0; k < group.pixels.size(); k++) {
-      const int i = group.pixels[k];
-      for (; i >= row + width_; row += width_) y++;
-      body(k, i, y, i - row);
+    for (size_t k = 0; k < group.edges.size(); k++) {
+      for (; group.edges[k].i >= row + width_; row += width_) y++;
+      body(k, group.edges[k], y, group.edges[k].i - row);
     }
   }
 
-  // Where those of a group's pixels lie that are chosen.
+  // Where those of a group's edges lie that are chosen.
   template <typename Chosen>
   Part bounds(const Group &group, const Chosen &chosen) const {
     int top = height_, left = width_, bottom = 0, right = 0;
-    each_pixel(group, [&](size_t k, int, int y, int x) {
+    each_edge(group, [&](size_t k, const Edge &, int y, int x) {
       if (!chosen(k)) return;
       top = std::min(top, y);
       left = std::min(left, x);
@@ -341,25 +391,10 @@ class Repair {
     return {top, left, bottom - top, right - left};
   }
 
-  // Calls body(i) for each pixel of a row that has a mark.
-  template <typename Body>
-  void each_marked(int y, int first, int last, const Body &body) const {
-    for (int i = y * width_ + first, end = y * width_ + last; i < end; i++) {
-      if (uint64_t eight; i + 8 <= end && (memcpy(&eight, &marks_[i], 8), eight == 0))
-        i += 7;
-      else if (marks_[i])
-        body(i);
-    }
-  }
-
   void allocate() {
-    near_ = Buffer<float>(area_);
-    far_ = Buffer<float>(area_);
-    witness_ = Buffer<float>(area_);
     score_ = Buffer<float>(area_);
     evidence_ = Buffer<float>(area_);
     marks_ = Buffer<uint8_t>(area_);
-    kind_ = Buffer<uint8_t>(area_);
   }
 
   Part in_frame(const Part &part) const {
@@ -396,37 +431,27 @@ class Repair {
         memcpy(grid.at(y, part.x0), grid.at(nearest, part.x0), part.width * sizeof(float));
   }
 
-  // Ramps and steps, and the two surfaces that meet there.
-  void find(bool expects_ramps) {
-    const std::vector<Group> all = tiles();
-    std::vector<Found> found(all.size());
-    parallel((int)all.size(), [&](int p) { find_in(all[p].part, expects_ramps, found[p]); });
+  // Ramps and steps, and the two surfaces that meet there: edges of groups, and marks as far as a halo around them.
+  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps) {
+    std::vector<Found> found(groups.size());
+    parallel((int)groups.size(), [&](int g) { find_in(groups[g], in_frame(groups[g].part.grown(halo)), expects_ramps, found[g]); });
+    found_ = {};
     for (const Found &here : found) {
       found_.length += here.length;
       found_.lost += here.lost;
       found_.middles += here.middles;
     }
+    return groups;
   }
 
-  // The same, in the blocks of a sample and what is around them.
-  void find_around(const std::vector<Group> &sampled) {
-    parallel((int)sampled.size(), [&](int p) {
-      Found unused;
-      find_in(in_frame(sampled[p].part.grown(REACH)), false, unused);
-    });
-  }
-
-  void find_in(const Part &part, bool expects_ramps, Found &found) {
+  void find_in(Group &group, const Part &part, bool expects_ramps, Found &found) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
-      const float *nearness = map_.nearness + i;
-      float *witness = witness_.data() + i;
-      for (int x = 0; x < part.width; x++) witness[x] = std::fabs(nearness[x]) <= LARGEST ? 1.0f : 0.0f;
-      memset(marks_.data() + i, 0, part.width);
+      for (int x = 0; x < part.width; x++) marks_[i + x] = std::fabs(map_.nearness[i + x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return;
-    if (expects_ramps || !find_in(busy, STEP_HALO, found)) find_in(busy, HALO, found);
+    if (expects_ramps || !find_in(group, busy, STEP_HALO, found)) find_in(group, busy, HALO, found);
   }
 
   // Where there may be edges.
@@ -473,7 +498,7 @@ class Repair {
   }
 
   // Returns whether the halo was wide enough.
-  bool find_in(const Part &inner, int halo, Found &found) {
+  bool find_in(Group &group, const Part &inner, int halo, Found &found) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -529,39 +554,34 @@ class Repair {
     });
     sums<2>(slope, high, rows, means, 1.0f);
 
-    float near_row[AREA + LANES], far_row[AREA + LANES], witness_row[AREA + LANES], mark_row[AREA + LANES];
+    float near_row[AREA + LANES], far_row[AREA + LANES], mark_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
       for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
         const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {};
-        vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), sure = all(SURE[RINGS + 1]), is_step = {};
+        vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
         const vec least = most(0.6f * (near + far), s);
         for (int r = RINGS - 1; r >= 0; r--) {
           const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
           const auto here = (gap > least) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
           near = here ? n : near;
           far = here ? f : far;
-          sure = here ? all(SURE[r + 1]) : sure;
-          is_step = here ? all(1.0f) : is_step;
+          unsure = here ? all((float)(RINGS - r)) : unsure;
         }
         near = is_ramp > none ? load<vec>(up.at(y, x)) : near;
         far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
         const auto is_valid = size_of(v) <= all(LARGEST);
-        const auto is_edge = (is_ramp + is_step > none) & (near - far > s) & is_valid;
+        const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
         store(near_row + k, near);
         store(far_row + k, far);
-        store(witness_row + k, is_valid & (is_ramp <= none) ? sure : none);
-        const vec mark = (is_edge ? all((float)EDGE) : none) + is_ramp * (float)RAMP + (2.0f * v > near + far ? all((float)(NEAR + GIVEN_NEAR)) : none);
-        store(mark_row + k, is_edge | (is_ramp > none) ? mark : none);
+        const vec mark = (is_edge ? all((float)EDGE) : none) + (2.0f * v > near + far ? all((float)(NEAR + GIVEN_NEAR)) : none) + is_ramp * (float)RAMP;
+        store(mark_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : all((float)(RINGS + 1))));
       }
       const size_t row = (size_t)y * width_ + inner.x0;
-      memcpy(near_.data() + row, near_row, inner.width * sizeof(float));
-      memcpy(far_.data() + row, far_row, inner.width * sizeof(float));
-      memcpy(witness_.data() + row, witness_row, inner.width * sizeof(float));
       uint8_t *marks = marks_.data() + row;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)mark_row[k];
       for (int k = 0; k < inner.width; k++) {
-        if (!(marks[k] & EDGE)) continue;
         const int x = inner.x0 + k;
+        if (!(marks[k] & EDGE) || !group.part.has(y, x)) continue;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
         const bool is_ramp = marks[k] & RAMP;
         const float beside = valid(value[1] - value[0]), under = valid(value[raw.pitch] - value[0]);
@@ -570,10 +590,9 @@ class Repair {
         found.middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
         const int direction = std::fabs(right) > std::fabs(below) ? right > 0 : 2 + (below > 0);
-        int ring = 0;
-        while (ring < RINGS - 1 && witness_row[k] > SURE[ring + 1]) ring++;
+        const int ring = RINGS - marks[k] / UNSURE;
         const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
-        kind_[row + k] = (uint8_t)(place * 4 + direction);
+        group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * 4 + direction)});
       }
     }
     return true;
@@ -648,7 +667,7 @@ class Repair {
   void judge(std::vector<Group> &groups) const {
     const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });  // none is its own witness
     parallel((int)groups.size(), [&](int g) {
-      if (groups[g].pixels.empty()) return;
+      if (groups[g].edges.empty()) return;
       switch (channels_) {
         case 1: return judge<1>(groups[g], falloff.data());
         case 3: return judge<3>(groups[g], falloff.data());
@@ -666,17 +685,17 @@ class Repair {
     const Grid given(around), witness(around), colour(around, channels);
     for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
     fetch(map_.nearness, given, valid);
-    fetch(witness_.data(), witness, [](float v) { return v; });
+    fetch(marks_.data(), witness, [](uint8_t marks) {
+      const int unsure = marks / UNSURE;
+      return unsure == 0 ? SURE[0] : unsure == 1 ? SURE[1] : unsure == 2 ? SURE[2] : unsure == 3 ? SURE[3] : SURE[4];
+    });
     struct Lanes {
       vec lanes;
     };
     std::vector<Lanes> many(C ? 0 : count);
     std::vector<float> numbers(C ? 0 : count + 3 + channels);
-    each_pixel(group, [&](size_t k, int i, int y, int x) {
-      const size_t soon = group.pixels[std::min(k + 8, group.pixels.size() - 1)];
-      __builtin_prefetch(&near_[soon]);
-      __builtin_prefetch(&far_[soon]);
-      const float near = near_[i], far = far_[i];
+    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+      const float near = edge.near, far = edge.far;
       const vec most_off = all(0.25f * std::max(near - far, 1e-12f)), none = {};
       vec few[C ? 4 + 2 * C : 1];
       float few_sums[C ? 4 + 2 * C + 3 : 1], few_own[C ? C : 1];
@@ -708,7 +727,7 @@ class Repair {
 
       Judgement &judged = group.judged[k];
       judged = {0.0f, 1.0f, near, far};
-      score_[i] = 0.0f;
+      score_[edge.i] = 0.0f;
       float square = 0;
       for (int c = 0; c < channels; c++) square += own[c] * own[c];
       const float per_light = 1.0f / (0.0225f * square + 1e-12f), *apart_at = (const float *)apart + REACH * WHOLE + REACH;
@@ -743,7 +762,7 @@ class Repair {
         const float t = 1.0f + from_mean[side] * per_spread;
         likelihood[side] = likelihood[side] * per_total[side] + 0.02f / (t * t) + 1e-9f;
       }
-      score_[i] = clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f);
+      score_[edge.i] = clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f);
       judged.tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
       judged.near = near + of_parts[2] / std::max(of_parts[0], 1e-12f);
       judged.far = near + of_parts[3] / std::max(of_parts[1], 1e-12f);
@@ -751,13 +770,13 @@ class Repair {
   }
 
   // Neighbours of like colour decide together.
-  void decide(std::vector<Group> &groups) const {
+  void decide(const std::vector<Group> &groups) const {
     parallel((int)groups.size(), [&](int g) {
-      Group &group = groups[g];
-      if (group.pixels.empty()) return;
+      const Group &group = groups[g];
+      if (group.edges.empty()) return;
       const Grid said(group.bounds.grown(1));
       take_listed(score_.data(), said, UNSAID);
-      each_pixel(group, [&](size_t k, int i, int y, int x) {
+      each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
         const float *own = said.at(y, x), *around = group.around[k].alike;
         float total = 1.0f, score = *own, strongest = std::fabs(*own);
         for (int n = 0; n < 8; n++) {
@@ -768,7 +787,7 @@ class Repair {
         }
         const float tells = group.judged[k].tells;
         group.judged[k].score = clamp(SHARPNESS * tells * (score / total), -6.0f, 6.0f);
-        evidence_[i] = clamp01(2.0f * tells * strongest - 1.0f);
+        evidence_[edge.i] = clamp01(2.0f * tells * strongest - 1.0f);
       });
     });
   }
@@ -778,10 +797,9 @@ class Repair {
     const Part inside = in_frame(grid);
     for (int y = inside.y0; y < inside.bottom(); y++) {
       float *row = grid.at(y, 0);
-      std::fill(row + grid.x0, row + grid.right(), elsewhere);
-      each_marked(y, inside.x0, inside.right(), [&](int i) {
-        if (marks_[i] & LISTED) row[i - y * width_] = plane[i];
-      });
+      const float *from = plane + (size_t)y * width_;
+      const uint8_t *marks = marks_.data() + (size_t)y * width_;
+      for (int x = inside.x0; x < inside.right(); x++) row[x] = marks[x] & LISTED ? from[x] : elsewhere;
     }
     go_on(grid, grid);
   }
@@ -790,10 +808,10 @@ class Repair {
   bool is_related(const std::vector<Group> &groups) const {
     double total = 0, agreed = 0;
     for (const Group &group : groups)
-      for (size_t k = 0; k < group.pixels.size(); k++) {
-        const int i = group.pixels[k];
-        const float score = group.judged[k].score, level = (map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f);
-        if (marks_[i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : kind_[i] / 4 % RINGS != RINGS - 1) continue;
+      for (size_t k = 0; k < group.edges.size(); k++) {
+        const Edge &edge = group.edges[k];
+        const float score = group.judged[k].score, level = (map_.nearness[edge.i] - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : edge.kind / 4 % RINGS != RINGS - 1) continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         total += weight;
         if ((score > 0) == (level > 0.5f)) agreed += weight;
@@ -830,9 +848,9 @@ class Repair {
     };
     std::vector<Witness> witnesses;
     for (const Group &group : groups)
-      for (size_t k = 0; k < group.pixels.size(); k++) {
+      for (size_t k = 0; k < group.edges.size(); k++) {
         const float score = group.judged[k].score, weight = std::min(0.5f * std::fabs(score), 1.0f);
-        const int kind = kind_[group.pixels[k]] / together;
+        const int kind = group.edges[k].kind / together;
         total[kind] += weight;
         if (weight > 0) witnesses.push_back({kind, weight, std::exp(-score)});
       }
@@ -851,18 +869,19 @@ class Repair {
   float blur() const { return clamp((float)(found_.middles / (MIDDLE_HALF * std::max(found_.length, 1e-12))), 0.2f, 3.0f); }
 
   // Marks the pixels that show the near surface; returns how many pixels of it at each edge the map has as far ones.
-  float choose(std::vector<Group> &groups) {
+  float choose(const std::vector<Group> &groups) {
     const float lean = map_.automatic ? LEAN : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<int64_t> lost(groups.size(), 0);
     parallel((int)groups.size(), [&](int g) {
-      for (size_t k = 0; k < groups[g].pixels.size(); k++) {
-        const int i = groups[g].pixels[k];
-        const float score = groups[g].judged[k].score;
-        const int shows_near = score + prior[kind_[i]] > -lean * clamp01(std::fabs(score) - 1.0f);
-        lost[g] += shows_near - (marks_[i] & NEAR) / NEAR;
-        marks_[i] = (uint8_t)((marks_[i] & ~NEAR) | shows_near * NEAR);
+      const Group &group = groups[g];
+      uint8_t *marks = marks_.data();
+      for (size_t k = 0; k < group.edges.size(); k++) {
+        const float score = group.judged[k].score;
+        const int i = group.edges[k].i, shows_near = score + prior[group.edges[k].kind] > -lean * clamp01(std::fabs(score) - 1.0f);
+        lost[g] += shows_near - (marks[i] & NEAR) / NEAR;
+        marks[i] = (uint8_t)((marks[i] & ~NEAR) | shows_near * NEAR);
       }
     });
     double total = found_.lost;
@@ -874,19 +893,23 @@ class Repair {
   static float is_lost(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
 
   // Gives pixels the depth of the surface that they show; on ramps as far as there is evidence.
-  void move(const std::vector<Group> &groups) const {
+  void move(const std::vector<Group> &groups, float sigma, float lost_px) const {
+    const std::vector<float> weights = even_window();
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
-      if (group.pixels.empty()) return;
+      if (group.edges.empty()) return;
+      unmix(group, weights.data(), sigma, lost_px);
       // from the ends of a wide ramp only one of the surfaces is in sight: what is three pixels away tells
       const Part around = group.bounds.grown(3);
       const Grid evidence(around), strongest(group.bounds), rows(around);
       take_listed(evidence_.data(), evidence, 0.0f);
       highest<3>(evidence, strongest, rows, group.bounds);
-      each_pixel(group, [&](size_t k, int i, int y, int x) {
-        const bool shows_near = marks_[i] & NEAR, given_near = marks_[i] & GIVEN_NEAR;
-        const float moved = marks_[i] & RAMP ? *strongest.at(y, x) : (float)(shows_near != given_near);
-        if (moved > 0) map_.out[i] += moved * ((shows_near ? group.judged[k].near : group.judged[k].far) - map_.out[i]);
+      each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+        const uint8_t marks = marks_[edge.i];
+        const bool shows_near = marks & NEAR, given_near = marks & GIVEN_NEAR;
+        const float moved = marks & RAMP ? *strongest.at(y, x) : (float)(shows_near != given_near);
+        const float out = map_.out[edge.i], to = shows_near ? group.judged[k].near : group.judged[k].far;
+        map_.out[edge.i] = moved > 0 ? out + moved * (to - out) : out;
       });
     });
   }
@@ -934,45 +957,40 @@ class Repair {
   }
 
   // The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best.
-  void unmix(std::vector<Group> &groups, float sigma, float lost_px) const {
-    const std::vector<float> weights = even_window();
+  void unmix(const Group &group, const float *weights, float sigma, float lost_px) const {
     const int reach = blur_reach(sigma);
-    parallel((int)groups.size(), [&](int g) {
-      Group &group = groups[g];
-      if (group.pixels.empty()) return;
-      const std::vector<uint8_t> is_thin = thin(group);
-      const Part part = bounds(group, [&](size_t k) { return is_thin[k]; });
-      if (part.height <= 0 || part.width <= 0) return;
-      const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
-      const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
-      fetch(map_.nearness, up, valid);
-      fetch(map_.nearness, given, valid);
-      for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
-      highest<SIDE_REACH>(up, high, rows, labelled);
-      highest<SIDE_REACH>(down, low, rows, labelled);
-      each_vector(labelled, [&](int y, int x) {
-        const auto is_near = 2.0f * load<vec>(up.at(y, x)) > load<vec>(high.at(y, x)) - load<vec>(low.at(y, x));
-        store(high.at(y, x), is_near ? all(1.0f) : vec{});
-      });
-      const Part inside = in_frame(labelled);
-      for (int y = inside.y0; y < inside.bottom(); y++) {
-        const uint8_t *marks = marks_.data() + (size_t)y * width_;
-        float *label = high.at(y, 0);
-        for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
-      }
-      go_on(high, labelled);
-      gaussian(high, blurred, rows, around, sigma);
-      each_pixel(group, [&](size_t k, int i, int y, int x) {
-        if (!is_thin[k]) return;
-        Line line = regress(given, high, blurred, weights.data(), y, x);
-        line.fit *= is_lost(marks_[i] & NEAR ? lost_px : -lost_px);
-        float &near = group.judged[k].near, &far = group.judged[k].far;
-        const float gap = near - far;
-        if (marks_[i] & NEAR)
-          near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
-        else if (line.fit > 0)
-          far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
-      });
+    const std::vector<uint8_t> is_thin = thin(group);
+    const Part part = bounds(group, [&](size_t k) { return is_thin[k]; });
+    if (part.height <= 0 || part.width <= 0) return;
+    const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
+    const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
+    fetch(map_.nearness, up, valid);
+    fetch(map_.nearness, given, valid);
+    for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
+    highest<SIDE_REACH>(up, high, rows, labelled);
+    highest<SIDE_REACH>(down, low, rows, labelled);
+    each_vector(labelled, [&](int y, int x) {
+      const auto is_near = 2.0f * load<vec>(up.at(y, x)) > load<vec>(high.at(y, x)) - load<vec>(low.at(y, x));
+      store(high.at(y, x), is_near ? all(1.0f) : vec{});
+    });
+    const Part inside = in_frame(labelled);
+    for (int y = inside.y0; y < inside.bottom(); y++) {
+      const uint8_t *marks = marks_.data() + (size_t)y * width_;
+      float *label = high.at(y, 0);
+      for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
+    }
+    go_on(high, labelled);
+    gaussian(high, blurred, rows, around, sigma);
+    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+      if (!is_thin[k]) return;
+      Line line = regress(given, high, blurred, weights, y, x);
+      line.fit *= is_lost(marks_[edge.i] & NEAR ? lost_px : -lost_px);
+      float &near = group.judged[k].near, &far = group.judged[k].far;
+      const float gap = near - far;
+      if (marks_[edge.i] & NEAR)
+        near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
+      else if (line.fit > 0)
+        far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
     });
   }
 
@@ -984,11 +1002,14 @@ class Repair {
     std::vector<uint8_t> memory(2 * size + 4 * pitch, 3);
     uint8_t *shape = memory.data(), *rows = shape + size + 2 * pitch;  // a bit for each surface: near, far
     const Part inside = in_frame(around);
-    for (int y = inside.y0; y < inside.bottom(); y++)
+    for (int y = inside.y0; y < inside.bottom(); y++) {
+      const uint8_t *marks = marks_.data() + (size_t)y * width_;
+      uint8_t *row = shape + (y - around.y0) * pitch - around.x0;
       for (int x = inside.x0; x < inside.right(); x++) {
-        const uint8_t marks = marks_[(size_t)y * width_ + x];
-        shape[(y - around.y0) * pitch + x - around.x0] = marks & EDGE ? (marks & NEAR ? 1 : 2) : 3;
+        const uint8_t edge = marks[x] & EDGE, is_near = marks[x] & NEAR;
+        row[x] = edge ? (is_near ? 1 : 2) : 3;
       }
+    }
     for (int y = 0; y < around.height; y++)
       for (int x = 2; x < pitch - 2; x++) {
         const uint8_t *p = shape + y * pitch + x;
@@ -999,19 +1020,22 @@ class Repair {
         const uint8_t *p = rows + y * pitch + x;
         shape[y * pitch + x] = p[-2 * pitch] & p[-pitch] & p[0] & p[pitch] & p[2 * pitch];
       }
-    for (int y = 0; y < around.height; y++)  // beyond the frame there is none
-      for (int x = 0; x < pitch; x++)
-        if (y + around.y0 < 0 || y + around.y0 >= height_ || x + around.x0 < 0 || x + around.x0 >= width_) shape[y * pitch + x] = 0;
+    for (int y = around.y0; y < around.bottom(); y++) {  // beyond the frame there is none
+      uint8_t *row = shape + (y - around.y0) * pitch;
+      if (y < 0 || y >= height_) memset(row, 0, pitch);
+      memset(row, 0, inside.x0 - around.x0);
+      memset(row + inside.right() - around.x0, 0, around.right() - inside.right());
+    }
     for (int y = 2; y < around.height - 2; y++)
       for (int x = 4; x < pitch - 4; x++) {
         const uint8_t *p = shape + y * pitch + x;
         rows[y * pitch + x] = p[-2] | p[-1] | p[0] | p[1] | p[2];
       }
-    std::vector<uint8_t> found(group.pixels.size());
-    each_pixel(group, [&](size_t k, int i, int y, int x) {
+    std::vector<uint8_t> found(group.edges.size());
+    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
       const uint8_t *p = rows + (y - around.y0) * pitch + x - around.x0;
       const uint8_t thick = p[-2 * pitch] | p[-pitch] | p[0] | p[pitch] | p[2 * pitch];
-      found[k] = !(thick & (marks_[i] & NEAR ? 1 : 2));
+      found[k] = !(thick & (marks_[edge.i] & NEAR ? 1 : 2));
     });
     return found;
   }
@@ -1031,9 +1055,8 @@ class Repair {
         low = least(low, load<vec>(near.at(y, x)));
       });
       if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * map_.step)) return;
-      const std::vector<int> lamps = lamps_of(part, near);
-      if (lamps.empty()) return;
-      const Group group{part, lamps};
+      const Group group{part, lamps_of(part, near)};
+      if (group.edges.empty()) return;
       const Part around = bounds(group, [](size_t) { return true; }).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
       const Grid bright(whole), usual(whole), rows(whole), peak(covered), blurred(around), given(around);
       brightest(bright, usual, rows, covered);
@@ -1045,10 +1068,11 @@ class Repair {
       go_on(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
       fetch(map_.nearness, given, valid);
-      each_pixel(group, [&](size_t, int i, int y, int x) {
+      each_edge(group, [&](size_t, const Edge &lamp, int y, int x) {
         Line line = regress(given, usual, blurred, weights.data(), y, x);
         line.fit *= is_lost(lost_px);
-        map_.out[i] += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - map_.out[i], 0.0f);
+        float &out = map_.out[lamp.i];
+        out += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - out, 0.0f);
       });
     });
   }
@@ -1068,13 +1092,13 @@ class Repair {
   }
 
   // The pixels of lamps in a part; up: its nearness, and that of what is REACH around.
-  std::vector<int> lamps_of(const Part &part, const Grid &up) const {
+  std::vector<Edge> lamps_of(const Part &part, const Grid &up) const {
     const Part whole = part.grown(USUAL_REACH);
     const Grid bright(whole), usual(part), rows(whole);
     brightest(bright, usual, rows, part);
     vec any{};
     each_vector(part, [&](int y, int x) { any = most(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? all(1.0f) : vec{}); });
-    std::vector<int> found;
+    std::vector<Edge> found;
     if (!(largest(any) > 0)) return found;
     const Part &around = up;
     const Grid down(around), high(part), low(part), peak(part);
@@ -1087,7 +1111,7 @@ class Repair {
         const size_t i = (size_t)y * width_ + x;
         const float own = *bright.at(y, x);
         if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) && *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
-          found.push_back((int)i);
+          found.push_back({(int)i, 0, 0, 0});
       }
     return found;
   }
@@ -1124,6 +1148,7 @@ class Repair {
   Buffer<uint8_t> marks_, kind_;
   Buffer<Judgement> judged_;  // of the pixels listed last
   Buffer<Around> around_;
+  mutable std::vector<Scratch> scratch_;  // of threads
   std::vector<float> shares_;
   Found found_;
 };
