@@ -246,16 +246,16 @@ struct Edge {
 struct Group {
   Part part;
   std::vector<Edge> edges;
-  Part bounds = {};              // where they lie
+  Part bounds = {};             // where they lie
   Judgement *judged = nullptr;  // of each
   Around *around = nullptr;
 };
 
 // What edges are, in sums.
 struct Found {
-  double length = 0;  // of steps, in pixels
-  double lost = 0;    // pixels that the map shows as near, less what it has of the near surface
-  int64_t middles = 0;
+  double length = 0;    // of steps, in pixels
+  double lost = 0;      // pixels that the map shows as near, less what it has of the near surface
+  int64_t middles = 0;  // pixels in the middle half of a step
 };
 
 class Repair {
@@ -341,6 +341,7 @@ class Repair {
   std::vector<Group> tiles() const {
     return squares(AREA, [](int, int) { return true; });
   }
+
   // Marks chosen edges, and forgets the others.
   template <typename Chosen>
   void list(std::vector<Group> &groups, const Chosen &chosen) {
