@@ -224,9 +224,12 @@ def test_bench_focuses_where_it_is_told(files: tuple[Path, Path], tmp_path: Path
 
 def test_bench_measures_the_lens_that_it_is_told(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[BenchScene] = []
-    monkeypatch.setattr(
-        speed, "measure_all", lambda scene, *_: (measured.append(scene) or [row(EXACT, 0.5, 0.0)], 0.02)
-    )
+
+    def kept(scene: BenchScene, *_: Any) -> tuple[list[speed.SettingCost], float]:
+        measured.append(scene)
+        return [row(EXACT, 0.5, 0.0)], 0.02
+
+    monkeypatch.setattr(speed, "measure_all", kept)
     lens = ("--fov-deg", 40, "--aperture-radius-m", 0.02, "--focus-at", "0,0", "--table", "gaussian", "--blades", 5)
     result = run(*files, *lens, "--json")
     assert result.exit_code == 0, result.output

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from torchdof import DepthOfField
 from torchdof.cli.main import app
 from torchdof.export import describe
 
@@ -28,8 +29,13 @@ def test_a_file_is_written_and_its_verification_printed(exported_by_command: tup
 
 
 def test_blades_are_those_of_the_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    modules = []
-    monkeypatch.setattr("torchdof.cli.export.to_onnx", lambda dof, *_, **__: modules.append(dof) or 1 / 0)
+    modules: list[DepthOfField] = []
+
+    def kept(dof: DepthOfField, *_: Any, **__: Any) -> None:
+        modules.append(dof)
+        raise ValueError("that was it")
+
+    monkeypatch.setattr("torchdof.cli.export.to_onnx", kept)
     run("-o", tmp_path / "dof.onnx", "--blades", "5", "--rotation", "10", "--squeeze", "2")
     aperture = modules[0].options.table.aperture
     assert aperture is not None and (aperture.blades, aperture.rotation_deg, aperture.squeeze) == (5, 10.0, 2.0)

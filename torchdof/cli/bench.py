@@ -243,8 +243,8 @@ def bench(
         typer.echo(json_line({**facts, **costs, "scans": [dataclasses.asdict(cost) for cost in scan_costs]}))
     else:
         speed.show(rows, scene, unit)
-        for table in scans:
-            table.show()
+        for of_scan in scans:
+            of_scan.show()
     if out is not None:
         speed.write(out, rows, scene, unit, repeat, scans)
 
