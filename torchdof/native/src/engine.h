@@ -184,6 +184,23 @@ inline V behind(const Layer &l, V place, bool ease) {
   return ramp((place - l.at) * l.per_after, ease);
 }
 
+constexpr float HAIR = 0.06f;  // share of a surface up to which, in a layer, it does not yet hide what is known behind it
+constexpr float GOES_ON = 0.1f;  // share of a pixel, beyond a hidden one's, from which on its farther surface goes on wholly
+// By how much the farther surface of a mixed pixel, which goes on behind the nearer one, may count more than its share; and by
+// how much it does in a layer that has so much of the nearer one at or behind it.
+template <typename V>
+inline V going_on(V share) {
+  const V zero = {}, one = zero + 1.0f;
+  V known = (share - HIDDEN_WEIGHT) * (1.0f / GOES_ON);
+  known = known > zero ? known : zero;
+  return (one - share) * (known < one ? known : one);
+}
+template <typename V>
+inline V where_it_shows(V going_on, V nearer) {
+  const V one = V{} + 1.0f, hidden = nearer * (1.0f / HAIR);
+  return going_on * (one - (hidden < one ? hidden : one));
+}
+
 struct Job {
   explicit Job(const torchdof_scene &scene);
   void begin();
@@ -308,8 +325,10 @@ struct LayerIndex {
 };
 
 // Parts of blocks of pixels that lie between two nodes, row by row of blocks: start[r] to start[r + 1] are those of row r.
-// values: weight and light; and these times how far between the nodes each pixel lies.
+// values: weight and light; and these times how far between the nodes each pixel lies. With the bit ROOM_ONLY a node is that
+// of weight which is room alone.
 struct Pieces {
+  static constexpr uint16_t ROOM_ONLY = 0x8000;
   std::vector<int> start, column;
   std::vector<uint16_t> node;
   std::vector<float> values;
@@ -425,7 +444,7 @@ class Turned {
       return clamp01(mean[0] + near * (mean[1] - mean[0]));
     }
     vec at(vec u, vec v) const {
-      const vec row = least(most(vec{}, u * per_u + first_u), all(last_row)), column = least(most(vec{}, v * per_v), all(last_column));
+      const vec row = least(most(u * per_u + first_u, vec{}), all(last_row)), column = least(most(v * per_v, vec{}), all(last_column));
       const ivec i = convert(least(row, all(last_row - 1.0f))), j = convert(least(column, all(last_column - 1.0f)));
       const vec down = row - convert(i), right = column - convert(j);
       const ivec first = i * columns + j;
