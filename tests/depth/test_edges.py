@@ -145,6 +145,15 @@ def test_what_differs_by_less_than_half_a_step_has_no_edge(
     assert torch.equal(edges.repair(image, nearness, 2.001 * float(high - low), False), nearness)
 
 
+@pytest.mark.parametrize("moved", [1e-4, -1e-4])
+def test_a_hair_decides_no_direction(moved: float) -> None:
+    """Where four blocks meet, the near surface lies as much beside a pixel as below it."""
+    blocks = 3.0 * torch.randint(0, 4, (1, 1, 6, 8)).repeat_interleave(8, -1).repeat_interleave(8, -2) + 0.1
+    found, again = (edges._find(n, n.isfinite(), torch.tensor(1.0)) for n in (blocks, blocks + moved))
+    assert bool(found.is_edge.any())
+    assert torch.equal(found.direction[found.is_edge], again.direction[found.is_edge])
+
+
 def test_infinite_depth_is_a_surface(scene: Scene) -> None:
     depth = torch.where(scene.depth == 6.0, math.inf, scene.depth)
     assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)

@@ -159,7 +159,7 @@ def rms(difference: Tensor) -> float:
 def test_a_hair_of_depth_changes_the_picture_by_a_hair(
     seeds: range, depth_edges: str, tolerance: float, most_rms: float, most: float, dtype: torch.dtype
 ) -> None:
-    """Also where edges are repaired: each decision fades in."""
+    """Also where edges are repaired: decisions fade in, or are off what scenes often hold."""
     for seed in seeds:
         scene = random_scene(seed)
         scene.options["depth_edges"] = depth_edges

@@ -34,6 +34,7 @@ _FALLOFF_PX = 2.5
 _ABRUPT = 0.3  # part of a step that lies between two neighbours
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a pixel as witness, by ring; beside an edge it may be wrong itself
 _RAMP_REACH = 6  # half the width of the widest ramp that is one, not a slope
+_TIE = 0.017  # part of a step by which directions must differ: off the multiples of 1/25 that means of steps are
 _SHALLOW = 0.03  # slope, of what lies between the surfaces around, from which on it belongs to a ramp
 _LEVELS = 6  # places on a ramp that are calibrated apart
 _PLACES = 2 * _RINGS + _LEVELS
@@ -250,7 +251,8 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
 
     mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
     right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
-    direction = torch.where(right.abs() > down.abs(), (right > 0).long(), 2 + (down > 0).long())
+    tie = _TIE * (near - far)
+    direction = torch.where(right.abs() > down.abs() + tie, (right > 0).long(), 2 + (down > tie).long())
     return _Edges(near, far, is_ramp, ring, is_edge, direction)
 
 

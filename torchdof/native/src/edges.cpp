@@ -14,7 +14,7 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
@@ -553,7 +553,7 @@ class Repair {
       const vec v = load<vec>(raw.at(y, x));
       store(slope.at(y, x), size_of(v) <= all(FINITE) ? v : vec{});
     });
-    sums<2>(slope, high, rows, means, 1.0f);
+    sums<2>(slope, high, rows, means, 1.0f / 25.0f);
 
     float near_row[AREA + LANES], far_row[AREA + LANES], mark_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
@@ -590,7 +590,7 @@ class Repair {
         found.lost += (marks[k] & NEAR ? 1.0f : 0.0f) - clamp01(level);
         found.middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
-        const int direction = std::fabs(right) > std::fabs(below) ? right > 0 : 2 + (below > 0);
+        const int direction = std::fabs(right) > std::fabs(below) + TIE * gap ? right > 0 : 2 + (below > TIE * gap);
         const int ring = RINGS - marks[k] / UNSURE;
         const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
         group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * 4 + direction)});
