@@ -9,6 +9,7 @@ plain engine renders, at a tolerance of 1/255; whole frames are compared.
 
 import argparse
 import contextlib
+import math
 import os
 import random
 import statistics
@@ -106,6 +107,7 @@ PARTS: dict[str, list[tuple[Any, str, Any]]] = {
     "everything": [],
     "no matting of mixed pixels": MATTING,
     "emitters stay on the surface of their pixel": MATTING[1:],
+    "farther surfaces of mixed pixels by their share alone": [(surfaces, "_GOES_ON", math.inf)],
     "nothing filled in behind blurred foregrounds": FILL,
     "one hidden surface, no light behind it": [(surfaces, "fill_hidden", _nothing_behind)],
     "highlights left in their layers": RAYS,
