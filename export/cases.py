@@ -45,6 +45,7 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         ("odd, three items", (3, 37, 53), _ramp(-0.6, 0.8)),
         ("portrait", (1, 96, 31), _ramp(-1.0, 0.4)),
         ("depth edges", (1, 64, 97), _steps),
+        ("lamps", (2, 48, 83), _steps),
         ("all in focus", (1, 48, 64), _ramp(0.0, 0.0)),
         ("all behind, out of focus", (1, 48, 64), _ramp(0.9, 0.9)),
         ("all in front, out of focus", (1, 48, 64), _ramp(-0.9, -0.9)),
@@ -62,6 +63,9 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
             image = 0.1 * image
             image[:, :, height // 3, width // 4] = 6.5e4
         coc = reach * shape(batch, height, width)
+        if name == "lamps":
+            image = 0.1 * image
+            image[:, :, 2::11, 3::13] *= 500.0
         if float(coc.min()) < float(coc.max()):
             # where a depth lies midway between its neighbours, to the last bit, rounding decides whose surface it is
             coc = coc * (1.0 + 0.03 * torch.rand(coc.shape, generator=random))

@@ -19,6 +19,7 @@ from torchdof.io.atomic import whole_file
 from .graph import INPUTS, OUTPUT, Portable, trace
 from .interface import broadcast
 from .metadata import label
+from .ray_loop import FUNCTIONS
 from .slimming import slim
 from .verification import Verification, verify
 
@@ -50,7 +51,7 @@ def to_onnx(
 
     The graph has the layers of every radius up to ``dof.max_coc_px``. It renders tile by tile in an ONNX ``Loop`` and
     skips, by ``If``, tiles that are in focus and layers that no pixel in or near a tile falls into (numbers in
-    docs/embedding.md). Highlights are blurred as other light is, not ray by ray as in eager renderings.
+    docs/embedding.md). Highlights, where there are any, are splatted ray by ray in another ``Loop``.
 
     Args:
         dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they
@@ -88,7 +89,8 @@ def to_onnx(
         raise ValueError(f"cannot write {path}: there is no folder {path.parent}")
     portable = Portable(dof, inputs, width)
     progress("tracing")
-    program = trace(portable, channels)
+    with _quiet():
+        program = trace(portable, channels)
     progress("translating")
     graph = _translate(program, portable.inputs, opset)
     progress("slimming")
@@ -120,6 +122,10 @@ def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
+    for function in FUNCTIONS:
+        own = onnx_ir.serde.deserialize_function(function.to_function_proto())
+        own.opset_imports[""] = opset
+        converted.model.functions[own.identifier()] = own
     return converted.model
 
 
@@ -171,10 +177,13 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
 """Operators that torch.onnx does not translate as they are."""
 
 
+_TALKATIVE = ("torch.onnx", "torch.fx.experimental.symbolic_shapes", "onnxscript", "onnx_ir")
+
+
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Without what torch.onnx and onnxscript say about themselves and not about the module."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    loggers = [logging.getLogger(name) for name in _TALKATIVE]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         # torch's own copy of its tree specs calls a constructor that torch deprecates
@@ -182,7 +191,8 @@ def _quiet() -> Iterator[None]:
         # the axes of depth, focus and f-number are those of the image, which is what is meant
         warnings.filterwarnings("ignore", message=r".*axis name: [BHW] will not be used", category=UserWarning)
         for logger in loggers:
-            logger.setLevel(logging.ERROR)  # torchvision's operators are missed at each export
+            # torchvision's operators are missed at each export, and ranges of sizes that torch cannot write down
+            logger.setLevel(logging.ERROR)
         try:
             yield
         finally:

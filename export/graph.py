@@ -12,6 +12,7 @@ from torchdof.optics.camera import Camera
 from torchdof.render.exporting import where_needed
 from torchdof.render.plan import Blur, Plan
 
+from .rays import kernels_of
 from .tiling import in_tiles
 
 __all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
@@ -80,7 +81,7 @@ class Portable(nn.Module):
     @property
     def plan(self) -> Plan:
         """The layers of the graph."""
-        return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance)
+        return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance, rays=True)
 
     def blurs(self, size: tuple[int, int]) -> list[Blur]:
         """Kernels of the graph's layers, for a frame of this height and width."""
@@ -138,5 +139,6 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
     # what torch would keep of each operator, to know one like it again, takes longer than it saves: sizes are symbols
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
-    with torch.no_grad(), in_tiles(), uncached:
+    kernels = kernels_of(table, portable.plan)
+    with torch.no_grad(), in_tiles(kernels), uncached:
         return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)

@@ -9,12 +9,15 @@ from torch import Tensor
 __all__ = ["samples"]
 
 
-def samples(values: Tensor, size: int, ratio: float, half_px: tuple[Tensor, Tensor]) -> Iterator[tuple[Tensor, Tensor]]:
-    """The samples around each pixel of a square map, and their shares of the linear mean.
+def samples(
+    values: Tensor, size: tuple[int, int], ratio: float, half_px: tuple[Tensor, Tensor]
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The samples around each pixel of a map, and their shares of the linear mean.
 
     Args:
-        values: Samples ``[B, C, n, n]`` at every ``ratio``-th pixel of the map, among them all around its pixels.
-        size: Of the map.
+        values: Samples ``[B, C, h, w]`` at every ``ratio``-th pixel of the map; beyond a ratio of 1 one more on each
+            side.
+        size: Height and width of the map.
         ratio: 1/2, 1 or more powers of two. Up to 1 both have one centre.
         half_px: How many halves of a pixel of the map, 0 or 1, its centre lies below and right of that of the samples.
     """
@@ -27,11 +30,14 @@ def samples(values: Tensor, size: int, ratio: float, half_px: tuple[Tensor, Tens
         return
     step = int(ratio)
     enlarged = functional.interpolate(values, scale_factor=float(step), mode="nearest")
-    first = (step * values.shape[-1] - size - step) // 2  # of the samples before the first pixel
-    place = 2 * torch.arange(size, device=values.device) + 2 * first + 1
-    shares = [((place % (2 * step)).to(values.dtype) + half) / (2 * step) for half in half_px]
-    down, right = ((1.0 - share, share) for share in shares)
+    first = step // 2  # of the samples before the first pixel
+    shares = []
+    for n, half in zip(size, half_px, strict=True):
+        place = 2 * torch.arange(n, device=values.device) + 2 * first + 1
+        share = ((place % (2 * step)).to(values.dtype) + half) / (2 * step)
+        shares.append((1.0 - share, share))
+    down, right = shares
     for row in (0, 1):
         for column in (0, 1):
-            top, left = first + row * step, first + column * step
-            yield enlarged[..., top : top + size, left : left + size], down[row][:, None] * right[column]
+            shifted = enlarged.narrow(-2, first + row * step, size[0]).narrow(-1, first + column * step, size[1])
+            yield shifted, down[row][:, None] * right[column]

@@ -1,6 +1,7 @@
 """A translated graph made flat, small and plain: what other runtimes read as well as the one it is verified with."""
 
 import itertools
+import string
 from collections.abc import Collection, Iterator
 from typing import Any
 
@@ -57,7 +58,8 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
     for graph in (model.graph, *model.graph.subgraphs()):
         _as_nodes(graph)
     kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
-    names = (f"v{i}" for i in itertools.count())
+    names = ("".join(letters) for n in (2, 3, 4) for letters in itertools.product(string.ascii_letters, repeat=n))
+    names = (name for name in names if name not in kept)
     for graph in (model.graph, *model.graph.subgraphs()):
         for value in (*graph.inputs, *graph.initializers.values()):
             _shorten(value, kept, names)
@@ -93,6 +95,9 @@ def _as_nodes(graph: onnx_ir.Graph) -> None:
     first = next(iter(graph), None)
     values: list[Any] = list(graph.initializers.values())
     for value in values:
+        if not value.uses():
+            del graph.initializers[value.name]
+            continue
         tape, array = Tape(), value.const_value.numpy()
         if array.size > _LARGEST_EQUAL and (array == array.flat[0]).all():
             shape = tape.op("Constant", [], {"value_ints": list(array.shape)})

@@ -18,7 +18,7 @@ _Owners = dict[Any, onnx_ir.Node]  # the node that a subgraph belongs to
 
 def structure(model: onnx_ir.Model) -> None:
     """Make loops and branches of a flat graph, in place."""
-    owners: _Owners = {}
+    owners: _Owners = {a.as_graph(): n for n in model.graph for a in n.attributes.values() if _is_graph(a)}
     for node in _ours(model.graph, COLLECT):
         _loop(model.graph, node, owners)
     _branches(model.graph, owners)
@@ -133,9 +133,13 @@ def _taken(node: onnx_ir.Node) -> list[onnx_ir.Value]:
     """What a node and its subgraphs take."""
     values = [value for value in node.inputs if value is not None]
     for attribute in node.attributes.values():
-        if attribute.type == onnx_ir.AttributeType.GRAPH:
+        if _is_graph(attribute):
             values += [value for inner in attribute.as_graph() for value in _taken(inner)]
     return values
+
+
+def _is_graph(attribute: onnx_ir.Attr) -> bool:
+    return attribute.type == onnx_ir.AttributeType.GRAPH
 
 
 def _in(graph: onnx_ir.Graph, node: onnx_ir.Node, owners: _Owners) -> onnx_ir.Node:

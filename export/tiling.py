@@ -8,6 +8,7 @@ results. :mod:`torchdof.export.structure` makes a loop and branches of these.
 """
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -15,14 +16,15 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof.render.disocclusion import BEHIND_PX, BEHIND_STEP, Level, Looking, Seen, search
+from torchdof.render.disocclusion import BEHIND_PX, Level, search
 from torchdof.render.exporting import Graph, graph_context, where_needed
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Frame, Placed
 
+from .rays import Kernels, splat
 from .shifting import samples
 
-__all__ = ["CHOICE", "COLLECT", "DOMAIN", "WINDOW", "choose", "in_tiles", "look_tile_by_tile", "side", "tile_by_tile"]
+__all__ = ["CHOICE", "COLLECT", "DOMAIN", "WINDOW", "choose", "in_tiles", "seen", "side", "tile_by_tile"]
 
 DOMAIN = "torchdof"
 """Of the operators that stand for structure in a flat graph; none is left in a file."""
@@ -51,10 +53,11 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     Args:
         frame: Surfaces and their border; its area is a multiple of :func:`side`.
         blurs: Kernel and resolution of each layer.
-        render: Renders one tile with them: ``[1, C, side, side]``.
+        render: Renders one tile with them: ``[1, C, side, side]``, or with weights of its light, 1 where it is sharp,
+            in further channels.
 
     Returns:
-        ``[B, C, H, W]``.
+        The same of the frame, ``[B, C, H, W]``.
     """
     length, margin = side(frame.margin), frame.margin
     parts = [t for s in frame.surfaces for t in s if t is not None]
@@ -68,92 +71,77 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     surfaces = [Placed(*fields[i : i + each]) for i in range(0, len(fields), each)]
     size = (length, length)
     piece = Frame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
-    tile = where_needed(
-        lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0,
-        render(piece, blurs),
-        surfaces[0].light[inner],
-    )
+    rendered, sharp = render(piece, blurs), surfaces[0].light[inner]
+    weights = int(rendered.shape[1]) - frame.colours
+    if weights:
+        sharp = torch.cat([sharp, torch.ones_like(sharp[:, :weights])], 1)
+    tile = where_needed(lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0, rendered, sharp)
     rows, columns = (n // length for n in frame.area)
-    batch, colours = parts[0].shape[0], frame.colours
-    pieces = _operator(COLLECT, [tile], (batch * rows * columns, colours, length, length))
+    batch = parts[0].shape[0]
+    pieces = _operator(COLLECT, [tile], (batch * rows * columns, int(rendered.shape[1]), length, length))
     return _joined(pieces, (batch, rows, columns))[..., : frame.size[0], : frame.size[1]]
 
 
-def look_tile_by_tile(
-    levels: Sequence[Level],
-    maps: Looking,
-    look: Callable[[Sequence[Level], Looking, Seen], tuple[Tensor, Tensor, Tensor]],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Look behind the pixels of a frame, each tile by itself, and only behind those where there may be something.
+def seen(
+    levels: Sequence[Level], coc_px: Tensor, mask: Tensor, step: int = 1, farthest: bool = False
+) -> tuple[Tensor, Tensor]:
+    """What levels of a pyramid show behind the surfaces of a map, as :data:`torchdof.render.disocclusion.Seen`.
 
-    Args:
-        levels: Of a pyramid, for the whole frame.
-        maps: Who looks.
-        look: Looks at one tile.
-
-    Returns:
-        What is seen and its votes, for the frame, and the light behind all, for its cells.
+    Behind cells it is looked for at once, behind pixels tile by tile, and only in those behind which there may be
+    something.
     """
-    size = maps.coc_px.shape[-2:]
-    whole = [BEHIND_STEP * n for n in maps.nearest.shape[-2:]]  # both have one centre
-    more = [(n + _SIDE - 1) // _SIDE * _SIDE - n for n in whole]  # below and right, to whole tiles
-    before = [(w - n) // 2 for w, n in zip(whole, size, strict=True)]
-    like = maps.coc_px
-    halves = [torch.scalar_tensor((w - n) % 2, dtype=like.dtype) for w, n in zip(whole, size, strict=True)]
-
-    def windows(values: Tensor, step: int, margin: int) -> Tensor:
-        ends = [margin, margin + more[1] // step, margin, margin + more[0] // step]
-        return _window(functional.pad(values, ends, mode="replicate"), _SIDE // step, margin)
-
-    top, left = before
-    ends = [left, whole[1] + more[1] - size[1] - left, top, whole[0] + more[0] - size[0] - top]
-    looking = torch.cat([maps.coc_px, maps.mask.to(like.dtype)], 1)
-    coc_px, mask = _window(functional.pad(looking, ends, mode="replicate"), _SIDE, 0).split(1, 1)
-    looking = torch.cat([maps.nearest, maps.cells.to(like.dtype)], 1)
-    nearest, cells = windows(looking, BEHIND_STEP, 1).split(1, 1)
-    # cells are looked at with a margin of one, so finer levels with one of as many pixels
-    around = [lv._replace(values=windows(lv.values, lv.step, max(1, BEHIND_STEP // lv.step))) for lv in levels]
-
-    def seen(
-        levels: Sequence[Level], coc_px: Tensor, mask: Tensor, step: int = 1, farthest: bool = False
-    ) -> tuple[Tensor, Tensor]:
-        length, half_px = int(coc_px.shape[-1]), (halves[0], halves[1])
-        if step > 1:  # cells and coarser ones lie on one grid
-            half_px = (like.new_zeros(()),) * 2
-        lists = [samples(level.values, length, level.step / step, half_px) for level in levels]
+    zero, size = coc_px.new_zeros(()), (coc_px.shape[-2], coc_px.shape[-1])
+    if step > 1:  # cells and levels have one centre
+        around = [_around(level.values, level.step / step) for level in levels]
+        lists = [samples(v, size, lv.step / step, (zero, zero)) for v, lv in zip(around, levels, strict=True)]
         shown, total = search(levels, lists, coc_px, farthest)
-        return shown, total * mask
+        found = torch.cat([shown, total * mask], 1)
+        found = where_needed(lambda: mask.any(), found, torch.zeros_like(found))
+        return found[:, :-1], found[:, -1:]
 
-    shown, total, behind = look(around, Looking(coc_px, mask, nearest, cells), seen)
-    own = next(level.values[:, :-2] for level in around if level.step == BEHIND_STEP)
-    found, given = torch.cat([shown, total], 1), torch.zeros_like(torch.cat([shown, total], 1))
-    inner = (..., slice(1, -1), slice(1, -1))
+    whole = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # both have one centre
+    more = [(n + _SIDE - 1) // _SIDE * _SIDE - n for n in whole]  # below and right, to whole tiles
+    top, left = ((w - n) // 2 for w, n in zip(whole, size, strict=True))
+    halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(whole, size, strict=True)]
+    ends = [left, whole[1] + more[1] - size[1] - left, top, whole[0] + more[0] - size[0] - top]
+    looking = functional.pad(torch.cat([coc_px, mask.to(coc_px.dtype)], 1), ends, mode="replicate")
+    coc_px, mask = _window(looking, _SIDE, 0).split(1, 1)
+    pieces = []
+    for level in levels:
+        ends = [1, 1 + more[1] // level.step, 1, 1 + more[0] // level.step]
+        values = _window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
+        pieces.append(level._replace(values=values))
+    sizes = (_SIDE, _SIDE)
+    lists = [samples(level.values, sizes, float(level.step), (halves[0], halves[1])) for level in pieces]
+    shown, total = search(pieces, lists, coc_px, farthest)
+    found = torch.cat([shown, total * mask], 1)
 
     def hides() -> Tensor:
-        farthest = torch.stack([level.values[:, -2].max() for level in around]).max()
-        return (mask.max() > 0) & (farthest > torch.minimum(coc_px.min(), nearest.min()) + (BEHIND_PX - 0.5))
+        most = torch.stack([level.values[:, -2].max() for level in pieces]).max()
+        return (mask.max() > 0) & (most > coc_px.min() + (BEHIND_PX - 0.5))
 
-    # both maps of a tile as one line of numbers, for a loop collects one thing
-    lines = (torch.cat([a.flatten(1), b[inner].flatten(1)], 1) for a, b in ((found, behind), (given, own)))
-    tile = where_needed(hides, *lines)
-    sides, channels = (_SIDE, _SIDE // BEHIND_STEP), (int(found.shape[1]), int(behind.shape[1]))
-    lengths = [n * across**2 for n, across in zip(channels, sides, strict=True)]
+    tile = where_needed(hides, found, torch.zeros_like(found))
     rows, columns = ((w + m) // _SIDE for w, m in zip(whole, more, strict=True))
-    tiles = _operator(COLLECT, [tile], (like.shape[0] * rows * columns, sum(lengths)))
-    pixel_maps, cell_maps = (
-        _joined(part.unflatten(1, (n, across, across)), (like.shape[0], rows, columns))
-        for part, n, across in zip(tiles.split(lengths, 1), channels, sides, strict=True)
-    )
+    batch, channels = looking.shape[0], int(found.shape[1])
+    tiles = _operator(COLLECT, [tile], (batch * rows * columns, channels, _SIDE, _SIDE))
     # narrowed, not sliced: so tracing knows the sizes of what is left
-    pixel_maps = pixel_maps.narrow(-2, top, size[0]).narrow(-1, left, size[1])
-    cell_maps = cell_maps.narrow(-2, 0, maps.nearest.shape[-2]).narrow(-1, 0, maps.nearest.shape[-1])
-    return pixel_maps[:, :-1], pixel_maps[:, -1:], cell_maps
+    maps = _joined(tiles, (batch, rows, columns)).narrow(-2, top, size[0]).narrow(-1, left, size[1])
+    return maps[:, :-1], maps[:, -1:]
+
+
+def _around(values: Tensor, ratio: float) -> Tensor:
+    """A level of a pyramid with the samples around all pixels of a map that are at every so many of its own."""
+    return values if ratio <= 1 else functional.pad(values, (1, 1, 1, 1), mode="replicate")
 
 
 @contextlib.contextmanager
-def in_tiles() -> Iterator[None]:
-    """Within this context graphs that are exported render their frames tile by tile, and choose their work."""
-    token = graph_context.set(Graph(side, tile_by_tile, look_tile_by_tile, choose))
+def in_tiles(kernels: Kernels) -> Iterator[None]:
+    """Within this context graphs that are exported render their frames tile by tile, and choose their work.
+
+    Their highlights have the given kernels.
+    """
+    splat_rays = functools.partial(splat, kernels=kernels)
+    token = graph_context.set(Graph(side, tile_by_tile, seen, splat_rays, choose))
     try:
         yield
     finally:

@@ -46,6 +46,11 @@ class Exported:
     path: Path
     verification: Verification
 
+    @property
+    def plan(self) -> Plan:
+        """The layers of the file, and its rays."""
+        return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance, rays=True)
+
     def render(self, *tensors: Tensor) -> Tensor:
         """What onnxruntime makes of the file."""
         runner = session(self.path)
@@ -55,7 +60,7 @@ class Exported:
     def eager(self, *tensors: Tensor) -> Tensor:
         """What PyTorch makes of the module, with the layers of the file."""
         with torch.no_grad():
-            return self.dof(*tensors, plan=Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance))
+            return self.dof(*tensors, plan=self.plan)
 
 
 def export_once(name: str, folder: Path) -> Exported:

@@ -83,7 +83,7 @@ SPEED_OR_ROUNDING = {
     "downsampling._PERIOD",
     "downsampling._STEP_PX",
     "headroom._SUMMED",
-    "highlights._COARSE_CELL",
+    "highlights.COARSE_CELL",
     "highlights._TAPS",
     "highlights._TAPS_PER_PIXEL",
     "highlights._WHOLE",
@@ -92,6 +92,7 @@ SPEED_OR_ROUNDING = {
     "matting._UNBOUNDED",
     "pipeline._REACH",
     "plan.KERNELS_PER_PX",
+    "plan._FEWER_KERNELS_PER_PX",
     "plan._SMALL_RADII",
     "scatter._COLUMN_BYTES",
 }

@@ -23,7 +23,9 @@ def places(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor, Ten
 
 def pick(values: Tensor, pixels: Tensor) -> Tensor:
     """Values ``[B, C, H, W]`` at pixels of any shape ``[...]``: ``[C, ...]``."""
-    picked = values.transpose(0, 1).flatten(1).index_select(1, pixels.flatten())
+    # of one channel nothing is moved first: a graph copies what it transposes
+    flat = values.reshape(1, -1) if values.shape[1] == 1 else values.transpose(0, 1).flatten(1)
+    picked = flat.index_select(1, pixels.flatten())
     return picked.unflatten(1, pixels.shape)
 
 

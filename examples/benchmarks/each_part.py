@@ -91,8 +91,8 @@ def _no_highlight(light: Tensor, valid: Tensor | None = None) -> Tensor:
     return torch.full_like(light[:, :1], torch.inf)
 
 
-def _all_pass(rays: Any, shown: Any, table: Any, occlusion: bool) -> Tensor:
-    return SPLAT(rays, shown, table, False)
+def _all_pass(rays: Any, shown: Any, table: Any, occlusion: bool, kernels_per_px: int) -> Tensor:
+    return SPLAT(rays, shown, table, False, kernels_per_px)
 
 
 def _drawn_out(light: Tensor, weight: Any, limit: Any, ends: tuple[int, int, int, int], farthest: int) -> Tensor:

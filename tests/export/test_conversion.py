@@ -78,7 +78,7 @@ def test_a_file_may_take_the_circle_of_confusion_and_a_single_channel(tmp_path: 
         image,
         coc,
         table=table,
-        plan=torchdof.render.plan.Plan.all(SIMPLE["max_coc_px"], SIMPLE["tolerance"]),
+        plan=torchdof.render.plan.Plan.all(SIMPLE["max_coc_px"], SIMPLE["tolerance"], rays=True),
         **{k: v for k, v in SIMPLE.items() if k != "max_coc_px"},
     )
     torch.testing.assert_close(out, expected, atol=1e-5, rtol=0)
@@ -96,16 +96,17 @@ def test_the_graph_holds_standard_operators_and_loops_that_skip_what_tiles_do_no
     model = onnx.load(layered.path)
     assert {entry.domain for entry in model.opset_import} == {""}
     nodes = [node for graph in graphs(model.graph) for node in graph.node]
-    looking, layers = [a.g for node in nodes if node.op_type == "Loop" for a in node.attribute if a.name == "body"]
+    looking, layers, rays = [a.g for n in nodes if n.op_type == "Loop" for a in n.attribute if a.name == "body"]
     for body, least in ((looking, 1), (layers, 5)):
         assert sum(node.op_type == "If" for graph in graphs(body) for node in graph.node) >= least
+    assert {"ScatterElements", "NonZero"} <= {node.op_type for node in rays.node}
     assert not {node.op_type for node in nodes} & {"Scan", "CastLike"} and not {node.domain for node in nodes} - {""}
 
 
 def test_what_a_frame_in_focus_does_not_need_is_inside_a_branch(layered: Any) -> None:
     graph = onnx.load(layered.path).graph
     assert len(graph.node) < 0.1 * sum(len(inner.node) for inner in graphs(graph))
-    assert not {node.op_type for node in graph.node} & {"Conv", "Loop", "NonZero", "TopK"}
+    assert not {node.op_type for node in graph.node} & {"Conv", "Loop", "NonZero", "TopK", "ScatterElements"}
 
 
 def test_weights_lie_beside_their_convolutions(layered: Any) -> None:

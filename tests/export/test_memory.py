@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from torchdof import blur_by_coc
-from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.hard
 
@@ -49,9 +48,7 @@ def test_1080p_is_rendered_right_with_less_than_0_9_gb(layered: Any, tmp_path: P
     rows, columns = slice(400, 640), slice(1280, 1600)  # of the blurred half, on the coarse layers' grid
     part = [tensor[..., rows, columns].contiguous() for tensor in (image, coc)]
     with torch.no_grad():
-        expected = blur_by_coc(
-            *part, plan=Plan.all(16.0, layered.dof.options.tolerance), **layered.dof.options.arguments()
-        )
+        expected = blur_by_coc(*part, plan=layered.plan, **layered.dof.options.arguments())
     inner = (..., slice(80, -80), slice(80, -80))  # where the part's border is out of reach
     assert (expected - part[0])[inner].abs().max() > 0.3
     torch.testing.assert_close(out[..., rows, columns][inner], expected[inner], atol=1e-5, rtol=0)

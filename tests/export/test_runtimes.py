@@ -20,12 +20,14 @@ LIMIT = 1e-4
 
 
 def scene() -> list[torch.Tensor]:
-    """A batch of two with a bad depth, an odd size and blur up to the largest radius."""
+    """A batch of two with a bad depth, lamps, an odd size and blur up to the largest radius."""
     depth = torch.linspace(1.2, 6.0, 71).expand(2, 1, 45, 71).contiguous()
     depth = depth + 0.2 * torch.rand(2, 1, 45, 71)
     depth[:, :, 20:30, 30:40] = 1.3
     depth[0, 0, 5, 6] = torch.nan
-    return [torch.rand(2, 3, 45, 71), depth, torch.tensor([1.5, 3.0]), torch.tensor([0.7, 1.0])]
+    image = torch.rand(2, 3, 45, 71)
+    image[:, :, 4::13, 5::17] = 30.0
+    return [image, depth, torch.tensor([1.5, 3.0]), torch.tensor([0.7, 1.0])]
 
 
 def compare(exported: Any, tensors: list[torch.Tensor], got: np.ndarray) -> None:

@@ -22,7 +22,7 @@ def test_the_mean_of_the_samples_around_each_pixel_is_linear_interpolation(
     size = 16
     count, halves = (int(size / ratio), (0, 0)) if ratio <= 1.0 else (int(size / ratio) + 2, halves)
     down, right = (torch.tensor(float(half), dtype=torch.float64) for half in halves)
-    around = list(samples(plane(count, count, ratio), size, ratio, (down, right)))
+    around = list(samples(plane(count, count, ratio), (size, size), ratio, (down, right)))
     shares = sum((share for _, share in around), torch.zeros(1, dtype=torch.float64))
     assert_close(shares, torch.ones_like(shares))
     mean = sum((sample * share for sample, share in around), torch.zeros(1, dtype=torch.float64))

@@ -56,12 +56,15 @@ def test_another_module_is_refused(plain: Any, change: dict[str, Any], message: 
         verify(plain.path, torchdof.DepthOfField(**options))
 
 
-def test_a_changed_kernel_is_found(plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
-    tensors = list(_tensors(model.graph))
-    kinds = onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE
-    kernel = max(tensors, key=lambda t: int(np.prod(t.dims)) if t.data_type in kinds else 0)
+@pytest.mark.parametrize("of_rays", [False, True], ids=["of a layer", "of rays"])
+def test_a_changed_kernel_is_found(of_rays: bool, plain: Any, model: onnx.ModelProto, tmp_path: Path) -> None:
+    tensors = [t for t in _tensors(model.graph) if t.data_type == onnx.TensorProto.FLOAT]
+    kernel = max((t for t in tensors if len(t.dims) == (2 if of_rays else 4)), key=lambda t: int(np.prod(t.dims)))
     values = onnx.numpy_helper.to_array(kernel).copy()
-    values.flat[values.size // 2] *= 1.01
+    if of_rays:  # of all radii together
+        values *= 1.01
+    else:
+        values.flat[values.size // 2] *= 1.01
     kernel.CopyFrom(onnx.numpy_helper.from_array(values, kernel.name))
     with pytest.raises(ValueError, match=r"differs from the module by more than 1e-05(.|\n)*DIFFERS"):
         verify(save(model, tmp_path), plain.dof)

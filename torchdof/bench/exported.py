@@ -119,7 +119,7 @@ def _torch_seconds(path: str, size: tuple[int, int], scene: str, threads: int, r
     tensors = [torch.from_numpy(value) for value in feed(runner, size, scene).values()]
     if len(tensors) != 4:
         raise ValueError("PyTorch is timed for files that take depth")
-    plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance)
+    plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance, rays=True)
     with torch.no_grad():
         planned, _ = median_and_spread(times(lambda: dof(*tensors), runs))
         fixed, _ = median_and_spread(times(lambda: dof(*tensors, plan=plan), runs))

@@ -39,6 +39,8 @@ def picture(
     if torch.is_grad_enabled() and options.table.requires_grad:
         return None
     given = [t for t in (light, coc, behind_light, behind_coc, cover) if t is not None]
+    if plan.rays and plan.kernels_per_px != KERNELS_PER_PX:
+        return None
     if options.method != "layered" or is_traced() or not native.chosen() or not all(map(_is_plain, given)):
         return None
     height, width = int(light.shape[-2]), int(light.shape[-1])

@@ -15,7 +15,7 @@ from .plan import Blur
 from .scatter import fold
 from .surfaces import Frame
 
-__all__ = ["Scatter", "accumulate", "accumulate_once", "over"]
+__all__ = ["Scatter", "accumulate", "accumulate_once", "mean", "over"]
 
 Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
@@ -65,17 +65,14 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
 
     picture = _composite_layers(frame, blurs, scatter, composited, 1.0 if backed else 0.0, normalised)
     light, left = _parts(picture, colours)
-    out = _mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
+    out = mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
 
 
-def accumulate(
-    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, normalize: bool, highlights: Tensor | None = None
-) -> Tensor:
-    """The paper's scatter: every pixel's light accumulates, whatever lies in front; then divided by the weights' sum.
+def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
+    """The paper's scatter: every pixel's light accumulates, whatever lies in front; after it come its weights.
 
-    Not normalised, the plain sum of what was seen is dark at the border and uneven at depth edges. ``highlights`` is
-    light that was extracted from the layers and splatted ray by ray; else arguments are those of :func:`over`.
+    It is what :func:`mean` takes. Arguments are those of :func:`over`.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 3.
@@ -84,14 +81,10 @@ def accumulate(
     def added(front: Picture, behind: Picture) -> Picture:
         return front[0] + behind[0], front[1] + behind[1]
 
-    summed = _composite_layers(frame, blurs, scatter, added)[..., : frame.size[0], : frame.size[1]]
-    if highlights is not None:
-        light, weight = _parts(summed, frame.colours)
-        summed = torch.cat([light + highlights, weight], 1)
-    return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
+    return _composite_layers(frame, blurs, scatter, added)[..., : frame.size[0], : frame.size[1]]
 
 
-def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Tensor:
+def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
     """The same scatter as :func:`accumulate`, as the paper does it: one pass, in which each pixel has its own kernel.
 
     A pixel's kernel is interpolated between those of the layers around its coc, at full resolution.
@@ -108,8 +101,7 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur], normalize: bool) -> Ten
     light = torch.cat([light, torch.ones_like(light[:, :each])], 1)
     shares = None if blurs[0].shares is None else [b.shares for b in blurs if b.shares is not None]
     summed = fold(light, kernels.repeat(1, min(2, each), 1, 1), halo, weights, shares, frame.size)
-    summed = summed[..., : frame.size[0], : frame.size[1]]
-    return _mean(summed, frame.colours) if normalize else summed[:, : frame.colours]
+    return summed[..., : frame.size[0], : frame.size[1]]
 
 
 def _composite_layers(
@@ -208,7 +200,12 @@ def _parts(values: Tensor, colours: int) -> Picture:
     return light, weight
 
 
-def _mean(summed: Tensor, colours: int) -> Tensor:
-    """Light over its weight; 0 where nothing is known."""
-    light, weight = _parts(summed, colours)
-    return light / torch.where(weight > _LEAST, weight, torch.inf)
+def mean(summed: Tensor, colours: int, normalize: bool = True, highlights: Tensor | None = None) -> Tensor:
+    """Light over the weight that comes after it; 0 where nothing is known.
+
+    Not normalised, the plain sum of what was seen, dark at the border and uneven at depth edges. ``highlights`` is
+    light that was extracted from the layers and splatted ray by ray.
+    """
+    light, weight = summed[:, :colours], summed[:, colours:]
+    light = light if highlights is None else light + highlights
+    return light if not normalize else light / torch.where(weight > _LEAST, weight, torch.inf)

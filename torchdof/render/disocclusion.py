@@ -22,7 +22,6 @@ __all__ = [
     "BEHIND_STEP",
     "HIDDEN_WEIGHT",
     "Level",
-    "Looking",
     "behind_pixels",
     "behind_size",
     "fill_hidden",
@@ -56,18 +55,6 @@ class Level(NamedTuple):
     step: int
     vote: float | None
     least_px: float
-
-
-class Looking(NamedTuple):
-    """Who looks at levels: signed coc of pixels and which of them count, ``[B, 1, H, W]``.
-
-    The last two tell the same of cells of :data:`BEHIND_STEP` pixels, counted from the image's centre: the nearest coc.
-    """
-
-    coc_px: Tensor
-    mask: Tensor
-    nearest: Tensor
-    cells: Tensor
 
 
 Seen = Callable[..., tuple[Tensor, Tensor]]
@@ -192,11 +179,13 @@ def fill_hidden(
     nearest = -_largest(-coc_px, cell_rows, cell_columns, BEHIND_STEP)
     cells = torch.cat([may_hide, wanted], 1).to(coc_px.dtype)
     cells = _largest(cells, cell_rows, cell_columns, BEHIND_STEP).amin(1, keepdim=True) > 0
-    maps = Looking(coc_px, may_hide & wanted, nearest, cells)
-    if graph is None:
-        seen, total, behind = _look(searched, maps, functools.partial(_seen, size=size))
-    else:
-        seen, total, behind = graph.look(searched, maps, _look)
+    look = functools.partial(_seen, size=size) if graph is None else graph.seen
+    shown, total = look(searched, nearest, cells, step=BEHIND_STEP, farthest=True)
+    behind = torch.where(total > 0, shown[:, :-1], pyramid[_FINE_LEVELS - 1][0])
+    if len(searched) > _FINE_LEVELS:
+        coarse = torch.cat(look(searched[_FINE_LEVELS:], nearest, cells, step=BEHIND_STEP), 1)
+        searched = [*searched[:_FINE_LEVELS], Level(coarse, BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)]
+    seen, total = look(searched, coc_px, may_hide & wanted)
 
     # each pixel behind which these levels show something gets it as its second sample, together with a surface that is
     # hardly mixed in: the more of that, the less of what is hidden
@@ -259,19 +248,6 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
             around = around.index_select(dim, place.round().clamp(0, samples - 1).long())
         may_hide = may_hide | ((around > near + (BEHIND_PX - 0.5)) & (near.abs() > _least_px(level)))
     return may_hide
-
-
-def _look(levels: Sequence[Level], maps: Looking, seen: Seen) -> tuple[Tensor, Tensor, Tensor]:
-    """What lies behind each pixel: light and coc ``[B, C + 1, H, W]`` and the votes for it; and the light behind both.
-
-    ``seen`` is :func:`_seen` of an image, or that of one of its tiles.
-    """
-    shown, total = seen(levels, maps.nearest, maps.cells, step=BEHIND_STEP, farthest=True)
-    behind = torch.where(total > 0, shown[:, :-1], levels[_FINE_LEVELS - 1].values[:, :-2])
-    if len(levels) > _FINE_LEVELS:
-        coarse = torch.cat(seen(levels[_FINE_LEVELS:], maps.nearest, maps.cells, step=BEHIND_STEP), 1)
-        levels = [*levels[:_FINE_LEVELS], Level(coarse, BEHIND_STEP, None, levels[_FINE_LEVELS].least_px)]
-    return *seen(levels, maps.coc_px, maps.mask), behind
 
 
 def _seen(

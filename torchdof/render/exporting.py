@@ -8,14 +8,12 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:  # these look at what is exported themselves
-    from .disocclusion import Level, Looking, Seen
+    from .disocclusion import Seen
+    from .highlights import Highlights
     from .plan import Blur
     from .surfaces import Frame
 
 __all__ = ["Graph", "exported_graph", "graph_context", "where_needed"]
-
-
-Result = tuple[Tensor, Tensor, Tensor]
 
 
 class Graph(NamedTuple):
@@ -24,15 +22,18 @@ class Graph(NamedTuple):
     Args:
         align: What the frame must be a multiple of, given the pixels that the widest kernel reaches.
         render: The picture of a frame, from it, its kernels and what renders one piece of it.
-        look: What lies behind the pixels of a frame, from levels of a pyramid, the pixels that look, and what looks for
-            them at one piece of these; as :mod:`torchdof.render.disocclusion` does it for the frame.
+        seen: What levels of a pyramid show behind the pixels of a frame, or behind its cells; as
+            :mod:`torchdof.render.disocclusion` looks for it.
+        splat: Highlights to ``[B, C, H, W]``, from all of them, the frame's coc and what may stand in the way of their
+            rays; as :mod:`torchdof.render.highlights` splats them.
         choose: ``(needed, result, given)`` to the result where it is needed, else what is given. What only the result
             needs is computed only then.
     """
 
     align: Callable[[int], int]
     render: "Callable[[Frame, Sequence[Blur], Callable[[Frame, Sequence[Blur]], Tensor]], Tensor]"
-    look: "Callable[[Sequence[Level], Looking, Callable[[Sequence[Level], Looking, Seen], Result]], Result]"
+    seen: "Seen"
+    splat: "Callable[[Highlights, Tensor, Sequence[tuple[Tensor, Tensor]]], Tensor]"
     choose: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 

@@ -21,21 +21,27 @@ from torch import Tensor
 
 from .. import pixels
 from ..optics.blur_table import BlurTable
+from ..validation import is_traced
 from .disocclusion import HIDDEN_WEIGHT
+from .exporting import exported_graph, where_needed
 from .field import Shares, placed, ray_shares
-from .plan import kernels_for
+from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import Surface
 
-__all__ = ["FACTOR", "Highlights", "extract", "splat", "threshold"]
+__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "Highlights", "extract", "obstacles", "splat", "threshold"]
 
 FACTOR = 8.0
 """Light above so many times what is around it is a highlight's."""
 
+COARSE_CELL = 8
+"""Pixels in which nearer surfaces are looked for."""
+
+NEARER_PX = 1.0
+"""Difference in coc from which on a surface is another one, in front: wholly at 1 px more."""
+
 _STEP = 3  # every so many pixels one tells the threshold; odd, as the next, that a flip of an image flips them
 _CELL = 11  # of them over which it is decided
 _LEAST_PX = 1.0  # blur from which on there are rays
-_COARSE_CELL = 8  # pixels in which nearer surfaces are looked for
-_NEARER_PX = 1.0  # difference in coc from which on a surface is another one, in front: wholly at 1 px more
 _WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, what counts of its rays
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
 _TAPS = 2**21  # rays splatted together
@@ -95,41 +101,49 @@ def extract(surface: Surface, limit: Tensor, from_px: float = _LEAST_PX) -> tupl
     brightest = light.amax(1, keepdim=True)
     is_bright = (brightest > limit) & (coc_px.detach().abs() > from_px)
     bright = pixels.indices(is_bright if weight is None else is_bright & (weight > 0))
-    if len(bright) == 0:
-        return surface, None
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
     fades = (coc.abs() - from_px).clamp(max=1.0)
-    least = _least_peak(peak.detach(), coc.detach(), ((1.0 - most / peak) * fades).detach(), coc_px.numel())
-    if least > 0.0:  # too many: the brightest of them, and only what they are brighter by
-        kept = peak.detach() > least
-        bright, peak, fades, coc, most = (t[kept] for t in (bright, peak, fades, coc, most))
-        most = most.clamp_min(least)
-        if len(bright) == 0:
-            return surface, None
+    # where they are too many, the brightest of them, and only what they are brighter by
+    least = _least_peak(peak.detach(), coc.detach(), ((1.0 - most / peak) * fades).detach(), math.prod(coc_px.shape))
+    kept = (peak.detach() > least).nonzero()[:, 0]
+    if not is_traced() and len(kept) == 0:
+        return surface, None
+    bright, peak, fades, coc, most = (t.index_select(0, kept) for t in (bright, peak, fades, coc, most))
+    most = torch.maximum(most, least)
     excess = pixels.pick(light, bright) * ((1.0 - most / peak) * fades)
     left = pixels.put(light, bright, pixels.pick(light, bright) - excess)
+    left = where_needed(lambda: is_bright.any(), left, light)
     highlights = Highlights(bright, excess if weight is None else excess * pixels.pick(weight, bright), coc)
     return surface._replace(light=left), highlights
 
 
-def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, area: int) -> float:
-    """Light up to which highlights ``[n]`` are left to the layers of a frame, lest there be too many rays; 0: all fit.
+def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, area: int) -> Tensor:
+    """Light ``[1]`` up to which highlights ``[n]`` are left to the layers of a frame, lest there be too many rays.
 
     It is the ``L`` at which the rays of those with a peak ``p`` above it, weighted by ``1 - L / (2 p)``, are as many as
-    there may be. So it grows smoothly with their number, for equal ones too, and at most twice as many are splatted.
+    there may be; 0 where all fit. So it grows smoothly with their number, for equal ones too, and at most twice as many
+    are splatted.
     """
-    budget = float(_TAPS_PER_PIXEL * area)
-    taps = ((2.0 * coc.abs() + 1.0) ** 2 * (_WHOLE * share).clamp(max=1.0)).double()
-    if float(taps.sum()) <= budget:
-        return 0.0
-    peak, order = peak.double().sort(descending=True)
-    count, slope = taps[order].cumsum(0), (0.5 * taps[order] / peak).cumsum(0)
-    at_next = count - functional.pad(peak[1:], (0, 1)) * slope  # how many there are at the next peak
-    last = int((at_next >= budget).nonzero()[0])
-    return min(float((count[last] - budget) / slope[last]), float(peak[last]))
+    taps = (2.0 * coc.abs() + 1.0) ** 2 * (_WHOLE * share).clamp(max=1.0)
+    values, order = functional.pad(peak.double(), (0, 1)).sort(descending=True)  # and one of no light, the last
+    count = functional.pad(taps.double(), (0, 1)).index_select(0, order)
+    slope = torch.where(values > 0, 0.5 * count / values, 0.0).cumsum(0)
+    budget = torch.scalar_tensor(_TAPS_PER_PIXEL * area, dtype=count.dtype, device=count.device)
+    count = count.cumsum(0) - budget  # how many of them are beyond what there may be
+    at_next = count - functional.pad(values[1:], (0, 1)) * slope  # how many there are at the next peak
+    last = (at_next[:-1] < 0).sum(0, keepdim=True)
+    count, slope, value = (t.index_select(0, last) for t in (count, slope, values))
+    level = count / torch.where(slope > 0, slope, 1.0)
+    return torch.minimum(level.clamp_min(0.0), value).to(peak.dtype)
 
 
-def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable, occlusion: bool = True) -> Tensor:
+def splat(
+    rays: Sequence[Highlights],
+    shown: Sequence[Surface],
+    table: BlurTable,
+    occlusion: bool = True,
+    kernels_per_px: int = KERNELS_PER_PX,
+) -> Tensor:
     """Scatter highlights to ``[B, C, H, W]``, each ray to where it lands but for what nearer surfaces take of it.
 
     These are the surfaces that an image shows, each pixel's own first; without occlusion all rays pass. Differentiable
@@ -138,6 +152,12 @@ def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable
     batch, _, height, width = shown[0].coc_px.shape
     longest = max(height, width)
     source, light, coc = (torch.cat(parts, -1) for parts in zip(*rays, strict=True))
+    graph = exported_graph()
+    if graph is not None:
+        in_the_way = obstacles(shown) if occlusion else []
+        splats = graph.splat(Highlights(source, light, coc), shown[0].coc_px, in_the_way)
+        nothing = coc.new_zeros(batch, len(light), 1, 1)  # wherever it is added, and it takes no memory
+        return where_needed(lambda: torch.ones_like(source).sum() > 0, splats, nothing)
     order = torch.argsort(coc.detach().abs())
     item, row, column = pixels.places(source[order], height, width)
     light, coc = light[:, order], coc[order]
@@ -159,7 +179,7 @@ def splat(rays: Sequence[Highlights], shown: Sequence[Surface], table: BlurTable
         stop = min(len(radii), start + max(1, _TAPS // (2 * half_of(radii[start]) + 1) ** 2))
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
-        kernels = kernels_for(table, coc[part], width, longest).to(light.dtype)  # [n, 1 or C, k, k]
+        kernels = kernels_for(table, coc[part], width, longest, kernels_per_px).to(light.dtype)  # [n, 1 or C, k, k]
         if shares:
             half_diagonal = 0.5 * math.hypot(height, width)
             y, x = ((row[part] + 0.5 - height / 2) / half_diagonal, (column[part] + 0.5 - width / 2) / half_diagonal)
@@ -191,6 +211,13 @@ def _placed(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Tensor, x
     return made
 
 
+def obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:
+    """Coc of surfaces and the part of each pixel that they cover, ``[B, 1, H, W]``: none where they are hidden."""
+    covers = [torch.ones_like(s.coc_px) if s.weight is None else s.weight for s in surfaces]
+    covers = [covers[0], *((c - HIDDEN_WEIGHT).clamp_min(0.0) for c in covers[1:])]
+    return [(s.coc_px, cover) for s, cover in zip(surfaces, covers, strict=True)]
+
+
 class _Hiding:
     """What may stand in the way of rays: surfaces that an image shows, in bins of 1 px of their coc."""
 
@@ -198,10 +225,7 @@ class _Hiding:
         coc_px = surfaces[0].coc_px
         self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
         self.low = float(coc_px.detach().min())
-        # place in bins, and the part of a pixel that is covered; what is hidden covers nothing
-        covers = [torch.ones_like(s.coc_px) if s.weight is None else s.weight for s in surfaces]
-        covers = [covers[0], *((c - HIDDEN_WEIGHT).clamp_min(0.0) for c in covers[1:])]
-        self.shown = [(s.coc_px - self.low, cover) for s, cover in zip(surfaces, covers, strict=True)]
+        self.shown = [(coc - self.low, cover) for coc, cover in obstacles(surfaces)]  # a place in bins
         occupied = torch.cat([place.detach()[cover > 0] for place, cover in self.shown])
         counts = torch.bincount(occupied.floor().long()).tolist()
         self.bins = sorted({k for i, count in enumerate(counts) if count for k in (i, i + 1)})
@@ -210,7 +234,7 @@ class _Hiding:
         for k in self.bins:
             covered = torch.cat([((place.detach() - k).abs() < 1.0) & (cover > 0) for place, cover in self.shown], 1)
             any_covered = covered.any(1, keepdim=True).to(torch.float32)
-            cells = functional.max_pool2d(any_covered, _COARSE_CELL, ceil_mode=True)[:, 0]
+            cells = functional.max_pool2d(any_covered, COARSE_CELL, ceil_mode=True)[:, 0]
             self.sums.append(functional.pad(cells.cumsum(-1).cumsum(-2), (1, 0, 1, 0)))
 
     def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor, farthest: float) -> Tensor:
@@ -226,12 +250,12 @@ class _Hiding:
             scale = 1.0 - nearer / coc  # a ray passes this surface so far on its way, as a share of its step
             reach = scale.detach().abs() * step[-1]
             (top, bottom), (left, right) = (
-                [(place + end).clamp(0, size - 1).long() // _COARSE_CELL for end in (-reach, reach + 1.0)]
+                [(place + end).clamp(0, size - 1).long() // COARSE_CELL for end in (-reach, reach + 1.0)]
                 for place, size in ((row, self.height), (column, self.width))
             )
             count = sums[item, bottom + 1, right + 1] - sums[item, top, right + 1]
             count = count - sums[item, bottom + 1, left] + sums[item, top, left]
-            fades = (coc - _NEARER_PX - nearer).clamp(0.0, 1.0)
+            fades = (coc - NEARER_PX - nearer).clamp(0.0, 1.0)
             hit = ((count > 0) & (fades.detach() > 0)).nonzero()[:, 0]
             if len(hit):
                 way = scale[hit, None] * step

@@ -41,13 +41,16 @@ def spacing(x: float, tolerance: float) -> float:
     return max(finest(x), _SPACING * loose * max(abs(x) + 0.5, 1.0) ** 0.75)
 
 
-def spaced_nodes(low: float, high: float, tolerance: float) -> tuple[float, ...]:
-    """Nodes outwards from focus by :func:`spacing`, the last on each side at or beyond the given end."""
+def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = math.inf) -> tuple[float, ...]:
+    """Nodes outwards from focus by :func:`spacing`, the last on each side at or beyond the given end.
+
+    From ``dense_from`` on they are spaced as for half the tolerance.
+    """
     nodes = [0.0]
     for sign, limit in ((-1, -low), (1, high)):
         x = 0.0
         while x < limit:
-            x += spacing(x, tolerance)
+            x += spacing(x, tolerance if x < dense_from else 0.5 * tolerance)
             nodes.append(sign * x)
     return tuple(sorted(nodes))
 

@@ -44,7 +44,7 @@ def blur(
     if plan is None and is_traced():
         # numbers that the graph is made for: those that differ between two modules would be variables in it
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
-        plan = Plan.all(max_coc_px, tolerance)
+        plan = Plan.all(max_coc_px, tolerance, rays=exported_graph() is not None)
     elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
         plan = Plan.of_frame(torch.cat(maps[1::2]), options.tolerance, still=True)
     elif plan is not None and not is_traced():
@@ -169,7 +169,7 @@ def _render_item(
         from_px = 0.0 if options.occlusion else crisp_px - 1.0
         extracted = [highlights.extract(s, limit, from_px) for s in surfaces]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
-        splats = highlights.splat(rays, shown, options.table, options.occlusion) if rays else None
+        splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px) if rays else None
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
     out = out if has_room else out / scale
@@ -214,13 +214,13 @@ def _composite(
     lit = options.occlusion or options.normalize
     frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
 
-    def picture(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
+    def scattered(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
         scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
         if options.occlusion:
-            out = composite.over(frame, blurs, scatter)
-            return out if splats is None else out + splats
-        if not layered:
-            return composite.accumulate_once(frame, blurs, options.normalize)
-        return composite.accumulate(frame, blurs, scatter, options.normalize, splats)
+            return composite.over(frame, blurs, scatter)
+        return composite.accumulate(frame, blurs, scatter) if layered else composite.accumulate_once(frame, blurs)
 
-    return picture(frame, blurs) if graph is None else graph.render(frame, blurs, picture)
+    out = scattered(frame, blurs) if graph is None else graph.render(frame, blurs, scattered)
+    if options.occlusion:
+        return out if splats is None else out + splats
+    return composite.mean(out, frame.colours, options.normalize, splats)

@@ -20,6 +20,7 @@ from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behin
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
 
 KERNELS_PER_PX = 32  # of radius, for highlights
+_FEWER_KERNELS_PER_PX = 4  # for those of a graph, which holds them all; costs up to 0.02 dB
 _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of the resolution will do at 1/255
 _LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
 _SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
@@ -56,8 +57,10 @@ class Plan:
     Args:
         nodes: Places of the layers on the blur axis (see :mod:`torchdof.render.layer_weights`), strictly increasing.
         tolerance: What the plan was made for, in [0, 1).
-        rays: Highlights are splatted (:mod:`torchdof.render.highlights`) where layers would not do, and layers are
-            added where a scene is blurred beyond them; False does neither, as plans for every scene.
+        rays: Highlights are splatted (:mod:`torchdof.render.highlights`) where layers would not do.
+        grows: Layers are added where a scene is blurred beyond them; False, as of plans for every scene: what is beyond
+            is blurred as far as the outermost ones.
+        kernels_per_px: Of radius, for these highlights; between them kernels are interpolated.
         pixels: Share of the scene's pixels that each layer carries, where it was asked for.
 
     Raises:
@@ -67,6 +70,8 @@ class Plan:
     nodes: tuple[float, ...]
     tolerance: float
     rays: bool = True
+    grows: bool = True
+    kernels_per_px: int = KERNELS_PER_PX
     pixels: tuple[float, ...] | None = dataclasses.field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -126,17 +131,21 @@ class Plan:
         return cls(layer_cocs.spaced_nodes(*layer_cocs.ends(coc_px.detach()), tolerance), tolerance)
 
     @classmethod
-    def all(cls, max_coc_px: float, tolerance: float) -> "Plan":
-        """Layers for every scene up to a radius: the plan of a compiled or exported module."""
+    def all(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
+        """Layers for every scene up to a radius: the plan of a compiled module, or with rays of an exported one.
+
+        Nothing tells where the borders of these scenes lie. So coarse layers, where that matters, are twice as many.
+        """
         reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64)))
-        last = reach - 0.3 * layer_cocs.spacing(reach, tolerance)
-        inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance) if abs(x) < last]
-        return cls((-reach, *inner, reach), tolerance, rays=False)
+        dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64)))
+        last = reach - 0.3 * layer_cocs.spacing(reach, 0.5 * tolerance)
+        inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
+        return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
 
     def reaching(self, coc_px: Tensor) -> "Plan":
         """This plan, with layers added outwards as far as a scene ``[B, 1, H, W]`` is blurred; itself if it reaches."""
         ends = layer_cocs.ends(coc_px.detach())
-        if not self.rays or (self.nodes[0] <= ends[0] and ends[1] <= self.nodes[-1]):
+        if not self.grows or (self.nodes[0] <= ends[0] and ends[1] <= self.nodes[-1]):
             return self
         nodes, scene = list(self.nodes), Plan.of_scene(coc_px, self.tolerance)
         for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
@@ -221,19 +230,19 @@ class Plan:
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
-def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int) -> Tensor:
+def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_px: int = KERNELS_PER_PX) -> Tensor:
     """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, of signed coc ``[n]``.
 
-    Each is interpolated between those of whole 1/32 px where no gradient asks for more. They are cut to what reaches
-    within a frame whose longer side is ``longest`` pixels.
+    Each is interpolated between those of so many radii a pixel where no gradient asks for more. They are cut to what
+    reaches within a frame whose longer side is ``longest`` pixels.
     """
     if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
         kernels = own_kernels(table, coc_px, width)
     else:
-        steps = coc_px.double() * KERNELS_PER_PX
+        steps = coc_px.double() * per_px
         below = steps.floor()
         radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
-        low, high = (own_kernels(table, radii.cpu() / KERNELS_PER_PX, width).to(coc_px.device)[i] for i in which)
+        low, high = (own_kernels(table, radii.cpu() / per_px, width).to(coc_px.device)[i] for i in which)
         kernels = torch.lerp(low, high, (steps - below)[:, None, None, None])
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
     return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]

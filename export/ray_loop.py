@@ -1,0 +1,254 @@
+"""The loop of :mod:`.rays`, as functions of ONNX that :mod:`onnxscript` makes of what is written here.
+
+Lists are those of sources ``[n]``; kernels are those of a part of them, ``[m, k, k]``, as wide as its widest needs.
+"""
+
+from typing import TYPE_CHECKING
+
+import onnxscript
+
+from torchdof.render.highlights import COARSE_CELL, NEARER_PX
+
+from .tiling import DOMAIN
+
+if TYPE_CHECKING:  # what stands below is read, and not by Python's rules
+    from typing import Any
+    from typing import Any as Flag
+    from typing import Any as Floats
+    from typing import Any as Ints
+
+    op: Any
+else:
+    from onnxscript import opset20 as op
+
+    Flag, Floats, Ints = onnxscript.BOOL[...], onnxscript.FLOAT[...], onnxscript.INT64[...]
+
+__all__ = ["FUNCTIONS"]
+
+_TAPS = 2**16
+"""Rays that are splatted together."""
+
+_script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
+
+
+@_script
+def stop_of(half: Ints, start: Ints) -> Ints:
+    """Where a part of the sources, narrowest first, ends that begins here: their taps are bounded."""
+    side = 2 * op.Gather(half, start) + 1
+    stop = op.Min(start + op.Max(_TAPS / (side * side), 1), op.Size(half))
+    side = 2 * op.Gather(half, stop - 1) + 1
+    return op.Min(start + op.Max(_TAPS / (side * side), 1), stop)
+
+
+@_script
+def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: Ints, step: Ints) -> Floats:
+    """Kernels ``[1 or C, m, k, k]`` at nodes ``[m]``; 0 beyond their ends."""
+    axes = op.Constant(value_ints=[1, 2])
+    down = op.Unsqueeze(step, op.Constant(value_ints=[1]))
+    most = op.Max(op.Abs(step), op.Abs(down))
+    half = op.Unsqueeze(op.Gather(halves, node), axes)
+    eighth = most * (most + 1) / 2 + op.Min(op.Abs(step), op.Abs(down))
+    place = op.Unsqueeze(op.Gather(origins, node), axes) + op.Where(round, eighth, down * (2 * half + 1) + step)
+    return op.Gather(values, op.Where(most > half, op.Constant(value_int=0), place), axis=1)
+
+
+@_script
+def kernels_at(
+    values: Floats, origins: Ints, halves: Ints, round: Flag, node: Ints, part: Floats, step: Ints
+) -> Floats:
+    """Kernels ``[1 or C, m, k, k]`` between nodes ``[m]`` and the next ones."""
+    near = values_at(values, origins, halves, round, node, step)
+    far = values_at(values, origins, halves, round, node + 1, step)
+    return near + (far - near) * op.Unsqueeze(part, op.Constant(value_ints=[1, 2]))
+
+
+@_script
+def covered_at(places: Floats, covers: Floats, pixel: Ints, bin: Floats) -> Floats:
+    """Part of pixels ``[p, k, k]`` that surfaces in bins ``[p, 1, 1, 1]`` cover."""
+    near = op.Relu(1.0 - op.Abs(op.Gather(places, pixel) - bin))
+    return op.ReduceSum(op.Gather(covers, pixel) * near, op.Constant(value_ints=[3]), keepdims=0)
+
+
+@_script
+def count_in(cells: Floats, bin: Ints, item: Ints, row: Ints, column: Ints) -> Floats:
+    """Cells above and left of places ``[m, bins]`` that may show something in bins ``[bins]``."""
+    items = op.Squeeze(op.Shape(cells, start=1, end=2))
+    rows = op.Squeeze(op.Shape(cells, start=2, end=3))
+    columns = op.Squeeze(op.Shape(cells, start=3, end=4))
+    place = (((bin * items) + item) * rows + row) * columns + column
+    return op.Gather(op.Reshape(cells, op.Constant(value_ints=[-1])), place)
+
+
+@_script
+def hidden_of(
+    coc: Floats,
+    item: Ints,
+    row: Ints,
+    column: Ints,
+    step: Ints,
+    height: Ints,
+    width: Ints,
+    places: Floats,
+    covers: Floats,
+    cells: Floats,
+    nearest: Floats,
+) -> Floats:
+    """Share of each ray that nearer surfaces take, ``[m, k, k]``; as ``_Hiding`` of the plain engine."""
+    axis_1 = op.Constant(value_ints=[1])
+    axis_2 = op.Constant(value_ints=[2])
+    axes = op.Constant(value_ints=[1, 2])
+    coc = op.Unsqueeze(coc, axis_1)
+    item = op.Unsqueeze(item, axis_1)
+    row = op.Cast(op.Unsqueeze(row, axis_1), to=1)
+    column = op.Cast(op.Unsqueeze(column, axis_1), to=1)
+    last_row = op.Cast(height - 1, to=1)
+    last_column = op.Cast(width - 1, to=1)
+    step = op.Cast(step, to=1)
+
+    # which of the bins may show something within reach of a source: pairs of both
+    zero = op.Constant(value_int=0)
+    one = op.Constant(value_int=1)
+    bin = op.Range(zero, op.Squeeze(op.Shape(cells, start=0, end=1)), one)
+    nearer = nearest + op.Cast(bin, to=1)
+    scale = 1.0 - nearer / coc
+    fade = op.Clip(coc - NEARER_PX - nearer, 0.0, 1.0)
+    reach = op.Abs(scale) * op.ReduceMax(step, keepdims=0)
+    top = op.Cast(op.Clip(row - reach, 0.0, last_row), to=7) / COARSE_CELL
+    bottom = op.Cast(op.Clip(row + reach + 1.0, 0.0, last_row), to=7) / COARSE_CELL + 1
+    left = op.Cast(op.Clip(column - reach, 0.0, last_column), to=7) / COARSE_CELL
+    right = op.Cast(op.Clip(column + reach + 1.0, 0.0, last_column), to=7) / COARSE_CELL + 1
+    below = count_in(cells, bin, item, bottom, right) - count_in(cells, bin, item, top, right)
+    shown = below - count_in(cells, bin, item, bottom, left) + count_in(cells, bin, item, top, left)
+    pairs = op.NonZero(op.And(shown > 0.0, fade > 0.0))
+    pair = op.Transpose(pairs, perm=[1, 0])
+    source = op.Gather(pairs, zero)
+    pair_bin = op.Unsqueeze(op.Cast(op.Gather(pairs, one), to=1), op.Constant(value_ints=[1, 2, 3]))
+
+    # each pair's rays pass that surface at places between four pixels
+    way = op.Unsqueeze(op.GatherND(scale, pair), axis_1) * step
+    rows = op.Clip(op.Gather(row, source) + way, 0.0, last_row)
+    columns = op.Clip(op.Gather(column, source) + way, 0.0, last_column)
+    top = op.Min(op.Floor(rows), op.Max(last_row - 1.0, 0.0))
+    left = op.Min(op.Floor(columns), op.Max(last_column - 1.0, 0.0))
+    line = (op.Gather(item, source) * height + op.Cast(top, to=7)) * width
+    first = op.Unsqueeze(line, axis_2) + op.Unsqueeze(op.Cast(left, to=7), axis_1)
+    beside = op.Min(width - 1, one)
+    below_it = op.Min(height - 1, one) * width
+    right_share = op.Unsqueeze(columns - left, axis_1)
+    upper = covered_at(places, covers, first, pair_bin)
+    upper = upper + (covered_at(places, covers, first + beside, pair_bin) - upper) * right_share
+    first = first + below_it
+    lower = covered_at(places, covers, first, pair_bin)
+    lower = lower + (covered_at(places, covers, first + beside, pair_bin) - lower) * right_share
+    covered = upper + (lower - upper) * op.Unsqueeze(rows - top, axis_2)
+    taken = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
+    side = op.Shape(step)
+    none = op.ConstantOfShape(op.Concat(op.Shape(item, start=0, end=1), side, side, axis=0))
+    return op.Min(op.ScatterND(none, op.Unsqueeze(source, axis_1), taken, reduction="add"), 1.0)
+
+
+@_script
+def landed(splats: Floats, light: Floats, first: Ints, kernels: Floats, step: Ints, across: Ints) -> Floats:
+    """Splats ``[C, n]`` with the light ``[m, C]`` of sources at places ``[m]`` of them added."""
+    axes = op.Constant(value_ints=[1, 2])
+    all_of_it = op.Constant(value_ints=[-1])
+    landing = kernels * op.Unsqueeze(op.Transpose(light, perm=[1, 0]), op.Constant(value_ints=[2, 3]))
+    landing = op.Reshape(landing, op.Concat(op.Shape(landing, start=0, end=1), all_of_it, axis=0))
+    away = op.Unsqueeze(step * across, op.Constant(value_ints=[1])) + step
+    place = op.Reshape(op.Unsqueeze(first, axes) + away, all_of_it)
+    return op.ScatterElements(splats, op.Expand(place, op.Shape(landing)), landing, axis=1, reduction="add")
+
+
+@_script
+def splat(
+    blank: Floats,
+    light: Floats,
+    coc: Floats,
+    item: Ints,
+    row: Ints,
+    column: Ints,
+    first: Ints,
+    node: Ints,
+    part: Floats,
+    half: Ints,
+    values: Floats,
+    origins: Ints,
+    halves: Ints,
+    round: Flag,
+    height: Ints,
+    width: Ints,
+    across: Ints,
+) -> Floats:
+    """Light ``[C, B, H, W]`` of all sources, none of which is hidden, on a blank frame with room around it."""
+    splats = op.Reshape(blank, op.Constant(value_ints=[0, -1]))
+    start = op.Constant(value_int=0)
+    going = op.Size(half) > 0
+    while going:
+        stop = stop_of(half, start)
+        reach = op.Gather(half, stop - 1)
+        step = op.Range(-reach, reach + 1, 1)
+        at = op.Range(start, stop, 1)
+        node_at, part_at = op.Gather(node, at), op.Gather(part, at)
+        kernels = kernels_at(values, origins, halves, round, node_at, part_at, step)
+        splats = landed(splats, op.Gather(light, at), op.Gather(first, at), kernels, step, across)
+        start = stop
+        going = start < op.Size(half)
+    return op.Reshape(splats, op.Shape(blank))
+
+
+@_script
+def splat_past(
+    blank: Floats,
+    light: Floats,
+    coc: Floats,
+    item: Ints,
+    row: Ints,
+    column: Ints,
+    first: Ints,
+    node: Ints,
+    part: Floats,
+    half: Ints,
+    values: Floats,
+    origins: Ints,
+    halves: Ints,
+    round: Flag,
+    height: Ints,
+    width: Ints,
+    across: Ints,
+    places: Floats,
+    covers: Floats,
+    cells: Floats,
+    nearest: Floats,
+) -> Floats:
+    """The same, but for what nearer surfaces take."""
+    splats = op.Reshape(blank, op.Constant(value_ints=[0, -1]))
+    start = op.Constant(value_int=0)
+    going = op.Size(half) > 0
+    while going:
+        stop = stop_of(half, start)
+        reach = op.Gather(half, stop - 1)
+        step = op.Range(-reach, reach + 1, 1)
+        at = op.Range(start, stop, 1)
+        kernels = kernels_at(values, origins, halves, round, op.Gather(node, at), op.Gather(part, at), step)
+        hidden = hidden_of(
+            op.Gather(coc, at),
+            op.Gather(item, at),
+            op.Gather(row, at),
+            op.Gather(column, at),
+            step,
+            height,
+            width,
+            places,
+            covers,
+            cells,
+            nearest,
+        )
+        kernels = kernels * (1.0 - hidden)
+        splats = landed(splats, op.Gather(light, at), op.Gather(first, at), kernels, step, across)
+        start = stop
+        going = start < op.Size(half)
+    return op.Reshape(splats, op.Shape(blank))
+
+
+FUNCTIONS = (stop_of, values_at, kernels_at, covered_at, count_in, hidden_of, landed, splat, splat_past)
+"""All of them, by their names in the graph."""

@@ -1,0 +1,127 @@
+"""Highlights of a graph: their light splatted ray by ray (:mod:`torchdof.render.highlights`), in a loop over parts.
+
+What a source needs by itself is traced. The loop over sources, whose number only a frame tells, is a function in ONNX
+(:mod:`.ray_loop`), which one operator calls in what is traced.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from torchdof import pixels
+from torchdof.optics.blur_table import BlurTable
+from torchdof.render.highlights import COARSE_CELL, Highlights
+from torchdof.render.plan import Plan
+
+__all__ = ["Kernels", "kernels_of", "splat"]
+
+_NEVER = 1e6  # pixels of coc that none has
+
+
+class Kernels(NamedTuple):
+    """Kernels of all radii of a plan, near to far, in rows of numbers.
+
+    Args:
+        values: ``[1 or C, n]``: of each kernel the eighth right of its centre and below, row by row to the diagonal, or
+            all of it. The first is 0.
+        origins: Where the value of each kernel's centre lies, ``[m]``.
+        halves: Pixels on each side of its centre.
+        round: Whether there are eighths, a bool ``[]``.
+        per_px: Kernels a pixel of radius.
+        bins: Pixels of coc from the nearest to the farthest.
+        margin: Pixels on each side of the widest one's centre.
+    """
+
+    values: Tensor
+    origins: Tensor
+    halves: Tensor
+    round: Tensor
+    per_px: int
+    bins: int
+    margin: int
+
+
+def kernels_of(table: BlurTable, plan: Plan) -> Kernels:
+    """Kernels of the highlights of a plan, for a table that is not tied to a width."""
+    farthest = max(abs(c) for c in plan.coc_px)
+    count = int(farthest * plan.kernels_per_px) + 2
+    values, size, places = [torch.zeros(table.channels, 1)], 1, []
+    seen: dict[bytes, tuple[int, int]] = {}
+    for step in range(-count, count + 1):
+        kernel = table.kernels(torch.tensor([step / plan.kernels_per_px], dtype=torch.float64), 1)[0].float()
+        half = kernel.shape[-1] // 2
+        if table.is_round:
+            row, column = torch.tril_indices(half + 1, half + 1)
+            numbers, centre = kernel[:, half + row, half + column], 0
+        else:
+            numbers, centre = kernel.flatten(1), 2 * half * (half + 1)
+        key = numbers.contiguous().numpy().tobytes()
+        if key not in seen:  # most are alike in front of the focus plane and behind it
+            seen[key] = (size + centre, half)
+            values.append(numbers)
+            size += numbers.shape[1]
+        places.append(seen[key])
+    origins, halves = torch.tensor(places).unbind(1)
+    bins, margin = 2 * int(farthest) + 3, int(halves.max())
+    return Kernels(
+        torch.cat(values, 1), origins, halves, torch.tensor(table.is_round), plan.kernels_per_px, bins, margin
+    )
+
+
+def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Tensor]], kernels: Kernels) -> Tensor:
+    """What :func:`torchdof.render.highlights.splat` does, of one list of highlights, in a graph: ``[B, C, H, W]``.
+
+    Args:
+        rays: The highlights of all surfaces.
+        coc_px: Of the frame, ``[B, 1, H, W]``.
+        obstacles: Coc and cover of what may stand in the way, each ``[B, 1, H, W]``.
+        kernels: Of the file.
+    """
+    batch, _, height, width = coc_px.shape
+    *lens, per_px, bins, margin = kernels
+    halves = kernels.halves
+    step = rays.coc_px * per_px + float(len(halves) // 2)
+    low = step.floor()
+    node, part = low.long(), step - low
+    half = torch.maximum(halves.index_select(0, node), halves.index_select(0, node + 1))
+    half, order = half.sort()  # a part of the sources has the taps of its widest
+    node, part, coc, source = (t.index_select(0, order) for t in (node, part, rays.coc_px, rays.pixels))
+    light = rays.light.index_select(1, order).t()
+    item, row, column = pixels.places(source, height, width)
+
+    across, down = width + 2 * margin, height + 2 * margin
+    first = (item * down + row + margin) * across + column + margin
+    lists = [light, coc, item, row, column, first, node, part, half]
+    blank = coc_px.new_zeros(rays.light.shape[0], batch, down, across)
+    sizes = [torch.scalar_tensor(n, dtype=torch.int64) for n in (height, width, across)]
+    inputs = [blank, *lists, *lens, *sizes]
+    if obstacles:
+        nearest = coc_px.min()
+        places = [(coc - nearest, cover) for coc, cover in obstacles]
+        inputs += [torch.stack([t.flatten() for t in maps], 1) for maps in zip(*places, strict=True)]
+        inputs += [_covered_cells(places, bins), nearest]
+    name = "splat_past" if obstacles else "splat"
+    splats = torch.onnx.ops.symbolic(f"torchdof::{name}", inputs, dtype=blank.dtype, shape=list(blank.shape), version=1)
+    return splats.transpose(0, 1).narrow(-2, margin, height).narrow(-1, margin, width)
+
+
+def _covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:
+    """How many cells above and left of each may show something in a bin: ``[bins, B, rows + 1, columns + 1]``.
+
+    Of each cell only the nearest and farthest of its places are looked at.
+    """
+    shown = [torch.where(cover > 0, place, _NEVER) for place, cover in places]
+    least = -torch.stack([_largest(-place) for place in shown]).amax(0)
+    shown = [torch.where(cover > 0, place, -_NEVER) for place, cover in places]
+    most = torch.stack([_largest(place) for place in shown]).amax(0)
+    index = torch.arange(bins).to(least.dtype)[:, None, None, None]
+    covered = ((least < index + 1.0) & (most > index - 1.0)).to(least.dtype)
+    return functional.pad(covered.cumsum(-1).cumsum(-2), (1, 0, 1, 0))
+
+
+def _largest(values: Tensor) -> Tensor:
+    """Largest of each cell of a map ``[B, 1, H, W]``: ``[B, rows, columns]``."""
+    return functional.max_pool2d(values, COARSE_CELL, ceil_mode=True)[:, 0]
