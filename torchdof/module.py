@@ -373,10 +373,18 @@ def _rendered(render: Callable[..., Tensor], light: Tensor, *arguments: Any) -> 
 
 def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     """A map of the coc with its edges where the image has them, as far as the options ask for that."""
-    if options.depth_edges == "as given":
+    if options.depth_edges == "as given" or _is_smooth(coc_px):
         return coc_px
     mended = -repair(image, -coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto")
     return torch.where(mended == coc_px, coc_px, mended) if coc_px.requires_grad else mended
+
+
+def _is_smooth(coc_px: Tensor) -> bool:
+    """Whether no two pixels of a map are so far apart that a repair could change one: half a step, beside lamps."""
+    if validation.is_traced():
+        return False
+    low, high = coc_px.detach().aminmax()
+    return bool(high - low < 0.5 * STEP_PX)
 
 
 _has_rendered = threading.Event()

@@ -1,4 +1,5 @@
 import csv
+import dataclasses
 import functools
 import importlib.metadata
 import importlib.util
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 from typer.testing import CliRunner, Result
 
-from torchdof import Camera, DepthOfField
+from torchdof import BlurTable, Camera, DepthOfField
 from torchdof.bench import scaling, speed
 from torchdof.bench.inputs import BenchScene, shipped
 from torchdof.cli.bench import from_files
@@ -24,6 +25,7 @@ from torchdof.reference import metrics
 
 LEVELS = ["8/255", "4/255", "2/255", "1/255", "0.5/255", "exact"]
 EXACT = speed.Setting("layered", True, 0.0)
+DISC = BlurTable.disc()
 
 
 def run(*arguments: object) -> Result:
@@ -220,6 +222,22 @@ def test_bench_focuses_where_it_is_told(files: tuple[Path, Path], tmp_path: Path
     assert float(given.coc_px.max()) == pytest.approx(8.0)
 
 
+def test_bench_measures_the_lens_that_it_is_told(files: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[BenchScene] = []
+    monkeypatch.setattr(
+        speed, "measure_all", lambda scene, *_: (measured.append(scene) or [row(EXACT, 0.5, 0.0)], 0.02)
+    )
+    lens = ("--fov-deg", 40, "--aperture-radius-m", 0.02, "--focus-at", "0,0", "--table", "gaussian", "--blades", 5)
+    result = run(*files, *lens, "--json")
+    assert result.exit_code == 0, result.output
+    assert "5 blades" in json.loads(result.stdout)["table"]
+    depth = torch.linspace(1.0, 4.0, 64).expand(1, 1, 36, 64)
+    camera = Camera.from_fov(40.0, 0.02, 1.0).focus_at(depth, 0.0, 0.0)
+    torch.testing.assert_close(measured[0].coc_px, camera.coc_px(depth, 64))
+    smooth, even = (speed.exact(dataclasses.replace(measured[0], table=t), True) for t in (measured[0].table, DISC))
+    assert float((smooth - even).abs().max()) > 0.01
+
+
 def test_alpha_is_left_out(tmp_path: Path) -> None:
     pixels = torch.full((1, 4, 20, 24), 0.5)
     write_image(tmp_path / "a.exr", Picture(pixels, ("R", "G", "B", "A")))
@@ -235,10 +253,13 @@ def test_alpha_is_left_out(tmp_path: Path) -> None:
         (["IMAGE", "IMAGE"], "which of the channels"),
         (["IMAGE", "DEPTH", "--truth", "."], "leave IMAGE and DEPTH out"),
         (["IMAGE", "DEPTH", "--out", "nowhere"], "no such folder"),
+        (["--truth", ".", "--out", ".", "--f-number", "2"], "have their own lens and depth"),
+        (["--truth", ".", "--out", ".", "--blades", "5"], "have their own lens and depth"),
+        (["--vignetting", "0.4", "--onnx"], "one kernel a layer"),
         (["IMAGE", "DEPTH", "--views", "4"], "name its folder with --truth"),
         (["IMAGE", "DEPTH", "--f-number", "-1"], "--f-number must be positive"),
         (["IMAGE", "DEPTH", "--depth-kind", "coc", "--focus-m", "2"], "takes no camera"),
-        (["IMAGE", "SMALL"], "depth is 20 x 20 pixels but the image is 64 x 36"),
+        (["IMAGE", "SMALL"], "must have the same aspect ratio"),
         (["TINY", "TINY", "--depth-kind", "z"], "from 16 pixels a side on"),
         (["--focus-m", "2"], "the built-in scene has its own camera"),
         (["--truth", "."], "give a folder with --out"),
@@ -260,7 +281,7 @@ def test_bad_arguments_are_refused_in_a_sentence(
 
 
 def test_an_exported_file_has_its_row(exported_by_command: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    def copied(dof: DepthOfField, path: str, inputs: str, channels: int) -> None:
+    def copied(dof: DepthOfField, path: str, inputs: str, channels: int, width: int | None) -> None:
         assert dof.options.max_coc_px == 2.0 and not dof.options.occlusion and (inputs, channels) == ("coc_px", 3)
         shutil.copyfile(exported_by_command[0], path)
 

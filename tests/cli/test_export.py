@@ -27,6 +27,14 @@ def test_a_file_is_written_and_its_verification_printed(exported_by_command: tup
     assert [file.name for file in path.parent.iterdir()] == ["dof.onnx"]
 
 
+def test_blades_are_those_of_the_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modules = []
+    monkeypatch.setattr("torchdof.cli.export.to_onnx", lambda dof, *_, **__: modules.append(dof) or 1 / 0)
+    run("-o", tmp_path / "dof.onnx", "--blades", "5", "--rotation", "10", "--squeeze", "2")
+    aperture = modules[0].options.table.aperture
+    assert aperture is not None and (aperture.blades, aperture.rotation_deg, aperture.squeeze) == (5, 10.0, 2.0)
+
+
 def test_show_prints_units_camera_table_and_options(plain: Any) -> None:
     result = run("--show", plain.path)
     assert result.exit_code == 0, result.output

@@ -1,5 +1,6 @@
 """`torchdof fit` as a user runs it."""
 
+import functools
 import json
 from pathlib import Path
 from types import ModuleType
@@ -9,6 +10,7 @@ from typer.testing import CliRunner, Result
 
 from torchdof import BlurTable
 from torchdof.cli.main import app
+from torchdof.fit.lens import trace
 
 
 def kernel(distance: float) -> tuple[str, dict[str, float]]:
@@ -103,6 +105,25 @@ def test_field_and_wavelengths_of_a_lens(tmp_path: Path) -> None:
     assert BlurTable.load(tmp_path / "lens.json").channels == 3
     assert "--wavelengths takes rgb, or micrometres" in run(*options, "--wavelengths", "red").output.replace("\n", " ")
     assert "--field-deg must be 0 to 90" in run(*options, "--field-deg", "95").output.replace("\n", " ")
+
+
+def test_a_lens_is_traced_across_its_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = functools.partial(trace.trace_table, field_nodes=2, field_rays=2000)
+    monkeypatch.setattr(trace, "trace_table", few)
+    (tmp_path / "single.txt").write_text("50 5 1.5168 20\n0 1 0 8\n-50 0 1 20\n")
+    file = tmp_path / "lens.json"
+    options = ("--lens", tmp_path / "single.txt", "--f-number", "8", "--nodes", "5", "-o", file)
+    result = run(*options, "--field", "0,6,12")
+    assert result.exit_code == 0, result.output
+    assert "across the field: [0.0, 6.0, 12.0] mm" in result.output
+    drawn = CliRunner().invoke(app, ["tables", str(file), "-o", str(tmp_path / "table.png")])
+    assert "distances to 12" in drawn.output and (tmp_path / "table.png").is_file()
+    field = BlurTable.load(file).field
+    assert field is not None and field.radius.tolist() == [0.0, 6.0, 12.0]
+    assert 1.02 * field.box[0, 0, 1] < field.box[0, 2, 1]  # a single lens is worse off its axis
+    for wrong in ("6,12", "0", "0,12,6", "0,6,6", "0,x", "0,nan"):
+        assert "--field takes distances in mm" in run(*options, "--field", wrong).output.replace("\n", " ")
+    assert "give one of them" in run(*options, "--field", "0,6", "--field-deg", "5").output.replace("\n", " ")
 
 
 @pytest.mark.parametrize(

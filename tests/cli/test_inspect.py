@@ -91,6 +91,11 @@ def test_relative_depth_is_inspected_between_its_distances(scene: Path) -> None:
     assert "nearest 1 " in out and "farthest 3" in out
 
 
+def test_a_range_in_focus_and_a_tilt_are_told(scene: Path) -> None:
+    out, _ = run("photo.png", "depth.npy", "--focus-range", "1.5,2.2", "--tilt", "3")
+    assert "focus 1.5 to 2.2 m" in out and "tilt 3 degrees" in out
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

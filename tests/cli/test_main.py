@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from torchdof.cli import main
+from torchdof.cli.arguments import DEPTH, LENS
 from torchdof.cli.main import app
 
 
@@ -60,3 +61,15 @@ def test_an_option_means_the_same_in_all_commands() -> None:
     assert {option: means for option, means in meanings.items() if len(means) > 1} == {}
     assert {parameter: options for parameter, options in spellings.items() if len(options) > 1} == {}
     assert all("--json" in {option for p in parsed.params for option in p.opts} for parsed in commands.values())
+
+
+def test_what_renders_and_what_measures_take_the_same_lens_depth_and_blur() -> None:
+    commands = {name: main._imported(name) for name in ("render", "inspect", "bench", "export", "tables")}
+    options = {name: {p.name: p.rich_help_panel for p in command.params} for name, command in commands.items()}
+    told = {name for name, panel in options["render"].items() if panel in (LENS, DEPTH)}
+    told -= {"depth_edges", "steady", "strict"}  # what is done with it
+    shape = {"blades", "rotation", "curvature", "squeeze", "aperture"}
+    assert told <= set(options["inspect"]) and told <= set(options["bench"])
+    for name in ("render", "bench", "tables"):
+        assert shape | {"vignetting"} <= set(options[name]), name
+    assert shape | {"table"} <= set(options["export"]) and "table" in options["bench"]

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 import torchdof
 from torchdof.cli.main import app
 from torchdof.io.images import Picture, read_image, write_image
+from torchdof.optics.field import Field
 
 HEIGHT, WIDTH = 16, 24
 LENS = ("--focal-length-mm", "50", "--f-number", "1.4", "--sensor-width-mm", "4")  # blurs by 1.8 px
@@ -254,8 +255,14 @@ def test_alpha_goes_through_the_blur_premultiplied(scene: Path) -> None:
     assert bool(((out[:, 3] > 0.01) & (out[:, 3] < 0.99)).any())
 
 
-def test_table_of_three_colours_blurs_alpha_like_green(scene: Path) -> None:
+@pytest.mark.parametrize("place", ["everywhere alike", "across the field"])
+def test_table_of_three_colours_blurs_alpha_like_green(scene: Path, place: str) -> None:
     table = torchdof.BlurTable("gaussian", coc=[1.0], params={"sigma": [[0.2], [0.5], [0.9]]})
+    if place == "across the field":
+        sizes = torch.tensor([0.2, 0.1, 0.3, 0.2]).reshape(2, 2, 1).expand(2, 2, 3)
+        light = torch.rand(3, 2, 2, 8, 4, generator=torch.Generator().manual_seed(1))
+        field = Field(torch.tensor([-0.1, 0.1]), torch.tensor([0.0, 0.6]), sizes, light)
+        table = table.replace(unit="fraction", field=field)
     table.save("colours.json")
     grey = image()[:, :1].expand(-1, 4, -1, -1)
     write_image("cut.exr", Picture(grey, ("R", "G", "B", "A"), sample="float"))

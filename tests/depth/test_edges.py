@@ -130,6 +130,21 @@ def test_a_lamp_gets_no_more_nearness_than_it_lost() -> None:
     assert float((1 / repair_edges(image, given, "auto")).max()) < 0.6
 
 
+@pytest.mark.parametrize("kind", ["half-res", "near -1px"])
+@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
+def test_what_differs_by_less_than_half_a_step_has_no_edge(
+    scene: Scene, kind: str, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)  # the renderer does not ask for a repair then
+    nearness = 1.0 / degrade(scene.depth, kind)
+    image = scene.image.clone()
+    image[..., 60:62, 90:92] = 500.0
+    nearness[..., 60:62, 90:92] = nearness.max()
+    low, high = nearness.aminmax()
+    assert not torch.equal(edges.repair(image, nearness, 0.5 * float(high - low), False), nearness)
+    assert torch.equal(edges.repair(image, nearness, 2.001 * float(high - low), False), nearness)
+
+
 def test_infinite_depth_is_a_surface(scene: Scene) -> None:
     depth = torch.where(scene.depth == 6.0, math.inf, scene.depth)
     assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)

@@ -9,6 +9,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <limits>
+#include <memory>
 #include <random>
 #include <thread>
 #include <vector>
@@ -38,6 +39,29 @@ std::vector<float> disc(double radius, int half, int colours) {
   return repeated;
 }
 
+// What a field lets through of kernels of some radii: less towards one end, the more the farther from the middle.
+struct Field {
+  static constexpr int distances = 5, columns = 4, rows = 2 * columns - 1;
+  std::vector<std::vector<float>> values, boxes;
+  std::vector<torchdof_shares> shares;
+
+  Field(const std::vector<double> &radii, int colours) {
+    for (double radius : radii) {
+      std::vector<float> through, box;
+      for (int c = 0; c < colours; c++)
+        for (int d = 0; d < distances; d++)
+          for (int i = 0; i < rows * columns; i++)
+            through.push_back(float(std::clamp(2.0 - d * (i / columns) / double(distances + c), 0.0, 1.0)));
+      for (int d = 0; d < distances; d++)
+        for (double side : {-0.1 * d, std::abs(radius) + 1.0, std::abs(radius) + 1.0}) box.push_back(float(side));
+      values.push_back(through);
+      boxes.push_back(box);
+    }
+    for (size_t i = 0; i < radii.size(); i++)
+      shares.push_back({values[i].data(), boxes[i].data(), float(radii[i]), colours, rows, columns});
+  }
+};
+
 // A scene and the memory that it points to.
 struct Scene {
   torchdof_scene scene{};
@@ -46,6 +70,7 @@ struct Scene {
   std::vector<double> nodes;
   std::vector<int32_t> scales, halves;
   std::vector<float> kernels;
+  std::unique_ptr<Field> field;
 
   explicit Scene(unsigned seed) {
     std::mt19937 random(seed);
@@ -61,9 +86,17 @@ struct Scene {
     scene.masked = integer(0, 1) && scene.kind != TORCHDOF_STACK;  // a stack's values are finite
     scene.highlights = integer(0, 3) > 0;
     scene.crisp_px = float(number(0.5, 4.0));
+    scene.squeeze = 1.0f;
     const double largest = number(1.0, 40.0);
     surfaces(integer, number, largest);
     layers(integer(0, 3) ? 1 : scene.channels, largest);
+    if (integer(0, 2)) return;
+    std::vector<double> radii;
+    for (size_t i = 0; i < nodes.size(); i++) radii.push_back(nodes[i] / scales[i]);
+    field = std::make_unique<Field>(radii, scene.kernel_colours);
+    scene.shares = field->shares.data();
+    scene.distances = Field::distances;
+    scene.squeeze = float(number(0.5, 2.0));
   }
 
  private:
@@ -131,7 +164,6 @@ struct Scene {
 
 // What came of it, and the picture if that is TORCHDOF_OK.
 int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vector<float> &picture) {
-  scene.squeeze = 1.0f;
   scene.threads = threads;
   scene.cancelled = cancelled;
   torchdof_job *job = nullptr;
@@ -149,7 +181,13 @@ int render(torchdof_scene scene, int threads, const int32_t *cancelled, std::vec
   }
   for (const std::vector<float> &kernel : kernels) kernels_at.push_back(kernel.data());
   picture.assign(size_t(scene.channels) * scene.height * scene.width, -1.0f);
-  const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), nullptr, 0, picture.data());
+  std::vector<double> radii;
+  for (double radius = 128.0; radius > 0.5; radius /= 1.3)
+    radii.insert(radii.begin() + long(radii.size() / 2), {-radius, radius});
+  const Field rays(radii, scene.kernel_colours);
+  const torchdof_shares *shares = scene.shares ? rays.shares.data() : nullptr;
+  const int32_t shares_count = scene.shares ? int32_t(radii.size()) : 0;
+  const int finished = torchdof_finish(job, kernels_at.data(), halves.data(), shares, shares_count, picture.data());
   torchdof_free(job);
   return finished;
 }

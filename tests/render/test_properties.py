@@ -212,6 +212,17 @@ def test_a_turned_scene_is_the_turned_picture(
             assert float(difference.abs().max()) < 1e-4 * max(1.0, float(scene.image.max())), f"scene {seed}"
 
 
+@seeds(12)
+def test_a_flip_of_a_frame_of_any_size_stays_within_the_tolerance(seeds: range) -> None:
+    """There the blocks of coarse layers are others."""
+    for seed in seeds:
+        scene = random_scene(seed)
+        scene.options["depth_edges"] = "as given"
+        flipped = scene.turned(lambda t: t.flip(-1, -2)).blurred(torch.float32, 1 / 255).flip(-1, -2)
+        difference = flipped - scene.blurred(torch.float32, 1 / 255)
+        assert rms(difference) < 1 / 255 * max(1.0, float(scene.image.max())), f"scene {seed}"
+
+
 @pytest.mark.parametrize("size", [16, 40, 56])
 def test_the_tolerance_holds_where_blurs_are_as_large_as_the_frame(size: int) -> None:
     for seed in range(6):

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..optics.blur_table import BlurTable
 from ..optics.camera import Camera
 from ..reference.scenes import posts, waves
 
@@ -24,12 +25,14 @@ class BenchScene:
         image: ``[1, C, H, W]``, linear light, without alpha.
         coc_px: ``[1, 1, H, W]``, signed radius in pixels.
         remark: Camera and focus, in words.
+        table: Of the lens; the disc unless given.
     """
 
     name: str
     image: Tensor
     coc_px: Tensor
     remark: str = ""
+    table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
 
     def __post_init__(self) -> None:
         height, width = self.image.shape[-2:]

@@ -153,6 +153,7 @@ def render_scene(scene: BenchScene, setting: Setting) -> Tensor:
         return blur_by_coc(
             scene.image,
             scene.coc_px,
+            table=scene.table,
             tolerance=setting.tolerance,
             occlusion=setting.occlusion,
             method=setting.method,
@@ -170,7 +171,7 @@ def renderer(scene: BenchScene, setting: Setting) -> Callable[[], Tensor]:
     if setting.runtime == "torch":
         return lambda: render_scene(scene, setting)
     reach = max(1.0, float(math.ceil(scene.radius_px)))
-    options: dict[str, Any] = {"tolerance": setting.tolerance, "occlusion": setting.occlusion}
+    options: dict[str, Any] = {"table": scene.table, "tolerance": setting.tolerance, "occlusion": setting.occlusion}
     if setting.runtime == "compiled":
         compiled = torch.compile(functools.partial(blur_by_coc, max_coc_px=reach, check=False, **options))
         run = torch.no_grad()(lambda: compiled(scene.image, scene.coc_px))
@@ -182,7 +183,8 @@ def renderer(scene: BenchScene, setting: Setting) -> Callable[[], Tensor]:
     dof = DepthOfField(Camera(), max_coc_px=reach, check=False, **options)
     with tempfile.TemporaryDirectory() as folder:
         path = f"{folder}/dof.onnx"
-        to_onnx(dof, path, inputs="coc_px", channels=scene.image.shape[1])
+        width = None if scene.table.unit == "relative" else scene.image.shape[-1]
+        to_onnx(dof, path, inputs="coc_px", channels=scene.image.shape[1], width=width)
         runner = session(path, torch.get_num_threads())
     feed = {"image": scene.image.numpy(), "coc_px": scene.coc_px.numpy()}
     return lambda: torch.from_numpy(runner.run(None, feed)[0])
@@ -382,7 +384,7 @@ def _remarks(rows: Sequence[SettingCost]) -> str:
 def _title(scene: BenchScene) -> str:
     height, width = scene.image.shape[-2:]
     low, high = float(scene.coc_px.min()), float(scene.coc_px.max())
-    return f"{scene.name}, {width} x {height}, blur radius {low:.1f} to {high:.1f} px"
+    return f"{scene.name}, {width} x {height}, blur radius {low:.1f} to {high:.1f} px, {scene.table!r}"
 
 
 def _plot(path: Path, rows: Sequence[SettingCost], scene: BenchScene) -> None:

@@ -20,9 +20,12 @@ __all__ = [
     "DepthUnknown",
     "FNumber",
     "FarM",
-    "FocalLengthMm",
-    "FovDeg",
     "FillDepth",
+    "FocalLengthMm",
+    "FocusAt",
+    "FocusMOrMedian",
+    "FocusRange",
+    "FovDeg",
     "MethodName",
     "NearM",
     "NoOcclusion",
@@ -30,7 +33,9 @@ __all__ = [
     "Rotation",
     "SensorWidthMm",
     "Squeeze",
+    "Swing",
     "TableName",
+    "Tilt",
     "ToleranceText",
     "ValueRange",
     "Vignetting",
@@ -39,6 +44,34 @@ __all__ = [
 LENS, DEPTH, BLUR = "Focus and lens", "Depth map", "Blur"
 """Panels of the help that these options stand in."""
 
+FocusMOrMedian = Annotated[
+    float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=LENS)
+]
+FocusAt = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y",
+        help="Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame.",
+        rich_help_panel=LENS,
+    ),
+]
+FocusRange = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NEAR,FAR",
+        help="In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
+        rich_help_panel=LENS,
+    ),
+]
+Tilt = Annotated[
+    float,
+    typer.Option(
+        help="Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", rich_help_panel=LENS
+    ),
+]
+Swing = Annotated[
+    float, typer.Option(help="Degrees to the right: focus comes nearer towards the right.", rich_help_panel=LENS)
+]
 FNumber = Annotated[float | None, typer.Option(help="Smaller is blurrier.", rich_help_panel=LENS)]
 FocalLengthMm = Annotated[
     float | None, typer.Option(help="Real focal length, not the 35 mm equivalent.", rich_help_panel=LENS)

@@ -15,23 +15,40 @@ from ..bench.accuracy import compare_with_truth
 from ..bench.degraded import compare_degraded
 from ..bench.inputs import BenchScene, shipped
 from ..bench.report import existing_folder
-from ..depth.holes import resolve_holes
-from ..depth.kinds import depth_from_values
-from ..io.images import read_image, read_values
 from .arguments import (
     DEPTH,
-    LENS,
+    ApertureImage,
+    ApertureRadiusM,
     AsJson,
+    Blades,
+    Curvature,
+    DepthChannel,
     DepthOffset,
     DepthScale,
+    DepthUnknown,
+    FarM,
     FillDepth,
     FNumber,
     FocalLengthMm,
+    FocusAt,
+    FocusMOrMedian,
+    FocusRange,
+    FovDeg,
+    NearM,
+    RelativeKind,
+    Rotation,
     SensorWidthMm,
+    Squeeze,
+    Swing,
+    TableName,
+    Tilt,
+    ValueRange,
+    Vignetting,
 )
+from .frame import read_frame
 from .printed import json_line
-from .render import parse_fill
-from .settings import RenderSettings
+from .render import parse_fill, parse_point, parse_range
+from .settings import RenderSettings, load_aperture, load_table
 
 __all__ = ["bench", "from_files"]
 
@@ -51,19 +68,36 @@ def bench(
         typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png."),
     ] = None,
     repeat: Annotated[int, typer.Option(help="Timed renderings of each setting.", min=1)] = 5,
-    focus_m: Annotated[
-        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=LENS)
-    ] = None,
+    focus_m: FocusMOrMedian = None,
+    focus_at: FocusAt = None,
+    focus_range: FocusRange = None,
+    tilt: Tilt = 0.0,
+    swing: Swing = 0.0,
     f_number: FNumber = None,
     focal_length_mm: FocalLengthMm = None,
     sensor_width_mm: SensorWidthMm = None,
+    fov_deg: FovDeg = None,
+    aperture_radius_m: ApertureRadiusM = None,
     depth_kind: Annotated[
-        Literal["z", "disparity", "inverse", "coc"],
+        Literal["z", "distance", "disparity", "inverse", "relative", "coc"],
         typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=DEPTH),
     ] = "z",
     depth_scale: DepthScale = None,
     depth_offset: DepthOffset = 0.0,
+    near_m: NearM = None,
+    far_m: FarM = None,
+    relative_kind: RelativeKind = None,
+    value_range: ValueRange = None,
+    depth_unknown: DepthUnknown = None,
     fill_depth: FillDepth = None,
+    depth_channel: DepthChannel = None,
+    table: TableName = "disc",
+    blades: Blades = 0,
+    rotation: Rotation = 0.0,
+    curvature: Curvature = 0.0,
+    squeeze: Squeeze = 1.0,
+    aperture: ApertureImage = None,
+    vignetting: Vignetting = 0.0,
     onnx: Annotated[
         bool,
         typer.Option(
@@ -118,6 +152,8 @@ def bench(
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
+    Camera, depth and blur are told as to torchdof render.
+
     torchdof and simpler renderers against scenes whose depth of field is known:
 
         torchdof bench --truth scenes --out results
@@ -130,10 +166,39 @@ def bench(
     sharp, truth, each renderer with its error below it, four times enlarged.
     """
     existing_folder(out)
+    opening = load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)
+    of_lens = load_table(table, opening)
+    how = RenderSettings(
+        focus=None if focus_m is None else [(0, focus_m)],
+        focus_at=None if focus_at is None else parse_point(focus_at),
+        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
+        tilt_deg=tilt,
+        swing_deg=swing,
+        f_number=f_number,
+        focal_length_mm=focal_length_mm,
+        sensor_width_mm=sensor_width_mm,
+        fov_x_deg=fov_deg,
+        aperture_radius_m=aperture_radius_m,
+        depth_kind=depth_kind,
+        depth_scale=depth_scale,
+        depth_offset=depth_offset,
+        depth_unknown=depth_unknown,
+        depth_channel=depth_channel,
+        near_m=near_m,
+        far_m=far_m,
+        relative_kind=relative_kind,
+        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
+        fill=None if fill_depth is None else parse_fill(fill_depth),
+        table=of_lens,
+    )
     if truth is not None:
         if image is not None or onnx or compiled or scan:
             raise ValueError(
                 "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
+            )
+        if how != RenderSettings(table=of_lens) or opening is not None or table != "disc":
+            raise ValueError(
+                "the scenes of --truth have their own lens and depth; leave options of these and of blur out"
             )
         if as_json:
             raise ValueError("--truth writes its numbers as CSV to the folder --out; leave --json out")
@@ -150,17 +215,9 @@ def bench(
         return
     if views or degrade or peer:
         raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
-    how = RenderSettings(
-        focus=None if focus_m is None else [(0, focus_m)],
-        f_number=f_number,
-        focal_length_mm=focal_length_mm,
-        sensor_width_mm=sensor_width_mm,
-        depth_kind=depth_kind,
-        depth_scale=depth_scale,
-        depth_offset=depth_offset,
-        fill=None if fill_depth is None else parse_fill(fill_depth),
-    )
-    if image is None and how != RenderSettings(table=how.table):
+    if (onnx or compiled) and of_lens.depends_on_place:
+        raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
+    if image is None and how != RenderSettings(table=of_lens):
         raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
     if out is not None and importlib.util.find_spec("matplotlib") is None:  # before the time is spent
         raise ModuleNotFoundError("no matplotlib", name="matplotlib")
@@ -170,7 +227,7 @@ def bench(
         raise FileNotFoundError(
             "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
         )
-    scene = shipped() if image is None else from_files(image, depth, how)
+    scene = dataclasses.replace(shipped(), table=of_lens) if image is None else from_files(image, depth, how)
     console = Console(stderr=True)
     runtimes: list[speed.Runtime] = []
     if onnx:
@@ -181,7 +238,7 @@ def bench(
     scan_costs = scaling.measure_scans(scene, repeat, unit, console) if scan else []
     scans = [scaling.table_of(scan_costs)] if scan_costs else []
     if as_json:
-        facts = {"scene": scene.name, "remark": scene.remark, "unit_s": unit}
+        facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table), "unit_s": unit}
         costs = {"settings": [dataclasses.asdict(row) for row in rows]}
         typer.echo(json_line({**facts, **costs, "scans": [dataclasses.asdict(cost) for cost in scan_costs]}))
     else:
@@ -198,27 +255,23 @@ def from_files(image: Path, depth: Path | None, how: RenderSettings) -> BenchSce
     Args:
         image: Image file.
         depth: Depth file; None takes the depth channel of the image.
-        how: Camera and depth as for ``torchdof render``; without a focus it is at the median depth, so that there is
-            blur on both sides.
+        how: Camera, depth and table as for ``torchdof render``; without a focus it is at the median depth, so that
+            there is blur on both sides.
 
     Raises:
         ValueError: If input is wrong or missing.
         OSError: If a file cannot be read.
     """
-    picture = read_image(image, how.transfer, how.layer)
-    values = picture.depth if depth is None else read_values(depth, how.depth_channel)
-    if values is None:
-        raise ValueError(f"{image}: has no depth channel; name a depth file after it: torchdof bench IMAGE DEPTH")
-    if how.depth_kind == "relative":
-        raise ValueError("torchdof bench takes depth whose scale is known; --depth-kind relative is for render")
-    values = depth_from_values(values, how.depth_kind, scale=how.depth_scale, offset=how.depth_offset)
-    values, _ = resolve_holes(values, str(depth or image), how.fill)
+    frame = read_frame(image, depth, how)
+    picture, values = frame.picture, frame.values
     light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
     if how.depth_kind == "coc":
-        return BenchScene(image.name, light, values, "blur as given")
+        return BenchScene(image.name, light, values, "blur as given", how.table)
     focus = "focus as stated"
-    if how.focus is None:
+    if how.focus is None and how.focus_at is None and how.focus_range is None:
         focus, how = "focus at the median depth", dataclasses.replace(how, focus=[(0, float(values.median()))])
     camera, remarks = how.camera(picture.metadata, light.shape[-1], 0)
+    if how.focus_at is not None:
+        camera = camera.focus_at(values, *how.focus_at)
     words = f"{camera!r}; {', '.join([focus, *remarks])}"
-    return BenchScene(image.name, light, camera.coc_px(values, light.shape[-1]), words)
+    return BenchScene(image.name, light, camera.coc_px(values, light.shape[-1]), words, how.table)

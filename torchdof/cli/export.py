@@ -13,15 +13,20 @@ from torchdof import Camera, DepthOfField
 from torchdof.cli.arguments import (
     BLUR,
     LENS,
+    ApertureImage,
     AsJson,
+    Blades,
+    Curvature,
     FovDeg,
     MethodName,
     NoOcclusion,
+    Rotation,
+    Squeeze,
     TableName,
     ToleranceText,
 )
 from torchdof.cli.printed import json_line
-from torchdof.cli.settings import load_table
+from torchdof.cli.settings import load_aperture, load_table
 from torchdof.export.conversion import OPSET, to_onnx
 from torchdof.export.metadata import describe, shown
 from torchdof.options import tolerance_of_text
@@ -40,6 +45,11 @@ def export(
     sensor_width_mm: Annotated[float, typer.Option(help="36 for full frame.", rich_help_panel=LENS)] = 36.0,
     fov_deg: FovDeg = None,
     table: TableName = "disc",
+    blades: Blades = 0,
+    rotation: Rotation = 0.0,
+    curvature: Curvature = 0.0,
+    squeeze: Squeeze = 1.0,
+    aperture: ApertureImage = None,
     max_coc: Annotated[
         float, typer.Option(help="Largest radius in pixels that the file holds.", rich_help_panel=BLUR)
     ] = 32.0,
@@ -95,7 +105,7 @@ def export(
         camera = Camera.from_fov(fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
     dof = DepthOfField(
         camera,
-        load_table(table),
+        load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture)),
         tolerance=tolerance_of_text(tolerance),
         occlusion=not no_occlusion,
         method=method,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -92,6 +93,15 @@ def fit(
     field_deg: Annotated[
         float, typer.Option(help="Angle from the axis, degrees: 0 is the frame's centre.", rich_help_panel=_LENS)
     ] = 0.0,
+    field: Annotated[
+        str | None,
+        typer.Option(
+            metavar="0,MM,MM,...",
+            help="Trace spots at these distances from the frame's middle: one table across the field; from 0 to 21.6 "
+            "for full frame.",
+            rich_help_panel=_LENS,
+        ),
+    ] = None,
     wavelengths: Annotated[
         str | None,
         typer.Option(
@@ -120,6 +130,10 @@ def fit(
     Or trace a lens:
 
         torchdof fit --lens double_gauss_50mm --f-number 2 --focus-m 2 -o double-gauss.json
+
+    Or all of its frame, from the middle to the corner, cat's eyes and coma included:
+
+        torchdof fit --lens double_gauss_50mm --field 0,4,8,12,16,20,21.6 -o across-the-field.json
     """
     console = Console(soft_wrap=True, quiet=as_json)
     if target is not None:
@@ -137,7 +151,7 @@ def fit(
     if plots is not None:
         plots.mkdir(parents=True, exist_ok=True)
     if lens is not None:
-        table = _trace(lens, f_number, focus_m, nodes, field_deg, wavelengths, console)
+        table = _trace(lens, f_number, focus_m, nodes, field_deg, field, wavelengths, console)
         _lens_summary(table, console)
         _write(table, out, console)
         if as_json:
@@ -192,6 +206,7 @@ def _trace(
     focus_m: float,
     nodes: int | None,
     field_deg: float,
+    field: str | None,
     wavelengths: str | None,
     console: Console,
 ) -> BlurTable:
@@ -205,6 +220,17 @@ def _trace(
         raise FitError(f"--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45; got {wavelengths}") from None
     if not 0 <= field_deg < 90:
         raise FitError(f"--field-deg must be 0 to 90 degrees from the axis, got {field_deg:g}")
+    if field is not None and field_deg:
+        raise FitError("--field-deg averages one place, --field traces several; give one of them")
+    try:
+        radii_mm = None if field is None else tuple(map(float, field.split(",")))
+    except ValueError:
+        radii_mm = ()
+    rising = radii_mm is None or all(low < high < math.inf for low, high in pairwise(radii_mm))
+    if radii_mm is not None and not (len(radii_mm) > 1 and radii_mm[0] == 0 and rising):
+        raise FitError(
+            f"--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6; got {field}"
+        )
     focal = lens.paraxial().focal_length
     number("--focus-m", focus_m, low=focal / 1000, unit="metres", infinite=True)
     image_mm = focal / (1 - focal / 1000 / focus_m)
@@ -216,6 +242,7 @@ def _trace(
             nodes=nodes,
             field_mm=image_mm * math.tan(math.radians(field_deg)),
             wavelengths_um=lines,
+            field=radii_mm,
         )
 
 
@@ -352,6 +379,8 @@ def _lens_summary(table: BlurTable, console: Console) -> None:
     if table.residual is not None:
         middle, most = 100 * float(table.residual.median()), 100 * float(table.residual.max())
         console.print(f"family: {table.family}, residual {middle:.2f} %, {most:.2f} % at most", highlight=False)
+    if table.field is not None:
+        console.print(f"across the field: {table.field.radius.tolist()} mm from the middle", highlight=False)
 
 
 def _write(table: BlurTable, target: Path, console: Console) -> None:

@@ -190,7 +190,10 @@ def render_frame(
         table = settings.table
         if picture.has_alpha and table.channels > 1:  # alpha is blurred as green is
             params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
-            table = table.replace(params=params)
+            field = table.field
+            if field is not None:
+                field = dataclasses.replace(field, light=torch.cat([field.light, field.light[1:2]]))
+            table = table.replace(params=params, field=field)
         options = Options(
             table, settings.tolerance, settings.occlusion, method=settings.method, depth_edges=settings.depth_edges
         ).arguments()
@@ -274,9 +277,7 @@ def read_metres(
     elif picture.depth is not None:
         values = picture.depth
     else:
-        raise ValueError(
-            f"{image}: has no depth channel; name a depth file after it: torchdof render IMAGE DEPTH -o OUT"
-        )
+        raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
     name = str(depth if depth is not None else image)
     kind = settings.depth_kind
     (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]

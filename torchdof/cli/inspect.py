@@ -14,7 +14,6 @@ from ..io.sheet import write_sheet
 from ..optics.camera import CAMERA_NUMBERS
 from .arguments import (
     DEPTH,
-    LENS,
     ApertureRadiusM,
     AsJson,
     DepthChannel,
@@ -25,10 +24,15 @@ from .arguments import (
     FillDepth,
     FNumber,
     FocalLengthMm,
+    FocusAt,
+    FocusMOrMedian,
+    FocusRange,
     FovDeg,
     NearM,
     RelativeKind,
     SensorWidthMm,
+    Swing,
+    Tilt,
     ValueRange,
 )
 from .doubts import Said
@@ -49,12 +53,11 @@ def inspect(
         Path | None,
         typer.Option("--out", "-o", help="Picture to write; default: IMAGE's name with .inspect.png, in this folder."),
     ] = None,
-    focus_m: Annotated[
-        float | None, typer.Option(help="Distance in focus in metres; default: the median.", rich_help_panel=LENS)
-    ] = None,
-    focus_at: Annotated[
-        str | None, typer.Option(metavar="X,Y", help="Focus on what is seen at this pixel.", rich_help_panel=LENS)
-    ] = None,
+    focus_m: FocusMOrMedian = None,
+    focus_at: FocusAt = None,
+    focus_range: FocusRange = None,
+    tilt: Tilt = 0.0,
+    swing: Swing = 0.0,
     f_number: FNumber = None,
     focal_length_mm: FocalLengthMm = None,
     sensor_width_mm: SensorWidthMm = None,
@@ -91,6 +94,9 @@ def inspect(
     settings = RenderSettings(
         focus=None if focus_m is None else [(0, focus_m)],
         focus_at=None if focus_at is None else parse_point(focus_at),
+        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
+        tilt_deg=tilt,
+        swing_deg=swing,
         f_number=f_number,
         focal_length_mm=focal_length_mm,
         sensor_width_mm=sensor_width_mm,
@@ -120,7 +126,7 @@ def inspect(
     if settings.fill is not None:
         metres, filled = resolve_holes(metres, str(depth or image), settings.fill)
     notes = []
-    if focus_m is None and focus_at is None:
+    if focus_m is None and focus_at is None and focus_range is None:
         notes = ["focus at the median depth"]
         settings = dataclasses.replace(settings, focus=[(0, float(known.median()))])
     width = picture.pixels.shape[-1]

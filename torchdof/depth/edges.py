@@ -130,8 +130,8 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
         mended = _operator(light, given, step, auto)
     elif not validation.is_traced() and all(map(native.can_read, (image, nearness))) and native.chosen():
         steps = step.expand(len(light), 1, *given.shape[-2:]) if step.ndim else step.expand(len(light), 1)
-        items = zip(light, given, steps, strict=True)
-        mended = torch.stack([native.repair_edges(a, b[0], c[0], auto)[None] for a, b, c in items])
+        items = [native.repair_edges(a, b[0], c[0], auto) for a, b, c in zip(light, given, steps, strict=True)]
+        mended = (items[0][None] if len(items) == 1 else torch.stack(items))[:, None]
     else:
         mended = _repair(light, given, step, auto)
     if nearness.dtype == torch.float32:

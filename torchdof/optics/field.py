@@ -105,10 +105,12 @@ class Field:
     def spots(self, coc: float, radius: Tensor) -> tuple[Tensor, Tensor]:
         """Boxes ``[n, 3]`` and light ``[channels, n, U, V]`` at a signed coc and distances ``[n]``, float64."""
         beyond = max(1.0, coc / float(self.coc[-1]), coc / float(self.coc[0]))
-        low, part = _between(self.coc, torch.tensor(coc, dtype=torch.float64))
-        box = torch.lerp(self.box[low], self.box[low + 1], part) * beyond  # [F, 3]
-        light = torch.lerp(self.light[:, low], self.light[:, low + 1], part)  # [channels, F, U, V]
         low, part = _between(self.radius, radius.to(torch.float64))
+        nodes = slice(int(low.min()), int(low.max()) + 2)
+        k, of_next = _between(self.coc, torch.tensor(coc, dtype=torch.float64))
+        box = torch.lerp(self.box[k, nodes], self.box[k + 1, nodes], of_next) * beyond  # [F, 3]
+        light = torch.lerp(self.light[:, k, nodes], self.light[:, k + 1, nodes], of_next)  # [channels, F, U, V]
+        low = low - nodes.start
         return (
             torch.lerp(box[low], box[low + 1], part[:, None]),
             torch.lerp(light[:, low], light[:, low + 1], part[:, None, None]),

@@ -54,7 +54,8 @@ def blur(
     # each item has its own layers, as it would have alone
     items = []
     for item in zip(*(t.split(1) for t in maps), strict=True):
-        items.append(_render_item(Plan.of_frame(torch.cat(item[1::2]), options.tolerance), options, *item))
+        cocs = item[1] if behind is None else torch.cat(item[1::2])
+        items.append(_render_item(Plan.of_frame(cocs, options.tolerance), options, *item))
     return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..validation import is_traced
 from .border import continued
-from .disocclusion import behind_pixels, behind_size, fill_hidden
+from .disocclusion import HIDDEN_WEIGHT, behind_pixels, behind_size, fill_hidden
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 from .matting import emitters_behind, matte
 from .plan import Blur
@@ -20,6 +20,8 @@ __all__ = ["Frame", "Placed", "Surface", "framed", "surfaces_of_image"]
 
 _HAIR = 0.06
 """Share of a surface up to which, in a layer, it does not yet hide what is known behind it."""
+_GOES_ON = 0.1
+"""Share of a pixel, beyond a hidden one's, from which on its farther surface goes on wholly behind the nearer one."""
 
 
 class Surface(NamedTuple):
@@ -46,7 +48,7 @@ class Frame:
     """Surfaces of a frame, continued over its border; what the layers scatter is cut out of it.
 
     Args:
-        surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area.
+        surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area; several are near to far.
         nodes: Places of the layers on the blur axis, near to far.
         ramps: Of these, as :func:`torchdof.render.layer_weights.ramps` gives them.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
@@ -111,17 +113,26 @@ class Frame:
 
 
 def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-    """``m_k I``, ``m_k`` and ``M_k - m_k`` of surfaces that share their pixels: each is a sum over them.
+    """``m_k I``, ``m_k`` and ``M_k - m_k`` of one surface, or of two that share their pixels, near to far.
+
+    Each is a sum over the surfaces. The farther one of a mixed pixel goes on behind the nearer one: in layers behind
+    that one it counts whole. Where the nearer one lies in a layer itself, or behind it, both count by their shares, for
+    else a surface that spans several layers would be open at its edge.
 
     Pairs are how much of each surface lies at or behind layers k, and behind them, ``[B, 1, n, h, w]``.
     """
     sums: list[Tensor] = []
+    nearer: Tensor | None = None
     for (light, _, cover), (behind, beyond) in zip(surfaces, pairs, strict=True):
         own = behind - beyond
         if cover is not None:
+            if nearer is not None:
+                goes_on = (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _GOES_ON).clamp(0.0, 1.0)
+                cover = cover + goes_on * (1.0 - (nearer / _HAIR).clamp(max=1.0))
             beyond, own = beyond * cover, own * cover
         terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms
+        nearer = behind
     return sums[0], sums[1], sums[2]
 
 
@@ -161,7 +172,7 @@ def framed(
     """Surfaces of an image as a frame: they go on beyond the border as they are at it (:mod:`torchdof.render.border`).
 
     Args:
-        surfaces: Near to far if stacked.
+        surfaces: Near to far if stacked; else one, or the two that share each pixel.
         nodes: As in :class:`Frame`; surfaces beyond the outermost ones belong to these.
         behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
         blurs: Kernel and resolution of each layer.
@@ -183,9 +194,21 @@ def framed(
         light = continued(light, weight, limit, ends, margin + multiple - 1) if lit else functional.pad(light, ends)
         x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
+    if len(placed) == 2 and not stacked:
+        placed = _near_to_far(*placed)
     if behind is not None:
         behind = functional.pad(behind_pixels(behind, size), beyond, mode="replicate")
     return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)
+
+
+def _near_to_far(own: Placed, other: Placed) -> list[Placed]:
+    """Both surfaces of each pixel, the nearer one first."""
+    is_nearer = other.x < own.x
+    pairs = [(a, b) for a, b in zip(own, other, strict=True) if a is not None and b is not None]
+    return [
+        Placed(*(torch.where(is_nearer, b, a) for a, b in pairs)),
+        Placed(*(torch.where(is_nearer, a, b) for a, b in pairs)),
+    ]
 
 
 def surfaces_of_image(

@@ -9,7 +9,6 @@ namespace {
 
 constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing is known
 constexpr float KNOWN = 2e-3f;    // and from which on a layer is known in full
-constexpr float HAIR = 0.06f;     // share of a surface up to which it does not yet hide what is known behind it
 constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
@@ -40,6 +39,7 @@ struct Run {
 // order[start[i + 1]].
 struct WindowPieces {
   std::vector<int> at, node, start, order;
+  std::vector<uint8_t> room_only;
   std::vector<const float *> values;
 };
 
@@ -362,6 +362,7 @@ class Composite {
     WindowPieces &p = b.pieces;
     p.at.clear();
     p.node.clear();
+    p.room_only.clear();
     p.values.clear();
     if (over_)
       for (int y = 0; y < height; y++) memset(b.rest + (size_t)y * pitch_, 0, width * sizeof(float));
@@ -371,7 +372,7 @@ class Composite {
       const int *start = &pieces.start[row - band * per_band], *column = pieces.column.data();
       const int end = (int)(std::lower_bound(column + start[0], column + start[1], left + width) - column);
       for (int i = (int)(std::lower_bound(column + start[0], column + start[1], left) - column); i < end; i++) {
-        const int node = (int)pieces.node[i] - run.first + 1, at = y * pitch_ + column[i] - left;
+        const int node = (pieces.node[i] & ~Pieces::ROOM_ONLY) - run.first + 1, at = y * pitch_ + column[i] - left;
         const float *values = &pieces.values[(size_t)i * stride];
         if (node < 0) continue;
         if (node >= L) {
@@ -380,6 +381,7 @@ class Composite {
         }
         p.at.push_back(at);
         p.node.push_back(node);
+        p.room_only.push_back(pieces.node[i] & Pieces::ROOM_ONLY ? 1 : 0);
         p.values.push_back(values);
       }
     }
@@ -442,8 +444,10 @@ class Composite {
         b.occupied[at / pitch_] |= bit;
         b.open[at / pitch_] |= bit;
         b.uneven[at / pitch_] |= bit;
-        b.term[C][at] += part(0);
-        for (int c = 0; c < C; c++) b.term[c][at] += part(1 + c);
+        if (!p.room_only[piece]) {
+          b.term[C][at] += part(0);
+          for (int c = 0; c < C; c++) b.term[c][at] += part(1 + c);
+        }
         if (!over_) continue;
         b.term[C + 1][at] += behind ? one[0] : two[0];
         if (behind) b.rest[at] += one[0];
@@ -676,19 +680,18 @@ class Composite {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
       vec some = {}, more = {}, other = {};
       for (int x = x0; x < x1; x += LANES) {
-        vec mine[COUNT], share = {}, room = {};
+        vec mine[COUNT], share = {}, room = {}, p[COUNT], h[COUNT], weight[COUNT];
         for (int j = 0; j < COUNT; j++) {
           const WindowBlock::Surface &of = w.surfaces[j];
-          const vec p = load<vec>(b.coc[j] + at + x);
-          vec h = at_or_behind(l, p, over_);
-          mine[j] = h - behind(l, p, over_);
-          if (of.weight) {
-            const vec weight = load<vec>(of.weight + row * of.weight_pitch + x);
-            mine[j] *= weight;
-            h *= weight;
-          }
+          p[j] = load<vec>(b.coc[j] + at + x);
+          h[j] = at_or_behind(l, p[j], over_);
+          weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
+        }
+        if (COUNT == 2) add_going_on(p, h, weight);
+        for (int j = 0; j < COUNT; j++) {
+          mine[j] = (h[j] - behind(l, p[j], over_)) * weight[j];
           share += mine[j];
-          room += h;
+          room += h[j] * weight[j];
         }
         store(b.term[C] + at + x, share);
         if (over_) store(b.term[C + 1] + at + x, room);
@@ -716,14 +719,15 @@ class Composite {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
       vec more = {}, other = {};
       for (int x = x0; x < x1; x += LANES) {
-        vec room = {};
+        vec room = {}, p[2], h[2], weight[2];
         for (int j = 0; j < w.count; j++) {
           const WindowBlock::Surface &of = w.surfaces[j];
-          const vec p = load<vec>(b.coc[j] + at + x);
-          vec h = at_or_behind(l, p, over_);
-          if (of.weight) h *= load<vec>(of.weight + row * of.weight_pitch + x);
-          room += h;
+          p[j] = load<vec>(b.coc[j] + at + x);
+          h[j] = at_or_behind(l, p[j], over_);
+          weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
         }
+        if (w.count == 2) add_going_on(p, h, weight);
+        for (int j = 0; j < w.count; j++) room += h[j] * weight[j];
         store(b.term[C_ + 1] + at + x, room);
         const vec lacking = room - all(1.0f);
         more = most(more, room);
@@ -733,6 +737,16 @@ class Composite {
       b.open[y] |= (uint32_t)any_positive(more) << bit;
       b.uneven[y] |= (uint32_t)any_positive(other) << bit;
     }
+  }
+
+  // To the weights of two surfaces, given their places and what they have at or behind a layer.
+  static void add_going_on(const vec *place, const vec *h, vec *weight) {
+    const auto other_is_nearer = place[1] < place[0];
+    const vec going = going_on(other_is_nearer ? weight[0] : weight[1]);
+    if (!any_positive(going)) return;
+    const vec more = where_it_shows(going, other_is_nearer ? h[1] : h[0]);
+    weight[0] += other_is_nearer ? more : vec{};
+    weight[1] += other_is_nearer ? vec{} : more;
   }
 
   static uint64_t below(int k, int word) {  // bits of layers before layer k
@@ -756,7 +770,7 @@ class Composite {
     const float per = per_half_diagonal(scene);
     const float y = (((block_row + 0.5f) * Turned::ROWS - before) * l.scale - 0.5f * H_) * per;
     const float x = (((block_column + 0.5f) * Turned::COLUMNS - before) * l.scale - 0.5f * W_) * per;
-    for (int e = 0; e < E_; e++) cut_kernel(l.kernels[e], Turned(scene, *l.shares, nullptr, 0.0f, e, y, x), cut.kernels[e]);
+    for (int e = 0; e < E_; e++) cut_kernel(l, e, Turned(scene, *l.shares, nullptr, 0.0f, e, y, x), cut.kernels[e]);
     return cut.kernels.data();
   }
 

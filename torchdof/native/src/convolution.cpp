@@ -17,10 +17,10 @@ template <bool SYMMETRIC, bool LONG>
 void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, vec (&sum)[ROWS][VECTORS]) {
   const int half = kernel.half, stride = stride_of(half);
   for (int i = 0; i < ROWS + 2 * half; i++) {
-    if (!(rows[i] & columns)) continue;
+    const int first = kernel.first[i], last = kernel.last[i];
+    if (!(rows[i] & columns) || first > last) continue;
     const float *row = in + (size_t)i * pitch + half;
     const float *tap = kernel.taps.data() + i + ROWS - 1;
-    const int reach = kernel.reach[i];
     vec line[ROWS][VECTORS] = {};
     vec(&to)[ROWS][VECTORS] = LONG ? line : sum;
     vec v[VECTORS];
@@ -28,15 +28,15 @@ void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns,
       for (int n = 0; n < VECTORS; n++) v[n] = load<vec>(row + n * LANES);
       for (int o = 0; o < ROWS; o++)
         for (int n = 0; n < VECTORS; n++) to[o][n] += v[n] * tap[-o];
-      for (int d = 1; d <= reach; d++) {
+      for (int d = 1; d <= last; d++) {
         tap += stride;
         for (int n = 0; n < VECTORS; n++) v[n] = load<vec>(row + n * LANES - d) + load<vec>(row + n * LANES + d);
         for (int o = 0; o < ROWS; o++)
           for (int n = 0; n < VECTORS; n++) to[o][n] += v[n] * tap[-o];
       }
     } else {
-      tap += (half - reach) * stride;
-      for (int d = -reach; d <= reach; d++, tap += stride) {
+      tap += (half + first) * stride;
+      for (int d = first; d <= last; d++, tap += stride) {
         for (int n = 0; n < VECTORS; n++) v[n] = load<vec>(row + n * LANES + d);
         for (int o = 0; o < ROWS; o++)
           for (int n = 0; n < VECTORS; n++) to[o][n] += v[n] * tap[-o];
@@ -46,6 +46,25 @@ void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns,
       for (int o = 0; o < ROWS; o++)
         for (int n = 0; n < VECTORS; n++) sum[o][n] += line[o][n];
   }
+}
+
+// Finds the columns in which input rows need taps.
+void find_rows(Kernel &kernel) {
+  const int half = kernel.half, side = 2 * half + 1, none = half + 1;
+  std::vector<int> low(side, none), high(side, -none);
+  const float *taps = kernel.taps.data() + ROWS - 1;
+  for (int d = kernel.symmetric ? 0 : -half; d <= half; d++, taps += stride_of(half))
+    for (int y = 0; y < side; y++) {
+      low[y] = std::min(low[y], taps[y] != 0 ? d : none);
+      high[y] = std::max(high[y], taps[y] != 0 ? d : -none);
+    }
+  kernel.first.assign(ROWS + 2 * half, none);
+  kernel.last.assign(ROWS + 2 * half, -none);
+  for (int y = 0; y < side; y++)
+    for (int i = y; i < y + ROWS; i++) {
+      kernel.first[i] = std::min(kernel.first[i], low[y]);
+      kernel.last[i] = std::max(kernel.last[i], high[y]);
+    }
 }
 
 }  // namespace
@@ -62,43 +81,62 @@ Kernel make_kernel(const float *values, int half, bool one_sided) {
   k.sum = (float)sum;
   const int first = k.symmetric ? 0 : -half;
   k.taps.assign((size_t)(half - first + 1) * stride, 0.0f);
-  k.reach.assign(ROWS + 2 * half, -1);
   for (int y = 0; y < side; y++)
-    for (int d = -half; d <= half; d++) {
-      // light comes from where it is scattered to, turned by half
-      const float tap = values[(side - 1 - y) * side + half - d];
-      if (d >= first) k.taps[(size_t)(d - first) * stride + y + ROWS - 1] = tap;
-      if (tap != 0)
-        for (int o = 0; o < ROWS; o++) k.reach[y + o] = std::max(k.reach[y + o], std::abs(d));
-    }
+    for (int d = first; d <= half; d++)  // light comes from where it is scattered to, turned by half
+      k.taps[(size_t)(d - first) * stride + y + ROWS - 1] = values[(side - 1 - y) * side + half - d];
+  find_rows(k);
   return k;
 }
 
-void cut_kernel(const Kernel &whole, const Turned &turned, Kernel &cut) {
+bool ends_dark(const torchdof_shares &shares, int distances) {
+  const int rows = shares.rows, columns = shares.columns;
+  for (int i = 0; i < shares.colours * distances; i++) {
+    const float *values = shares.values + (size_t)i * rows * columns;
+    for (int row = 0; row < rows; row++) {
+      const float *of_row = values + (size_t)row * columns;
+      if (of_row[columns - 1] != 0) return false;
+      for (int column = 0; (row == 0 || row == rows - 1) && column < columns; column++)
+        if (of_row[column] != 0) return false;
+    }
+  }
+  return true;
+}
+
+void cut_kernel(const Layer &layer, int colour, const Turned &turned, Kernel &cut) {
+  const Kernel &whole = layer.kernels[colour];
   const int half = whole.half, side = 2 * half + 1, stride = stride_of(half);
   cut.half = half;
   cut.symmetric = false;
   cut.sum = whole.sum;
-  cut.reach.assign(whole.reach.size(), -1);
-  cut.taps = whole.taps;
-  float left = 0;
+  cut.taps.assign(whole.taps.size(), 0.0f);
+  vec left = {};
   for (int d = -half; d <= half; d++) {
-    float *taps = cut.taps.data() + (size_t)(d + half) * stride + ROWS - 1;
-    for (int y = 0; y < side; y++) {
-      if (taps[y] == 0) continue;
-      taps[y] *= turned.share((float)(half - y), (float)-d);
-      if (taps[y] == 0) continue;
-      left += taps[y];
-      for (int o = 0; o < ROWS; o++) cut.reach[y + o] = std::max(cut.reach[y + o], std::abs(d));
+    const size_t column = (size_t)(d + half) * stride + ROWS - 1;
+    const float *from = whole.taps.data() + column;
+    float *to = cut.taps.data() + column;
+    float low = -half, high = half;
+    if (layer.spots) turned.rows_of((float)-d, low, high);
+    const int start = (int)std::ceil(clamp(half - high, 0.0f, (float)side)), end = (int)std::floor(clamp(half - low, -1.0f, (float)(side - 1))) + 1;
+    for (int y = start; y < end; y += LANES) {
+      const int n = std::min(LANES, end - y);
+      vec taps = {};
+      memcpy(&taps, from + y, n * sizeof(float));
+      taps *= turned.shares((float)(half - y), (float)-d);
+      left += taps;
+      memcpy(to + y, &taps, n * sizeof(float));
     }
   }
-  if (!(left > Turned::LEAST * whole.sum)) {
+  float light = 0;
+  for (int i = 0; i < LANES; i++) light += left[i];
+  if (!(light > Turned::LEAST * whole.sum)) {
     cut.taps = whole.taps;
-    cut.reach = whole.reach;
+    cut.first = whole.first;
+    cut.last = whole.last;
     return;
   }
-  const float gain = whole.sum / left;
+  const float gain = whole.sum / light;
   for (float &tap : cut.taps) tap *= gain;
+  find_rows(cut);
 }
 
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out) {

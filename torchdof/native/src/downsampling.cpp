@@ -9,13 +9,14 @@ namespace {
 
 typedef float f4 __attribute__((vector_size(16)));
 
-// Adds up what a block of one surface has between two nodes; out as Pieces::values. Weights lie without gaps.
+// Adds up what a block of one surface has between two nodes; out as Pieces::values. Weights, in the layer before and in the
+// one behind, lie without gaps.
 template <int CHANNELS, int S>
-void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *weight,
-              const LayerIndex &index, const Layer &l, bool over, float *out) {
+void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *before,
+              const float *after, const LayerIndex &index, const Layer &l, bool over, float *out) {
   f4 share = {}, part_sum = {}, one[CHANNELS] = {}, two[CHANNELS] = {};
-  auto add = [&](const f4 w, const f4 c, auto light_at) {
-    const f4 part = behind(l, index.place(c), over) * w;
+  auto add = [&](const f4 first, const f4 second, const f4 c, auto light_at) {
+    const f4 far = behind(l, index.place(c), over), part = far * second, w = first + far * (second - first);
     share += w;
     part_sum += part;
     for (int i = 0; i < CHANNELS; i++) {
@@ -26,11 +27,11 @@ void sum_part(const float *const *light, size_t light_step, const float *coc, si
   };
   if (S == 2) {
     auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
-    add(load<f4>(weight), four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
+    add(load<f4>(before), load<f4>(after), four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
   } else {
     for (int y = 0; y < S; y++)
       for (int x = 0; x < S; x += 4)
-        add(load<f4>(weight + y * S + x), load<f4>(coc + y * coc_step + x),
+        add(load<f4>(before + y * S + x), load<f4>(after + y * S + x), load<f4>(coc + y * coc_step + x),
             [&](const float *from) { return load<f4>(from + y * light_step + x); });
   }
   auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
@@ -204,19 +205,72 @@ class Downsampling {
     }
   }
 
+  // Weights of both surfaces of a block's pixels, in the layer before each and in the one behind it. The farther one of a
+  // mixed pixel goes on behind the nearer: there it counts for more than its share, and what it thereby has too much of in
+  // the layers up to the nearer one is to be taken from their room. False if there is no such pixel.
+  bool share_out(int y0, int x0, bool inside) {
+    lacking_.clear();
+    const int s = to_.scale, run = inside ? std::min(s, 4) : 1;
+    bool any = false;
+    for (int i = 0; i < s * s; i += 4) {
+      f4 coc[2], weight[2];
+      int interval[2][4];
+      for (int lane = 0; lane < 4; lane += run) {
+        const int y = std::clamp(y0 + (i + lane) / s, 0, job_.height - 1), x = std::clamp(x0 + (i + lane) % s, 0, job_.width - 1);
+        for (int j = 0; j < 2; j++) {
+          const float *coc_of, *weight_of;
+          s_.row(j, y, x, light_.data(), coc_of, weight_of);
+          for (int k = 0; k < run; k++) {
+            coc[j][lane + k] = coc_of[k];
+            weight[j][lane + k] = weight_of[k];
+            interval[j][lane + k] = index_.intervals[j][(size_t)y * job_.width + x + k];
+          }
+        }
+      }
+      const auto other_is_nearer = coc[1] < coc[0];
+      const f4 share = other_is_nearer ? weight[0] : weight[1], going = going_on(share), whole = share + going;
+      f4 first = share, second = share;
+      for (int lane = 0, last = -1; lane < 4; lane++) {
+        if (!(going[lane] > 0)) continue;
+        any = true;
+        const int near = other_is_nearer[lane] ? 1 : 0, k = interval[near][lane], n = interval[1 - near][lane];
+        if (!to_.needed(n) && !to_.needed(k)) continue;
+        const float of_near = behind(job_.layers[k], index_.place(coc[near][lane]), over_);
+        const float next = share[lane] + where_it_shows(going[lane], of_near);  // in layer k + 1
+        first[lane] = n == k ? share[lane] : n == k + 1 ? next : whole[lane];
+        second[lane] = n == k ? next : whole[lane];
+        if (!to_.needed(k)) continue;
+        const float of_far = to_.wanted[n] ? behind(job_.layers[n], index_.place(coc[1 - near][lane]), over_) : 0.0f;
+        const float given = first[lane] + of_far * (second[lane] - first[lane]);
+        if (k != last) lacking_.push_back({last = k, 0.0f, 0.0f});
+        lacking_.back().up_to += share[lane] - given;
+        if (to_.wanted[k] && n > k) lacking_.back().next += next - given;
+      }
+      store(before_[0] + i, other_is_nearer ? first : weight[0]);
+      store(after_[0] + i, other_is_nearer ? second : weight[0]);
+      store(before_[1] + i, other_is_nearer ? weight[1] : first);
+      store(after_[1] + i, other_is_nearer ? weight[1] : second);
+    }
+    return any;
+  }
+
   void gather(int row, int column, bool inside) {
     const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width, C = C_;
     const float *coc, *weight;
+    const bool two = s_.count == 2 && s_.row(1, std::clamp(y0, 0, H - 1), std::clamp(x0, 0, W - 1), light_.data(), coc, weight) &&
+                     share_out(y0, x0, inside);
     for (int i = 0; i < s_.count; i++) {
       if (inside) {
         if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
         if (C == 3) {
           const uint16_t *interval = &index_.intervals[i][(size_t)y0 * W + x0];
           const int coc_step = i ? BLOCK : W;
-          s == 2 ? sum_intervals<2>(interval, coc, coc_step, weight)
-          : s == 4 ? sum_intervals<4>(interval, coc, coc_step, weight)
-          : s == 8 ? sum_intervals<8>(interval, coc, coc_step, weight)
-                   : sum_intervals<16>(interval, coc, coc_step, weight);
+          const float *before = two ? before_[i] : weight, *after = two ? after_[i] : weight;
+          const int pitch = two ? s : BLOCK;
+          s == 2 ? sum_intervals<2>(interval, coc, coc_step, weight, before, after, pitch)
+          : s == 4 ? sum_intervals<4>(interval, coc, coc_step, weight, before, after, pitch)
+          : s == 8 ? sum_intervals<8>(interval, coc, coc_step, weight, before, after, pitch)
+                   : sum_intervals<16>(interval, coc, coc_step, weight, before, after, pitch);
           continue;
         }
       }
@@ -234,8 +288,8 @@ class Downsampling {
             at = 0;
             if (!s_.row(i, at_y, at_x, light_.data(), coc, weight)) continue;
           }
-          const float w = weight ? weight[at] : 1.0f;
-          if (w == 0) continue;
+          const float first = two ? before_[i][y * s + x] : weight ? weight[at] : 1.0f, second = two ? after_[i][y * s + x] : first;
+          if (second == 0) continue;
           const int k = index_.intervals[i][(size_t)at_y * W + at_x];
           if (!to_.needed(k)) continue;
           if (k != last) {
@@ -243,18 +297,18 @@ class Downsampling {
             one = gathered_.between(to_.stands_for[k]);
           }
           if (!to_.wanted[k]) {
-            one[0] += w;
+            one[0] += first;
             continue;
           }
           const Layer &l = job_.layers[k];
-          const float part = behind(l, index_.place(coc[at]), over_);
-          float *two = one + C + 1;
+          const float far = behind(l, index_.place(coc[at]), over_), part = far * second, w = first + far * (second - first);
+          float *parts = one + C + 1;
           one[0] += w;
-          two[0] += w * part;
+          parts[0] += part;
           for (int c = 0; c < C; c++) {
-            const float v = w * (beyond ? border_.light(i, c, y0 + y, x0 + x, light_[c][at]) : light_[c][at]);
-            one[1 + c] += v;
-            two[1 + c] += v * part;
+            const float v = beyond ? border_.light(i, c, y0 + y, x0 + x, light_[c][at]) : light_[c][at];
+            one[1 + c] += v * w;
+            parts[1 + c] += v * part;
           }
         }
       }
@@ -269,30 +323,38 @@ class Downsampling {
       gathered_.nodes[i] = gathered_.nodes[gathered_.count];
       memcpy(&gathered_.values[(size_t)i * stride_], &gathered_.values[(size_t)gathered_.count * stride_], stride_ * sizeof(float));
     }
+    if (!two) return;
+    for (const Lacking &of : lacking_) {
+      float *values = gathered_.between(to_.stands_for[of.node] | Pieces::ROOM_ONLY);
+      values[0] += of.up_to;
+      values[C + 1] += of.next;
+    }
   }
 
   // A block of one surface, of three channels, within the frame: the sums of each interval that occurs in it.
   template <int S>
-  void sum_intervals(const uint16_t *interval, const float *coc, int coc_step, const float *weight) {
+  void sum_intervals(const uint16_t *interval, const float *coc, int coc_step, const float *weight, const float *before,
+                     const float *after, int pitch) {
     constexpr int AREA = S * S;
     const size_t light_step = weight ? BLOCK : s_.width;
-    float left[AREA], interval_of[AREA], of_one[AREA];
+    float left[AREA], left_after[AREA], interval_of[AREA], of_one[AREA], of_one_after[AREA];
     unsigned differs = 0;
     float any = 0;
     for (int y = 0; y < S; y++)
       for (int x = 0; x < S; x++) {
         differs |= interval[(size_t)y * s_.width + x] ^ *interval;
-        left[y * S + x] = weight ? weight[y * BLOCK + x] : 1.0f;
+        left[y * S + x] = weight ? before[y * pitch + x] : 1.0f;
+        left_after[y * S + x] = weight ? after[y * pitch + x] : 1.0f;
         any += left[y * S + x];
       }
     if (any == 0) return;
-    auto add = [&](int node, const float *weights, float sum) {
+    auto add = [&](int node, const float *firsts, const float *seconds, float sum) {
       if (to_.wanted[node])
-        sum_part<3, S>(light_.data(), light_step, coc, coc_step, weights, index_, job_.layers[node], over_, gathered_.between(to_.stands_for[node]));
+        sum_part<3, S>(light_.data(), light_step, coc, coc_step, firsts, seconds, index_, job_.layers[node], over_, gathered_.between(to_.stands_for[node]));
       else if (to_.needed(node))
         gathered_.between(to_.stands_for[node])[0] += sum;
     };
-    if (!differs) return add(*interval, left, any);
+    if (!differs) return add(*interval, left, left_after, any);
     for (int y = 0; y < S; y++)
       for (int x = 0; x < S; x++) interval_of[y * S + x] = (float)interval[(size_t)y * s_.width + x];
     for (int i = 0; i < AREA; i++) {
@@ -301,10 +363,11 @@ class Downsampling {
       any = 0;
       for (int j = 0; j < AREA; j++) {  // the others weigh nothing
         of_one[j] = interval_of[j] == k ? left[j] : 0.0f;
+        of_one_after[j] = interval_of[j] == k ? left_after[j] : 0.0f;
         left[j] -= of_one[j];
         any += of_one[j];
       }
-      add((int)k, of_one, any);
+      add((int)k, of_one, of_one_after, any);
     }
   }
 
@@ -316,6 +379,12 @@ class Downsampling {
   Downsampled &to_;
   const int C_, stride_;
   const float each_;
+  struct Lacking {
+    int node;           // before a nearer surface
+    float up_to, next;  // room that is to be added in the layers up to it, and in the next one
+  };
+  float before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
+  std::vector<Lacking> lacking_;
   Gathered gathered_;
   std::vector<const float *> light_;
 };

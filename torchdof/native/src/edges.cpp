@@ -14,17 +14,21 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
-constexpr float SURE[RINGS + 2] = {0.0f, 0.02f, 0.06f, 0.2f, 1.0f};
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
-constexpr int AREA = 64, FLAT_REACH = 8;
+constexpr int AREA = 96, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
-constexpr float NONE = 1e30f;
+constexpr float NONE = 1e30f, UNSAID = 100.0f;  // UNSAID: above all scores
+constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
 constexpr float LARGEST = 1e15f, BRIGHTEST = 1e30f, FINITE = 3.402823466e38f;
-constexpr int SIDE = 2 * REACH + 1, ACROSS = (SIDE + LANES - 1) / LANES * LANES;  // of a window, and in whole vectors
+// A window: its rows, in whole vectors as far as these go, and then the rest, four values a row.
+constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4, WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
+static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 
-constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, LISTED = 8;  // marks of a pixel; NEAR: it shows the near surface
+// Marks of a pixel. NEAR: it shows the near surface; GIVEN_NEAR: it has its depth. Above them how unsure a witness it is.
+constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, GIVEN_NEAR = 8, LISTED = 16, UNSURE = 32;
+constexpr float SURE[RINGS + 2] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};  // its weight: far from steps, RINGS from one, ..., beside it; none
 
 // A part of the frame, and what is around it, even beyond the frame.
 struct Part {
@@ -32,35 +36,114 @@ struct Part {
 
   int bottom() const { return y0 + height; }
   int right() const { return x0 + width; }
+  bool has(int y, int x) const { return y >= y0 && y < bottom() && x >= x0 && x < right(); }
   Part grown(int by) const { return {y0 - by, x0 - by, height + 2 * by, width + 2 * by}; }
 };
 
-// Values of a part, by their place in the frame. Rows are longer than the part, by two vectors that hold something.
+// Memory of a thread for what it looks at, given back in reverse order: so it stays in the processor's cache.
+class Scratch {
+ public:
+  float *take(size_t size) {
+    if (blocks_.empty() || blocks_[block_].size - blocks_[block_].used < size) {
+      const size_t next = blocks_.empty() ? 0 : block_ + 1, whole = std::max(size, BLOCK_SIZE);
+      if (next < blocks_.size() && blocks_[next].size < size) blocks_.erase(blocks_.begin() + next, blocks_.end());  // all are free
+      if (next == blocks_.size()) blocks_.push_back({Buffer<float>(whole), whole, 0});
+      block_ = next;
+    }
+    Block &block = blocks_[block_];
+    block.used += size;
+    return block.data.data() + block.used - size;
+  }
+  void give(size_t size) {
+    blocks_[block_].used -= size;
+    if (blocks_[block_].used == 0 && block_ > 0) block_--;
+  }
+
+  static thread_local Scratch *mine;
+
+ private:
+  static constexpr size_t BLOCK_SIZE = 1 << 19;
+  struct Block {
+    Buffer<float> data;
+    size_t size, used;
+  };
+  std::vector<Block> blocks_;
+  size_t block_ = 0;
+};
+thread_local Scratch *Scratch::mine = nullptr;
+
+// Values of a part, by their place in the frame, in the thread's scratch memory. Rows are longer than the part, by two
+// vectors that hold something.
 class Grid : public Part {
  public:
   explicit Grid(const Part &part, int planes = 1)
-      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), data_(size * planes + LANES) {
-    std::fill(data_.data() + size * planes, data_.data() + size * planes + LANES, 0.0f);
+      : Part(part), pitch((part.width + LANES - 1) / LANES * LANES + 2 * LANES), size((size_t)part.height * pitch), taken_((size * planes + LANES + 15) / 16 * 16), data_(Scratch::mine->take(taken_)) {
+    std::fill(data_ + size * planes, data_ + size * planes + LANES, 0.0f);
   }
-  float *at(int y, int x) const { return data_.data() + (size_t)(y - y0) * pitch + (x - x0); }
-  void clear() const { std::fill(data_.data(), data_.data() + size, 0.0f); }
+  Grid(const Grid &) = delete;
+  Grid &operator=(const Grid &) = delete;
+  ~Grid() { Scratch::mine->give(taken_); }
+
+  float *at(int y, int x) const { return data_ + (size_t)(y - y0) * pitch + (x - x0); }
+  void clear() const { std::fill(data_, data_ + size, 0.0f); }
 
   const int pitch;
   const size_t size;  // of a plane
 
  private:
-  Buffer<float> data_;
+  const size_t taken_;
+  float *const data_;
 };
 
-inline float sum(vec v) {
-  typedef float half __attribute__((vector_size(16)));
-  half parts[LANES / 4], total;
+typedef float quad __attribute__((vector_size(16)));
+inline quad quad_of(vec v) {
+  quad parts[LANES / 4], total;
   memcpy(parts, &v, sizeof(v));
   total = parts[0];
   for (int i = 1; i < LANES / 4; i++) total += parts[i];
+  return total;
+}
+inline float sum(vec v) {
+  const quad total = quad_of(v);
   return (total[0] + total[1]) + (total[2] + total[3]);
 }
+// The sum of each of many vectors; goes up to three numbers beyond them.
+inline void sum(const vec *v, int count, float *out) {
+  for (int i = 0; i < count; i += 4) {
+    const quad none = {}, a = quad_of(v[i]), b = i + 1 < count ? quad_of(v[i + 1]) : none, c = i + 2 < count ? quad_of(v[i + 2]) : none, d = i + 3 < count ? quad_of(v[i + 3]) : none;
+    const quad ab = quad{a[0], b[0], a[1], b[1]} + quad{a[2], b[2], a[3], b[3]}, cd = quad{c[0], d[0], c[1], d[1]} + quad{c[2], d[2], c[3], d[3]};
+    store(out + i, quad{ab[0], ab[1], cd[0], cd[1]} + quad{ab[2], ab[3], cd[2], cd[3]});
+  }
+}
 inline vec size_of(vec v) { return most(v, -v); }
+
+// Calls look(n, take) for each vector of a window; take(p, pitch) has its values in a grid where p is the window's first.
+template <typename Look>
+inline void each_of_window(const Look &look) {
+  int n = 0;
+  for (int v = 0; v < SIDE; v++)
+    for (int u = 0; u < WHOLE; u += LANES) look(n++, [v, u](const float *p, int pitch) { return load<vec>(p + v * pitch + u); });
+  for (int v = 0; v < SIDE; v += ROWS_AT_ONCE)
+    look(n++, [v](const float *p, int pitch) {
+      p += v * pitch + WHOLE;
+#if defined(__AVX2__)
+      const quad a = load<quad>(p), b = load<quad>(v + 1 < SIDE ? p + pitch : p);
+      return vec{a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]};
+#else
+      return load<vec>(p);
+#endif
+    });
+}
+
+// What a function of the square of the distance says, for each place of a window.
+template <typename Of>
+std::vector<float> window(const Of &of) {
+  std::vector<float> values(WINDOW * LANES, 0.0f);
+  for (int v = 0; v < SIDE; v++)
+    for (int u = 0; u < SIDE; u++)
+      values[u < WHOLE ? v * WHOLE + u : SIDE * WHOLE + 4 * v + u - WHOLE] = of((float)((v - REACH) * (v - REACH) + (u - REACH) * (u - REACH)));
+  return values;
+}
 
 // Calls body(y, x) for each vector of a part; the last of a row goes beyond it.
 template <typename Body>
@@ -69,21 +152,24 @@ inline void each_vector(const Part &part, const Body &body) {
     for (int x = part.x0; x < part.right(); x += LANES) body(y, x);
 }
 
-// The largest of a square around each value of a part.
+// The largest of a square around each value of a part: of three runs of a third of its side, which overlap.
 template <int REACH_>
 void highest(const Grid &in, const Grid &out, const Grid &rows, const Part &part) {
-  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) {
-    const float *from = in.at(y, x);
+  constexpr int TAPS = 2 * REACH_ + 1, RUN = (TAPS + 2) / 3, LAST = TAPS - RUN, MIDDLE = LAST / 2;
+  const auto run = [](const float *from, int stride) {
     vec high = load<vec>(from);
-    for (int d = 1; d <= REACH_; d++) high = most(high, most(load<vec>(from - d), load<vec>(from + d)));
-    store(rows.at(y, x), high);
-  });
-  each_vector(part, [&](int y, int x) {
-    const float *from = rows.at(y, x);
-    vec high = load<vec>(from);
-    for (int d = 1; d <= REACH_; d++) high = most(high, most(load<vec>(from - d * rows.pitch), load<vec>(from + d * rows.pitch)));
-    store(out.at(y, x), high);
-  });
+    for (int d = 1; d < RUN; d++) high = most(high, load<vec>(from + d * stride));
+    return high;
+  };
+  const auto three = [](const float *from, int stride) {
+    return most(load<vec>(from), most(load<vec>(from + MIDDLE * stride), load<vec>(from + LAST * stride)));
+  };
+  for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
+    for (int x = part.x0; x < part.right() + LAST; x += LANES) store(rows.at(y, x), run(in.at(y, x - REACH_), 1));
+    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), three(rows.at(y, x), 1));
+  }
+  each_vector({part.y0 - REACH_, part.x0, part.height + LAST, part.width}, [&](int y, int x) { store(rows.at(y, x), run(rows.at(y, x), rows.pitch)); });
+  each_vector(part, [&](int y, int x) { store(out.at(y, x), three(rows.at(y - REACH_, x), rows.pitch)); });
 }
 
 // Around one vector of values, the largest of 3 x 3.
@@ -110,21 +196,24 @@ void highest_beside(const Grid &in, const Grid &out, const Part &part) {
   }
 }
 
-// The sum of a square around each value of a part, times a factor.
+// The sum of a square around each value of a part, times a factor: of runs of values that lie side by side.
 template <int REACH_>
 void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float factor) {
-  each_vector({part.y0 - REACH_, part.x0, part.height + 2 * REACH_, part.width}, [&](int y, int x) {
-    const float *from = in.at(y, x);
-    vec total = load<vec>(from);
-    for (int d = 1; d <= REACH_; d++) total += load<vec>(from - d) + load<vec>(from + d);
-    store(rows.at(y, x), total);
-  });
-  each_vector(part, [&](int y, int x) {
-    const float *from = rows.at(y, x);
-    vec total = load<vec>(from);
-    for (int d = 1; d <= REACH_; d++) total += load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch);
-    store(out.at(y, x), total * factor);
-  });
+  constexpr int TAPS = 2 * REACH_ + 1, RUN = TAPS % 3 ? 1 : 3, LAST = TAPS - RUN;
+  const auto symmetric = [](const float *from, int stride, int taps, int step) {
+    const int middle = taps / 2 * stride;
+    vec total = load<vec>(from + middle);
+    for (int d = step; d <= taps / 2; d += step) total += load<vec>(from + middle - d * stride) + load<vec>(from + middle + d * stride);
+    return total;
+  };
+  for (int y = part.y0 - REACH_; y < part.bottom() + REACH_; y++) {
+    if (RUN > 1)
+      for (int x = part.x0; x < part.right() + LAST; x += LANES) store(rows.at(y, x), symmetric(in.at(y, x - REACH_), 1, RUN, 1));
+    for (int x = part.x0; x < part.right(); x += LANES) store(rows.at(y, x), symmetric(RUN > 1 ? rows.at(y, x) : in.at(y, x - REACH_), 1, LAST + 1, RUN));
+  }
+  if (RUN > 1)
+    each_vector({part.y0 - REACH_, part.x0, part.height + LAST, part.width}, [&](int y, int x) { store(rows.at(y, x), symmetric(rows.at(y, x), rows.pitch, RUN, 1)); });
+  each_vector(part, [&](int y, int x) { store(out.at(y, x), symmetric(rows.at(y - REACH_, x), rows.pitch, LAST + 1, RUN) * factor); });
 }
 
 // The largest value of the square of LOWEST_REACH around a place.
@@ -139,20 +228,40 @@ inline float largest_around(const Grid &in, int y, int x) {
 }
 
 struct Judgement {
-  float score, tells, near, far, evidence;
+  float score, tells, near, far;
 };
 
-// Pixels of a part that are looked at together.
+struct Around {
+  float alike[8];  // how much the colours around a pixel are its own
+};
+
+// A pixel to look at.
+struct Edge {
+  int i;
+  float near, far;  // of the two surfaces that meet there
+  uint8_t kind;
+};
+
+// Edges of a part that are looked at together, in the order of rows.
 struct Group {
   Part part;
-  std::vector<int> pixels;
-  std::vector<Judgement> judged;
+  std::vector<Edge> edges;
+  Part bounds = {};             // where they lie
+  Judgement *judged = nullptr;  // of each
+  Around *around = nullptr;
+};
+
+// What edges are, in sums.
+struct Found {
+  double length = 0;    // of steps, in pixels
+  double lost = 0;      // pixels that the map shows as near, less what it has of the near surface
+  int64_t middles = 0;  // pixels in the middle half of a step
 };
 
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width) {}
+      : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
 
   void run() {
     parallel(height_, [&](int y) {
@@ -161,44 +270,49 @@ class Repair {
     allocate();
     const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
     const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
-    std::vector<Group> sampled = blocks(every);
-    spares ? find_around(sampled) : find();
-    list(sampled, [](int) { return true; });
+    const auto is_sampled = [&](int y, int x) { return (y + 3 * x) % every == 0; };
+    std::vector<Group> groups, sampled;
+    if (spares) {
+      sampled = find_in(squares(SAMPLE_BLOCK, is_sampled), REACH, false);
+    } else {
+      sampled = groups = find_in(tiles(), 0, false);
+    }
+    list(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_ / SAMPLE_BLOCK, edge.i % width_ / SAMPLE_BLOCK); });
     judge(sampled);
     decide(sampled);
     calibrate(sampled);
     const bool is_soft = ramps_of(sampled) > SOFT;
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return;
-    if (spares) find();
-    std::vector<Group> groups = tiles();
-    list(groups, [&](int i) { return !map_.automatic || (marks_[i] & RAMP ? is_soft : wrong(i) > DOUBTFUL); });
+    if (spares) groups = find_in(tiles(), 0, is_soft);
+    list(groups, [&](const Edge &edge) { return !map_.automatic || (marks_[edge.i] & RAMP ? is_soft : wrong(edge) > DOUBTFUL); });
     judge(groups);
     decide(groups);
     const float sigma = blur();
     const float lost_px = choose(groups);
-    unmix(groups, sigma, lost_px);
-    move(groups);
+    move(groups, sigma, lost_px);
     if (is_soft) lift_lamps(sigma, lost_px);
   }
 
  private:
   template <typename Body>
   void parallel(int count, const Body &body) const {
-    torchdof::parallel(map_.threads, count, map_.cancelled, [&](int i, int) { body(i); });
+    torchdof::parallel(map_.threads, count, map_.cancelled, [&](int i, int worker) {
+      Scratch::mine = &scratch_[worker];
+      body(i);
+    });
   }
 
   float step(size_t i) const { return map_.steps ? map_.steps[i] : map_.step; }
-  bool is_near(size_t i) const { return 2.0f * map_.nearness[i] > near_[i] + far_[i]; }
-  float wrong(size_t i) const { return is_near(i) ? 1.0f - shares_[kind_[i]] : shares_[kind_[i]]; }
+  float wrong(const Edge &edge) const { return marks_[edge.i] & GIVEN_NEAR ? 1.0f - shares_[edge.kind] : shares_[edge.kind]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
-  static float colour(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
+  static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Share of ramps among a sample's pixels.
   double ramps_of(const std::vector<Group> &sampled) const {
     double ramps = 0, all = 0;
     for (const Group &group : sampled) {
-      all += (double)group.pixels.size();
-      for (const int i : group.pixels) ramps += marks_[i] & RAMP ? 1 : 0;
+      all += (double)group.edges.size();
+      for (const Edge &edge : group.edges) ramps += marks_[edge.i] & RAMP ? 1 : 0;
     }
     return ramps / std::max(all, 1.0);
   }
@@ -207,9 +321,9 @@ class Repair {
   bool is_inexact(const std::vector<Group> &sampled) const {
     double found = 0, steps = 0;
     for (const Group &group : sampled)
-      for (const int i : group.pixels)
-        if (!(marks_[i] & RAMP)) {
-          found += wrong(i);
+      for (const Edge &edge : group.edges)
+        if (!(marks_[edge.i] & RAMP)) {
+          found += wrong(edge);
           steps++;
         }
     return found > EXACT * steps;
@@ -221,43 +335,67 @@ class Repair {
     std::vector<Group> found;
     for (int y = 0; y * side < height_; y++)
       for (int x = 0; x * side < width_; x++)
-        if (wanted(y, x)) found.push_back({{y * side, x * side, std::min(side, height_ - y * side), std::min(side, width_ - x * side)}, {}, {}});
+        if (wanted(y, x)) found.push_back({{y * side, x * side, std::min(side, height_ - y * side), std::min(side, width_ - x * side)}, {}});
     return found;
   }
   std::vector<Group> tiles() const {
     return squares(AREA, [](int, int) { return true; });
   }
-  std::vector<Group> blocks(int every) const {
-    return squares(SAMPLE_BLOCK, [&](int y, int x) { return (y + 3 * x) % every == 0; });
-  }
 
-  // The pixels of groups that are edges and chosen.
+  // Marks chosen edges, and forgets the others.
   template <typename Chosen>
   void list(std::vector<Group> &groups, const Chosen &chosen) {
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
-      for (int y = group.part.y0; y < group.part.bottom(); y++)
-        for (int i = y * width_ + group.part.x0, end = i + group.part.width; i < end; i++) {
-          if (uint64_t eight; i + 8 <= end && (memcpy(&eight, &marks_[i], 8), eight == 0)) {
-            i += 7;
-            continue;
-          }
-          if (!(marks_[i] & EDGE)) continue;
-          const bool is_listed = chosen(i);
-          marks_[i] = (uint8_t)((marks_[i] & ~LISTED) | (is_listed ? LISTED : 0));
-          if (is_listed) group.pixels.push_back(i);
-        }
-      group.judged.resize(group.pixels.size());
+      size_t kept = 0;
+      for (const Edge &edge : group.edges) {
+        const bool is_listed = chosen(edge);
+        marks_[edge.i] = (uint8_t)((marks_[edge.i] & ~LISTED) | (is_listed ? LISTED : 0));
+        if (is_listed) group.edges[kept++] = edge;
+      }
+      group.edges.resize(kept);
+      group.bounds = bounds(group, [](size_t) { return true; });
     });
+    size_t count = 0;
+    for (const Group &group : groups) count += group.edges.size();
+    judged_ = Buffer<Judgement>(count);
+    around_ = Buffer<Around>(count);
+    count = 0;
+    for (Group &group : groups) {
+      group.judged = judged_.data() + count;
+      group.around = around_.data() + count;
+      count += group.edges.size();
+    }
+  }
+
+  // Calls body(k, edge, y, x) for each of a group.
+  template <typename Body>
+  void each_edge(const Group &group, const Body &body) const {
+    int y = group.part.y0, row = y * width_;
+    for (size_t k = 0; k < group.edges.size(); k++) {
+      for (; group.edges[k].i >= row + width_; row += width_) y++;
+      body(k, group.edges[k], y, group.edges[k].i - row);
+    }
+  }
+
+  // Where those of a group's edges lie that are chosen.
+  template <typename Chosen>
+  Part bounds(const Group &group, const Chosen &chosen) const {
+    int top = height_, left = width_, bottom = 0, right = 0;
+    each_edge(group, [&](size_t k, const Edge &, int y, int x) {
+      if (!chosen(k)) return;
+      top = std::min(top, y);
+      left = std::min(left, x);
+      bottom = y + 1;
+      right = std::max(right, x + 1);
+    });
+    return {top, left, bottom - top, right - left};
   }
 
   void allocate() {
-    near_ = Buffer<float>(area_);
-    far_ = Buffer<float>(area_);
-    witness_ = Buffer<float>(area_);
     score_ = Buffer<float>(area_);
+    evidence_ = Buffer<float>(area_);
     marks_ = Buffer<uint8_t>(area_);
-    kind_ = Buffer<uint8_t>(area_);
   }
 
   Part in_frame(const Part &part) const {
@@ -294,38 +432,27 @@ class Repair {
         memcpy(grid.at(y, part.x0), grid.at(nearest, part.x0), part.width * sizeof(float));
   }
 
-  // Ramps and steps, and the two surfaces that meet there.
-  void find() {
-    const std::vector<Group> all = tiles();
-    std::vector<double> length(all.size(), 0.0);
-    std::vector<int64_t> middles(all.size(), 0);
-    parallel((int)all.size(), [&](int p) { find_in(all[p].part, length[p], middles[p]); });
-    for (size_t p = 0; p < all.size(); p++) {
-      length_ += length[p];
-      middles_ += middles[p];
+  // Ramps and steps, and the two surfaces that meet there: edges of groups, and marks as far as a halo around them.
+  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps) {
+    std::vector<Found> found(groups.size());
+    parallel((int)groups.size(), [&](int g) { find_in(groups[g], in_frame(groups[g].part.grown(halo)), expects_ramps, found[g]); });
+    found_ = {};
+    for (const Found &here : found) {
+      found_.length += here.length;
+      found_.lost += here.lost;
+      found_.middles += here.middles;
     }
+    return groups;
   }
 
-  // The same, in the blocks of a sample and what is around them.
-  void find_around(const std::vector<Group> &sampled) {
-    parallel((int)sampled.size(), [&](int p) {
-      double length;
-      int64_t middles;
-      find_in(in_frame(sampled[p].part.grown(REACH)), length, middles);
-    });
-  }
-
-  void find_in(const Part &part, double &length, int64_t &middles) {
+  void find_in(Group &group, const Part &part, bool expects_ramps, Found &found) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
-      const float *nearness = map_.nearness + i;
-      float *witness = witness_.data() + i;
-      for (int x = 0; x < part.width; x++) witness[x] = std::fabs(nearness[x]) <= LARGEST ? 1.0f : 0.0f;
-      memset(marks_.data() + i, 0, part.width);
+      for (int x = 0; x < part.width; x++) marks_[i + x] = std::fabs(map_.nearness[i + x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return;
-    if (!find_in(busy, STEP_HALO, length, middles)) find_in(busy, HALO, length, middles);
+    if (expects_ramps || !find_in(group, busy, STEP_HALO, found)) find_in(group, busy, HALO, found);
   }
 
   // Where there may be edges.
@@ -372,7 +499,7 @@ class Repair {
   }
 
   // Returns whether the halo was wide enough.
-  bool find_in(const Part &inner, int halo, double &length, int64_t &middles) {
+  bool find_in(Group &group, const Part &inner, int halo, Found &found) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -399,10 +526,9 @@ class Repair {
       store(ramp.at(y, x), is_ramp ? all(1.0f) : vec{});
     });
     // ramps no farther away than this reach into the inner part
-    float any = 0;
-    for (int y = beside.y0; y < beside.bottom(); y++)
-      for (int x = beside.x0; x < beside.right(); x++) any = any < *ramp.at(y, x) ? *ramp.at(y, x) : any;
-    if (any > 0) {
+    vec any{};
+    each_vector(beside, [&](int y, int x) { any = most(any, load<vec>(ramp.at(y, x))); });
+    if (largest(any) > 0) {
       if (!is_wide) return false;
       end_ramps(up, down, slope, high, low, rows, ramp, ramps);
       each_vector(beside, [&](int y, int x) {
@@ -429,50 +555,45 @@ class Repair {
     });
     sums<2>(slope, high, rows, means, 1.0f);
 
-    float near_row[AREA + LANES], far_row[AREA + LANES], witness_row[AREA + LANES], mark_row[AREA + LANES];
+    float near_row[AREA + LANES], far_row[AREA + LANES], mark_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
       for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
         const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {};
-        vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), sure = all(SURE[RINGS + 1]), is_step = {};
+        vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
         const vec least = most(0.6f * (near + far), s);
         for (int r = RINGS - 1; r >= 0; r--) {
           const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
           const auto here = (gap > least) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
           near = here ? n : near;
           far = here ? f : far;
-          sure = here ? all(SURE[r + 1]) : sure;
-          is_step = here ? all(1.0f) : is_step;
+          unsure = here ? all((float)(RINGS - r)) : unsure;
         }
         near = is_ramp > none ? load<vec>(up.at(y, x)) : near;
         far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
         const auto is_valid = size_of(v) <= all(LARGEST);
-        const auto is_edge = (is_ramp + is_step > none) & (near - far > s) & is_valid;
+        const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
         store(near_row + k, near);
         store(far_row + k, far);
-        store(witness_row + k, is_valid & (is_ramp <= none) ? sure : none);
-        const vec mark = (is_edge ? all((float)EDGE) : none) + is_ramp * (float)RAMP + (2.0f * v > near + far ? all((float)NEAR) : none);
-        store(mark_row + k, is_edge | (is_ramp > none) ? mark : none);
+        const vec mark = (is_edge ? all((float)EDGE) : none) + (2.0f * v > near + far ? all((float)(NEAR + GIVEN_NEAR)) : none) + is_ramp * (float)RAMP;
+        store(mark_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : all((float)(RINGS + 1))));
       }
       const size_t row = (size_t)y * width_ + inner.x0;
-      memcpy(near_.data() + row, near_row, inner.width * sizeof(float));
-      memcpy(far_.data() + row, far_row, inner.width * sizeof(float));
-      memcpy(witness_.data() + row, witness_row, inner.width * sizeof(float));
       uint8_t *marks = marks_.data() + row;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)mark_row[k];
       for (int k = 0; k < inner.width; k++) {
-        if (!(marks[k] & EDGE)) continue;
         const int x = inner.x0 + k;
+        if (!(marks[k] & EDGE) || !group.part.has(y, x)) continue;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
         const bool is_ramp = marks[k] & RAMP;
         const float beside = valid(value[1] - value[0]), under = valid(value[raw.pitch] - value[0]);
-        length += std::sqrt(beside * beside + under * under) / gap;
-        middles += std::fabs(level - 0.5f) < 0.25f;
+        found.length += std::sqrt(beside * beside + under * under) / gap;
+        found.lost += (marks[k] & NEAR ? 1.0f : 0.0f) - clamp01(level);
+        found.middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
         const int direction = std::fabs(right) > std::fabs(below) ? right > 0 : 2 + (below > 0);
-        int ring = 0;
-        while (ring < RINGS - 1 && witness_row[k] > SURE[ring + 1]) ring++;
+        const int ring = RINGS - marks[k] / UNSURE;
         const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
-        kind_[row + k] = (uint8_t)(place * 4 + direction);
+        group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * 4 + direction)});
       }
     }
     return true;
@@ -509,8 +630,9 @@ class Repair {
     for (int y = inside.y0; y < inside.bottom(); y++)
       for (int x = ramps.x0; x < ramps.right(); x += LANES) {
         vec is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (-load<vec>(low.at(y, x)) < 0.3f * load<vec>(slope.at(y, x))) ? all(1.0f) : vec{};
-        for (int i = 0; i < LANES; i++)
-          if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
+        if (x < inside.x0 || x + LANES > inside.right())
+          for (int i = 0; i < LANES; i++)
+            if (x + i < inside.x0 || x + i >= inside.right()) is_ramp[i] = 0;
         store(ramp.at(y, x), is_ramp);
         if (largest(is_ramp) > 0) pieces.push_back(Piece{y, x, is_ramp, is_ramp});
       }
@@ -525,11 +647,15 @@ class Repair {
       memcpy(high.at(y, ramps.x0 - 1), up.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
       memcpy(low.at(y, ramps.x0 - 1), down.at(y, ramps.x0 - 1), (ramps.width + 2) * sizeof(float));
     }
-    for (int round = 0; round < RAMP_REACH; round++) {
+    vec changed = all(1.0f);
+    for (int round = 0; round < RAMP_REACH && largest(changed) > 0; round++) {
+      changed = vec{};
       for (Piece &b : pieces) {
+        const vec near = load<vec>(high.at(b.y, b.x)), far = load<vec>(low.at(b.y, b.x));
         const auto is_ramp = load<vec>(ramp.at(b.y, b.x)) > vec{};
-        b.near = is_ramp ? highest_beside(high.at(b.y, b.x), high.pitch) : load<vec>(high.at(b.y, b.x));
-        b.far = is_ramp ? highest_beside(low.at(b.y, b.x), low.pitch) : load<vec>(low.at(b.y, b.x));
+        b.near = is_ramp ? highest_beside(high.at(b.y, b.x), high.pitch) : near;
+        b.far = is_ramp ? highest_beside(low.at(b.y, b.x), low.pitch) : far;
+        changed = (b.near > near) | (b.far > far) ? all(1.0f) : changed;
       }
       for (const Piece &b : pieces) {
         store(high.at(b.y, b.x), b.near);
@@ -540,12 +666,9 @@ class Repair {
 
   // Which of two surfaces pixels show, by their colour.
   void judge(std::vector<Group> &groups) const {
-    std::vector<float> falloff(SIDE * ACROSS, 0.0f);
-    for (int v = -REACH; v <= REACH; v++)
-      for (int u = -REACH; u <= REACH; u++) falloff[(v + REACH) * ACROSS + u + REACH] = std::exp(-(float)(v * v + u * u) / 12.5f);
-    falloff[REACH * ACROSS + REACH] = 0.0f;  // none is its own witness
+    const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });  // none is its own witness
     parallel((int)groups.size(), [&](int g) {
-      if (groups[g].pixels.empty()) return;
+      if (groups[g].edges.empty()) return;
       switch (channels_) {
         case 1: return judge<1>(groups[g], falloff.data());
         case 3: return judge<3>(groups[g], falloff.data());
@@ -555,212 +678,141 @@ class Repair {
     });
   }
 
-  // Where a group's pixels lie.
-  template <typename Chosen>
-  Part bounds(const Group &group, const Chosen &chosen) const {
-    int top = height_, left = width_, bottom = 0, right = 0;
-    for (size_t k = 0; k < group.pixels.size(); k++)
-      if (chosen(k)) {
-        const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
-        top = std::min(top, y);
-        left = std::min(left, x);
-        bottom = std::max(bottom, y + 1);
-        right = std::max(right, x + 1);
-      }
-    return {top, left, bottom - top, right - left};
-  }
-  Part bounds(const Group &group) const {
-    return bounds(group, [](size_t) { return true; });
-  }
-
-  // Fills a grid's planes with square roots of light, and the last with the sum of their squares.
-  void take_colours(const Grid &grid) const {
-    float *to = grid.at(grid.y0, grid.x0), *squares = to + channels_ * grid.size;
-    std::fill(squares, squares + grid.size, 0.0f);
-    for (int c = 0; c < channels_; c++, to += grid.size) {
-      fetch(map_.light + c * area_, grid, to, colour);
-      for (size_t i = 0; i < grid.size; i++) squares[i] += to[i] * to[i];
-    }
-  }
-
   // C: channels, or 0 for any number.
   template <int C>
   void judge(Group &group, const float *falloff) const {
-    const int channels = C ? C : channels_;
-    const Part around = bounds(group).grown(REACH);
-    const Grid given(around), witness(around), colour(around, channels + 1);
-    take_colours(colour);
+    const int channels = C ? C : channels_, count = 4 + 2 * channels;
+    const Part around = group.bounds.grown(REACH);
+    const Grid given(around), witness(around), colour(around, channels);
+    for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
     fetch(map_.nearness, given, valid);
-    fetch(witness_.data(), witness, [](float v) { return v; });
-    std::vector<float> more(C ? 0 : 2 * channels * (LANES + 1) + channels);
-    for (size_t k = 0; k < group.pixels.size(); k++) {
-      const int i = group.pixels[k], y = i / width_, x = i % width_;
-      const float near = near_[i], far = far_[i], per_gap = 1.0f / std::max(near - far, 1e-12f);
-      const float *colour_at = colour.at(y, x), *square_at = colour_at + channels * colour.size - REACH * colour.pitch - REACH;
-      vec weights[2][SIDE * ACROSS / LANES], values[SIDE * ACROSS / LANES], apart[SIDE * ACROSS / LANES];
-      vec total[2] = {}, square[2] = {}, few[2][C ? C : 1] = {};
-      float own_few[C ? C : 1], mean_few[2][C ? C : 1];
-      float *own = C ? own_few : more.data();
-      float *means[2] = {C ? mean_few[0] : own + channels, C ? mean_few[1] : own + 2 * channels};
-      float *many = C ? nullptr : own + 3 * channels;  // sums of colours, in vectors
-      if (!C) std::fill(many, many + 2 * channels * LANES, 0.0f);
-      for (int c = 0; c < channels; c++) own[c] = colour_at[c * colour.size];
-      for (int v = 0, n = 0; v < SIDE; v++) {
-        const float *given_row = given.at(y + v - REACH, x - REACH), *witness_row = witness.at(y + v - REACH, x - REACH), *fall = falloff + v * ACROSS;
-        const size_t row = (size_t)(v - REACH) * colour.pitch;
-        for (int u = 0; u < ACROSS; u += LANES, n++) {
-          const vec value = load<vec>(given_row + u), level = (value - far) * per_gap, weight = load<vec>(fall + u) * load<vec>(witness_row + u);
-          const auto is_near = size_of(level - 1.0f) < all(0.25f), is_far = size_of(level) < all(0.25f);
-          const vec none = {}, w[2] = {is_near ? weight : none, is_far ? weight : none}, squared = load<vec>(square_at + v * colour.pitch + u);
-          vec stray = none;
-          for (int c = 0; c < channels; c++) {
-            const vec other = load<vec>(colour_at + c * colour.size + row + u - REACH), d = other - own[c];
-            stray += d * d;
-            for (int side = 0; side < 2; side++) {
-              if (C)
-                few[side][c] += w[side] * other;
-              else
-                store(many + (side * channels + c) * LANES, load<vec>(many + (side * channels + c) * LANES) + w[side] * other);
-            }
-          }
-          for (int side = 0; side < 2; side++) {
-            total[side] += w[side];
-            square[side] += w[side] * squared;
-            weights[side][n] = w[side];
-          }
-          values[n] = is_near | is_far ? value - near : none;
-          apart[n] = stray;
-        }
-      }
-      const float sums[2] = {sum(total[0]), sum(total[1])};
-      Judgement &judged = group.judged[k];
-      judged = {0.0f, 1.0f, near, far, 0.0f};
-      if (!(sums[0] > 1e-3f && sums[1] > 1e-3f)) continue;  // the neighbours tell
-      float spread = 0, contrast = 0, noise = 0, from_mean[2] = {0, 0};
-      for (int side = 0; side < 2; side++) {
-        float of_mean = 0;
+    fetch(marks_.data(), witness, [](uint8_t marks) {
+      const int unsure = marks / UNSURE;
+      return unsure == 0 ? SURE[0] : unsure == 1 ? SURE[1] : unsure == 2 ? SURE[2] : unsure == 3 ? SURE[3] : SURE[4];
+    });
+    struct Lanes {
+      vec lanes;
+    };
+    std::vector<Lanes> many(C ? 0 : count);
+    std::vector<float> numbers(C ? 0 : count + 3 + channels);
+    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+      const float near = edge.near, far = edge.far;
+      const vec most_off = all(0.25f * std::max(near - far, 1e-12f)), none = {};
+      vec few[C ? 4 + 2 * C : 1];
+      float few_sums[C ? 4 + 2 * C + 3 : 1], few_own[C ? C : 1];
+      vec *sums = C ? few : &many[0].lanes;  // of weights, of what colours are apart, and of colours: of both surfaces each
+      float *totals = C ? few_sums : numbers.data(), *own = C ? few_own : numbers.data() + count + 3;
+      for (int n = 0; n < count; n++) sums[n] = none;
+      const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH), *colour_at = colour.at(y - REACH, x - REACH);
+      for (int c = 0; c < channels; c++) own[c] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
+      vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
+      const auto look = [&](int n, const auto &take) {
+        const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
+        const vec w[2] = {size_of(off) < most_off ? weight : none, size_of(value - far) < most_off ? weight : none};
+        vec stray = none;
         for (int c = 0; c < channels; c++) {
-          const float mean = sum(C ? few[side][c] : load<vec>(many + (side * channels + c) * LANES)) / sums[side];
-          means[side][c] = mean;
-          of_mean += mean * mean;
-          from_mean[side] += (own[c] - mean) * (own[c] - mean);
+          const vec d = take(colour_at + c * colour.size, given.pitch) - own[c];
+          stray += d * d;
+          for (int side = 0; side < 2; side++) sums[4 + 2 * c + side] += w[side] * d;
         }
-        spread += 0.5f * std::max(sum(square[side]) / sums[side] - of_mean, 0.0f);
-      }
+        for (int side = 0; side < 2; side++) {
+          sums[side] += w[side];
+          sums[2 + side] += w[side] * stray;
+          weights[side][n] = w[side];
+        }
+        values[n] = off;
+        apart[n] = stray;
+      };
+      each_of_window(look);
+      sum(sums, count, totals);
+
+      Judgement &judged = group.judged[k];
+      judged = {0.0f, 1.0f, near, far};
+      score_[edge.i] = 0.0f;
+      float square = 0;
+      for (int c = 0; c < channels; c++) square += own[c] * own[c];
+      const float per_light = 1.0f / (0.0225f * square + 1e-12f), *apart_at = (const float *)apart + REACH * WHOLE + REACH;
+      for (int n = 0; n < 8; n++) group.around[k].alike[n] = 1.0f / (1.0f + apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]] * per_light);
+      if (!(totals[0] > 1e-3f && totals[1] > 1e-3f)) return;  // the neighbours tell
+      const float per_total[2] = {1.0f / totals[0], 1.0f / totals[1]};
+      float contrast = 0, noise = 0, from_mean[2] = {0, 0};
       for (int c = 0; c < channels; c++) {
-        const float both = means[0][c] + means[1][c], between = means[0][c] - means[1][c];
+        const float near_off = totals[4 + 2 * c] * per_total[0], far_off = totals[5 + 2 * c] * per_total[1], both = 2.0f * own[c] + near_off + far_off;
+        from_mean[0] += near_off * near_off;
+        from_mean[1] += far_off * far_off;
+        contrast += (near_off - far_off) * (near_off - far_off);
         noise += both * both;
-        contrast += between * between;
       }
-      spread += 2.25e-4f * noise + 1e-12f;
+      float spread = 2.25e-4f * noise + 1e-12f;
+      for (int side = 0; side < 2; side++) spread += 0.5f * std::max(totals[2 + side] * per_total[side] - from_mean[side], 0.0f);
       const float per_spread = 1.0f / (0.3f * spread);
-      vec likely[2] = {}, share[2] = {}, value[2] = {};
-      for (int n = 0; n < SIDE * ACROSS / LANES; n++) {
+      vec likely[2] = {}, parts[4] = {};
+      for (int n = 0; n < WINDOW; n++) {
         const vec t = 1.0f + apart[n] * per_spread, alike = 1.0f / (t * t);
         for (int side = 0; side < 2; side++) {
           const vec part = weights[side][n] * (alike + 1e-3f);
           likely[side] += weights[side][n] * alike;
-          share[side] += part;
-          value[side] += part * values[n];
+          parts[side] += part;
+          parts[2 + side] += part * values[n];
         }
       }
-      float likelihood[2], surface[2];
+      float of_parts[4 + 3], likelihood[4 + 3];
+      sum(parts, 4, of_parts);
+      sum(likely, 2, likelihood);
       for (int side = 0; side < 2; side++) {
         const float t = 1.0f + from_mean[side] * per_spread;
-        likelihood[side] = sum(likely[side]) / sums[side] + 0.02f / (t * t) + 1e-9f;
-        surface[side] = near + sum(value[side]) / std::max(sum(share[side]), 1e-12f);
+        likelihood[side] = likelihood[side] * per_total[side] + 0.02f / (t * t) + 1e-9f;
       }
-      const float tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
-      judged = {clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f), tells, surface[0], surface[1], 0.0f};
-    }
+      score_[edge.i] = clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f);
+      judged.tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
+      judged.near = near + of_parts[2] / std::max(of_parts[0], 1e-12f);
+      judged.far = near + of_parts[3] / std::max(of_parts[1], 1e-12f);
+    });
   }
 
   // Neighbours of like colour decide together.
-  void decide(std::vector<Group> &groups) {
+  void decide(const std::vector<Group> &groups) const {
     parallel((int)groups.size(), [&](int g) {
-      for (size_t k = 0; k < groups[g].pixels.size(); k++) score_[groups[g].pixels[k]] = groups[g].judged[k].score;
-    });
-    parallel((int)groups.size(), [&](int g) {
-      if (!groups[g].pixels.empty()) decide(groups[g]);
-    });
-    parallel((int)groups.size(), [&](int g) {
-      for (size_t k = 0; k < groups[g].pixels.size(); k++) score_[groups[g].pixels[k]] = groups[g].judged[k].evidence;
-    });
-    // from the ends of a wide ramp only one of the surfaces is in sight
-    parallel((int)groups.size(), [&](int g) {
-      Group &group = groups[g];
-      if (group.pixels.empty()) return;
-      const Part part = bounds(group);
-      const Part around = part.grown(3);
-      const Grid said(around), highest_said(part), rows(around);
-      take_listed(said, nullptr);
-      highest<3>(said, highest_said, rows, part);
-      for (size_t k = 0; k < group.pixels.size(); k++) {
-        const int i = group.pixels[k];
-        group.judged[k].evidence = *highest_said.at(i / width_, i % width_);
-      }
-    });
-  }
-
-  // What listed pixels said, 0 elsewhere; and 1 at them, 0 elsewhere.
-  void take_listed(const Grid &said, const Grid *is_listed) const {
-    const int first = std::max(0, -said.x0), last = std::min(said.width, width_ - said.x0);
-    said.clear();
-    if (is_listed) is_listed->clear();
-    for (int y = said.y0; y < said.bottom(); y++) {
-      const ptrdiff_t from = (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + said.x0;
-      for (int x = first; x < last; x++)
-        if (marks_[from + x] & LISTED) {
-          said.at(y, said.x0)[x] = score_[from + x];
-          if (is_listed) is_listed->at(y, said.x0)[x] = 1.0f;
-        }
-    }
-    go_on(said, said);
-    if (is_listed) go_on(*is_listed, *is_listed);
-  }
-
-  void decide(Group &group) const {
-    const Part part = bounds(group), around = part.grown(1);
-    const Grid said(around), is_listed(around), score(part), evidence(part), colour(around, channels_ + 1);
-    take_colours(colour);
-    take_listed(said, &is_listed);
-    each_vector(part, [&](int y, int x) {
-      if (!(sum(load<vec>(is_listed.at(y, x))) > 0)) return;
-      const float *own = colour.at(y, x);
-      const vec per_light = 1.0f / (0.0225f * load<vec>(own + channels_ * colour.size) + 1e-12f);
-      vec total{}, all_said{}, strongest{};
-      for (int v = -1; v <= 1; v++)
-        for (int u = -1; u <= 1; u++) {
-          const int off = v * colour.pitch + u;
-          vec apart{};
-          for (int c = 0; c < channels_; c++) {
-            const vec d = load<vec>(own + c * colour.size + off) - load<vec>(own + c * colour.size);
-            apart += d * d;
-          }
-          const vec alike = load<vec>(is_listed.at(y + v, x + u)) / (1.0f + apart * per_light), s = load<vec>(said.at(y + v, x + u));
+      const Group &group = groups[g];
+      if (group.edges.empty()) return;
+      const Grid said(group.bounds.grown(1));
+      take_listed(score_.data(), said, UNSAID);
+      each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+        const float *own = said.at(y, x), *around = group.around[k].alike;
+        float total = 1.0f, score = *own, strongest = std::fabs(*own);
+        for (int n = 0; n < 8; n++) {
+          const float other = own[NEIGHBOURS[n][0] * said.pitch + NEIGHBOURS[n][1]], alike = other < UNSAID ? around[n] : 0.0f;
           total += alike;
-          all_said += alike * s;
-          strongest = most(strongest, size_of(s));
+          score += alike * other;
+          strongest = std::max(strongest, other < UNSAID ? std::fabs(other) : 0.0f);
         }
-      store(score.at(y, x), all_said / most(total, all(1e-12f)));
-      store(evidence.at(y, x), strongest);
+        const float tells = group.judged[k].tells;
+        group.judged[k].score = clamp(SHARPNESS * tells * (score / total), -6.0f, 6.0f);
+        evidence_[edge.i] = clamp01(2.0f * tells * strongest - 1.0f);
+      });
     });
-    for (size_t k = 0; k < group.pixels.size(); k++) {
-      const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
-      Judgement &judged = group.judged[k];
-      judged.score = clamp(SHARPNESS * judged.tells * *score.at(y, x), -6.0f, 6.0f);
-      judged.evidence = clamp01(2.0f * judged.tells * *evidence.at(y, x) - 1.0f);
+  }
+
+  // Values of listed pixels of a plane; another one elsewhere.
+  void take_listed(const float *plane, const Grid &grid, float elsewhere) const {
+    const Part inside = in_frame(grid);
+    for (int y = inside.y0; y < inside.bottom(); y++) {
+      float *row = grid.at(y, 0);
+      const float *from = plane + (size_t)y * width_;
+      const uint8_t *marks = marks_.data() + (size_t)y * width_;
+      for (int x = inside.x0; x < inside.right(); x++) row[x] = marks[x] & LISTED ? from[x] : elsewhere;
     }
+    go_on(grid, grid);
   }
 
   // Whether what colours say agrees with the map where that is hardly in doubt.
   bool is_related(const std::vector<Group> &groups) const {
     double total = 0, agreed = 0;
     for (const Group &group : groups)
-      for (size_t k = 0; k < group.pixels.size(); k++) {
-        const int i = group.pixels[k];
-        const float score = group.judged[k].score, level = (map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f);
-        if (marks_[i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : kind_[i] / 4 % RINGS != RINGS - 1) continue;
+      for (size_t k = 0; k < group.edges.size(); k++) {
+        const Edge &edge = group.edges[k];
+        const float score = group.judged[k].score, level = (map_.nearness[edge.i] - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : edge.kind / 4 % RINGS != RINGS - 1) continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         total += weight;
         if ((score > 0) == (level > 0.5f)) agreed += weight;
@@ -797,9 +849,9 @@ class Repair {
     };
     std::vector<Witness> witnesses;
     for (const Group &group : groups)
-      for (size_t k = 0; k < group.pixels.size(); k++) {
+      for (size_t k = 0; k < group.edges.size(); k++) {
         const float score = group.judged[k].score, weight = std::min(0.5f * std::fabs(score), 1.0f);
-        const int kind = kind_[group.pixels[k]] / together;
+        const int kind = group.edges[k].kind / together;
         total[kind] += weight;
         if (weight > 0) witnesses.push_back({kind, weight, std::exp(-score)});
       }
@@ -815,44 +867,51 @@ class Repair {
   }
 
   // Standard deviation of the blur that made ramps of steps.
-  float blur() const { return clamp((float)(middles_ / (MIDDLE_HALF * std::max(length_, 1e-12))), 0.2f, 3.0f); }
+  float blur() const { return clamp((float)(found_.middles / (MIDDLE_HALF * std::max(found_.length, 1e-12))), 0.2f, 3.0f); }
 
   // Marks the pixels that show the near surface; returns how many pixels of it at each edge the map has as far ones.
-  float choose(std::vector<Group> &groups) {
+  float choose(const std::vector<Group> &groups) {
     const float lean = map_.automatic ? LEAN : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
-    std::vector<double> lost(groups.size(), 0.0);
+    std::vector<int64_t> lost(groups.size(), 0);
     parallel((int)groups.size(), [&](int g) {
-      for (size_t k = 0; k < groups[g].pixels.size(); k++) {
-        const int i = groups[g].pixels[k];
-        const float score = groups[g].judged[k].score;
-        const bool shows_near = score + prior[kind_[i]] > -lean * clamp01(std::fabs(score) - 1.0f);
-        marks_[i] = (uint8_t)((marks_[i] & ~NEAR) | (shows_near ? NEAR : 0));
+      const Group &group = groups[g];
+      uint8_t *marks = marks_.data();
+      for (size_t k = 0; k < group.edges.size(); k++) {
+        const float score = group.judged[k].score;
+        const int i = group.edges[k].i, shows_near = score + prior[group.edges[k].kind] > -lean * clamp01(std::fabs(score) - 1.0f);
+        lost[g] += shows_near - (marks[i] & NEAR) / NEAR;
+        marks[i] = (uint8_t)((marks[i] & ~NEAR) | shows_near * NEAR);
       }
-      const Part &part = groups[g].part;
-      for (int y = part.y0; y < part.bottom(); y++)
-        for (int i = y * width_ + part.x0, end = i + part.width; i < end; i++)
-          if (marks_[i] & EDGE)
-            lost[g] += (marks_[i] & NEAR ? 1.0f : 0.0f) - clamp01((map_.nearness[i] - far_[i]) / std::max(near_[i] - far_[i], 1e-12f));
     });
-    double total = 0;
-    for (const double here : lost) total += here;
-    return (float)(total / std::max(length_, 1e-12));
+    double total = found_.lost;
+    for (const int64_t here : lost) total += (double)here;
+    return (float)(total / std::max(found_.length, 1e-12));
   }
 
   // How far thin structures can have lost nearness, 0 to 1: none where the map's surfaces are too large.
   static float is_lost(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
 
-  void move(const std::vector<Group> &groups) const {
+  // Gives pixels the depth of the surface that they show; on ramps as far as there is evidence.
+  void move(const std::vector<Group> &groups, float sigma, float lost_px) const {
+    const std::vector<float> weights = even_window();
     parallel((int)groups.size(), [&](int g) {
-      for (size_t k = 0; k < groups[g].pixels.size(); k++) {
-        const int i = groups[g].pixels[k];
-        const Judgement &judged = groups[g].judged[k];
-        const bool shows_near = marks_[i] & NEAR;
-        const float moved = marks_[i] & RAMP ? judged.evidence : (float)(shows_near != is_near(i));
-        if (moved > 0) map_.out[i] += moved * ((shows_near ? judged.near : judged.far) - map_.out[i]);
-      }
+      const Group &group = groups[g];
+      if (group.edges.empty()) return;
+      unmix(group, weights.data(), sigma, lost_px);
+      // from the ends of a wide ramp only one of the surfaces is in sight: what is three pixels away tells
+      const Part around = group.bounds.grown(3);
+      const Grid evidence(around), strongest(group.bounds), rows(around);
+      take_listed(evidence_.data(), evidence, 0.0f);
+      highest<3>(evidence, strongest, rows, group.bounds);
+      each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+        const uint8_t marks = marks_[edge.i];
+        const bool shows_near = marks & NEAR, given_near = marks & GIVEN_NEAR;
+        const float moved = marks & RAMP ? *strongest.at(y, x) : (float)(shows_near != given_near);
+        const float out = map_.out[edge.i], to = shows_near ? group.judged[k].near : group.judged[k].far;
+        map_.out[edge.i] = moved > 0 ? out + moved * (to - out) : out;
+      });
     });
   }
 
@@ -861,101 +920,97 @@ class Repair {
   };
 
   // Weights of a window, which sum to 1.
-  static std::vector<float> window() {
-    std::vector<float> weights(SIDE * ACROSS, 0.0f);
+  static std::vector<float> even_window() {
+    std::vector<float> weights = window([](float square) { return std::exp(-square / 18.0f); });
     float total = 0;
-    for (int v = -REACH; v <= REACH; v++)
-      for (int u = -REACH; u <= REACH; u++) total += weights[(v + REACH) * ACROSS + u + REACH] = std::exp(-(v * v + u * u) / 18.0f);
+    for (const float weight : weights) total += weight;
     for (float &weight : weights) weight /= total;
     return weights;
   }
 
   // Nearness around a pixel as a + b blurred, which must explain what the shape does not that is not blurred.
   static Line regress(const Grid &given, const Grid &shape, const Grid &blurred, const float *weights, int y, int x) {
-    const float own = *given.at(y, x);
-    const Grid *covers[2] = {&blurred, &shape};
-    vec mx[2] = {}, xx[2] = {}, xy[2] = {}, my{}, yy{};
-    for (int v = 0; v < SIDE; v++)
-      for (int u = 0; u < ACROSS; u += LANES) {
-        const vec weight = load<vec>(weights + v * ACROSS + u), cy = load<vec>(given.at(y + v - REACH, x + u - REACH)) - own, wy = weight * cy;
-        my += wy;
-        yy += wy * cy;
-        for (int i = 0; i < 2; i++) {
-          const vec cx = weight > vec{} ? load<vec>(covers[i]->at(y + v - REACH, x + u - REACH)) : vec{}, wx = weight * cx;
-          mx[i] += wx;
-          xx[i] += wx * cx;
-          xy[i] += wx * cy;
-        }
+    const float own = *given.at(y, x), *given_at = given.at(y - REACH, x - REACH);
+    const float *covers[2] = {blurred.at(y - REACH, x - REACH), shape.at(y - REACH, x - REACH)};
+    const int pitches[2] = {blurred.pitch, shape.pitch};
+    vec of_y[2] = {}, of_covers[2][3] = {};  // sums of y, y y; and of x, x x, x y
+    each_of_window([&](int n, const auto &take) {
+      const vec weight = load<vec>(weights + n * LANES), none = {}, cy = take(given_at, given.pitch) - own, wy = weight * cy;
+      of_y[0] += wy;
+      of_y[1] += wy * cy;
+      for (int i = 0; i < 2; i++) {
+        const vec cx = weight > none ? take(covers[i], pitches[i]) : none, wx = weight * cx;
+        of_covers[i][0] += wx;
+        of_covers[i][1] += wx * cx;
+        of_covers[i][2] += wx * cy;
       }
-    const float mean_y = sum(my), of_y = std::max(sum(yy) - mean_y * mean_y, 0.0f);
+    });
+    const float mean_y = sum(of_y[0]), yy = std::max(sum(of_y[1]) - mean_y * mean_y, 0.0f);
     float mean_x[2], of_x[2], both[2], explained[2];
     for (int i = 0; i < 2; i++) {
-      mean_x[i] = sum(mx[i]);
-      of_x[i] = std::max(sum(xx[i]) - mean_x[i] * mean_x[i], 0.0f);
-      both[i] = std::max(sum(xy[i]) - mean_x[i] * mean_y, 0.0f);
-      explained[i] = both[i] * both[i] / std::max(of_x[i] * of_y, 1e-12f);
+      mean_x[i] = sum(of_covers[i][0]);
+      of_x[i] = std::max(sum(of_covers[i][1]) - mean_x[i] * mean_x[i], 0.0f);
+      both[i] = std::max(sum(of_covers[i][2]) - mean_x[i] * mean_y, 0.0f);
+      explained[i] = both[i] * both[i] / std::max(of_x[i] * yy, 1e-12f);
     }
     const float b = both[0] / std::max(of_x[0], 1e-9f), better = clamp01((explained[0] - explained[1]) / std::max(BETTER * (1.0f - explained[1]), 1e-6f));
     return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - 0.5f) / 0.3f) * better : 0.0f};
   }
 
   // The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best.
-  void unmix(std::vector<Group> &groups, float sigma, float lost_px) const {
-    const std::vector<float> weights = window();
+  void unmix(const Group &group, const float *weights, float sigma, float lost_px) const {
     const int reach = blur_reach(sigma);
-    parallel((int)groups.size(), [&](int g) {
-      Group &group = groups[g];
-      if (group.pixels.empty()) return;
-      const std::vector<uint8_t> is_thin = thin(group);
-      const Part part = bounds(group, [&](size_t k) { return is_thin[k]; });
-      if (part.height <= 0) return;
-      const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
-      const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
-      fetch(map_.nearness, up, valid);
-      fetch(map_.nearness, given, valid);
-      for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
-      highest<SIDE_REACH>(up, high, rows, labelled);
-      highest<SIDE_REACH>(down, low, rows, labelled);
-      each_vector(labelled, [&](int y, int x) {
-        const auto is_near = 2.0f * load<vec>(up.at(y, x)) > load<vec>(high.at(y, x)) - load<vec>(low.at(y, x));
-        store(high.at(y, x), is_near ? all(1.0f) : vec{});
-      });
-      const Part inside = in_frame(labelled);
-      for (int y = inside.y0; y < inside.bottom(); y++) {
-        const uint8_t *marks = marks_.data() + (size_t)y * width_;
-        float *label = high.at(y, 0);
-        for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
-      }
-      go_on(high, labelled);
-      gaussian(high, blurred, rows, around, sigma);
-      for (size_t k = 0; k < group.pixels.size(); k++) {
-        if (!is_thin[k]) continue;
-        const int y = group.pixels[k] / width_, x = group.pixels[k] % width_;
-        Line line = regress(given, high, blurred, weights.data(), y, x);
-        line.fit *= is_lost(marks_[group.pixels[k]] & NEAR ? lost_px : -lost_px);
-        float &near = group.judged[k].near, &far = group.judged[k].far;
-        const float gap = near - far;
-        if (marks_[group.pixels[k]] & NEAR)
-          near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
-        else if (line.fit > 0)
-          far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
-      }
+    const std::vector<uint8_t> is_thin = thin(group);
+    const Part part = bounds(group, [&](size_t k) { return is_thin[k]; });
+    if (part.height <= 0 || part.width <= 0) return;
+    const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
+    const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
+    fetch(map_.nearness, up, valid);
+    fetch(map_.nearness, given, valid);
+    for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
+    highest<SIDE_REACH>(up, high, rows, labelled);
+    highest<SIDE_REACH>(down, low, rows, labelled);
+    each_vector(labelled, [&](int y, int x) {
+      const auto is_near = 2.0f * load<vec>(up.at(y, x)) > load<vec>(high.at(y, x)) - load<vec>(low.at(y, x));
+      store(high.at(y, x), is_near ? all(1.0f) : vec{});
+    });
+    const Part inside = in_frame(labelled);
+    for (int y = inside.y0; y < inside.bottom(); y++) {
+      const uint8_t *marks = marks_.data() + (size_t)y * width_;
+      float *label = high.at(y, 0);
+      for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
+    }
+    go_on(high, labelled);
+    gaussian(high, blurred, rows, around, sigma);
+    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+      if (!is_thin[k]) return;
+      Line line = regress(given, high, blurred, weights, y, x);
+      line.fit *= is_lost(marks_[edge.i] & NEAR ? lost_px : -lost_px);
+      float &near = group.judged[k].near, &far = group.judged[k].far;
+      const float gap = near - far;
+      if (marks_[edge.i] & NEAR)
+        near += line.fit * std::max(std::min(line.least + line.difference, far + MOST * gap) - near, 0.0f);
+      else if (line.fit > 0)
+        far += line.fit * std::min(std::max(line.least, std::max(near - MOST * gap, -largest_around(down, y, x))) - far, 0.0f);
     });
   }
 
   // Which of a group's pixels belong to a surface that no 5 x 5 pixels near them show whole.
   std::vector<uint8_t> thin(const Group &group) const {
-    const Part part = bounds(group), around = part.grown(4);
+    const Part around = group.bounds.grown(4);
     const int pitch = around.width;
     const size_t size = (size_t)around.height * pitch;
     std::vector<uint8_t> memory(2 * size + 4 * pitch, 3);
     uint8_t *shape = memory.data(), *rows = shape + size + 2 * pitch;  // a bit for each surface: near, far
     const Part inside = in_frame(around);
-    for (int y = inside.y0; y < inside.bottom(); y++)
+    for (int y = inside.y0; y < inside.bottom(); y++) {
+      const uint8_t *marks = marks_.data() + (size_t)y * width_;
+      uint8_t *row = shape + (y - around.y0) * pitch - around.x0;
       for (int x = inside.x0; x < inside.right(); x++) {
-        const uint8_t marks = marks_[(size_t)y * width_ + x];
-        shape[(y - around.y0) * pitch + x - around.x0] = marks & EDGE ? (marks & NEAR ? 1 : 2) : 3;
+        const uint8_t edge = marks[x] & EDGE, is_near = marks[x] & NEAR;
+        row[x] = edge ? (is_near ? 1 : 2) : 3;
       }
+    }
     for (int y = 0; y < around.height; y++)
       for (int x = 2; x < pitch - 2; x++) {
         const uint8_t *p = shape + y * pitch + x;
@@ -966,27 +1021,29 @@ class Repair {
         const uint8_t *p = rows + y * pitch + x;
         shape[y * pitch + x] = p[-2 * pitch] & p[-pitch] & p[0] & p[pitch] & p[2 * pitch];
       }
-    for (int y = 0; y < around.height; y++)  // beyond the frame there is none
-      for (int x = 0; x < pitch; x++)
-        if (y + around.y0 < 0 || y + around.y0 >= height_ || x + around.x0 < 0 || x + around.x0 >= width_) shape[y * pitch + x] = 0;
+    for (int y = around.y0; y < around.bottom(); y++) {  // beyond the frame there is none
+      uint8_t *row = shape + (y - around.y0) * pitch;
+      if (y < 0 || y >= height_) memset(row, 0, pitch);
+      memset(row, 0, inside.x0 - around.x0);
+      memset(row + inside.right() - around.x0, 0, around.right() - inside.right());
+    }
     for (int y = 2; y < around.height - 2; y++)
       for (int x = 4; x < pitch - 4; x++) {
         const uint8_t *p = shape + y * pitch + x;
         rows[y * pitch + x] = p[-2] | p[-1] | p[0] | p[1] | p[2];
       }
-    std::vector<uint8_t> found(group.pixels.size());
-    for (size_t k = 0; k < found.size(); k++) {
-      const int i = group.pixels[k];
-      const uint8_t *p = rows + (i / width_ - around.y0) * pitch + i % width_ - around.x0;
+    std::vector<uint8_t> found(group.edges.size());
+    each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+      const uint8_t *p = rows + (y - around.y0) * pitch + x - around.x0;
       const uint8_t thick = p[-2 * pitch] | p[-pitch] | p[0] | p[pitch] | p[2 * pitch];
-      found[k] = !(thick & (marks_[i] & NEAR ? 1 : 2));
-    }
+      found[k] = !(thick & (marks_[edge.i] & NEAR ? 1 : 2));
+    });
     return found;
   }
 
   // Lamps of a few pixels, whose nearness a soft map spreads around them.
   void lift_lamps(float sigma, float lost_px) const {
-    const std::vector<float> weights = window();
+    const std::vector<float> weights = even_window();
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {
@@ -999,10 +1056,9 @@ class Repair {
         low = least(low, load<vec>(near.at(y, x)));
       });
       if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * map_.step)) return;
-      const std::vector<int> lamps = lamps_of(part, near);
-      if (lamps.empty()) return;
-      const Group group{part, lamps, {}};
-      const Part around = bounds(group).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
+      const Group group{part, lamps_of(part, near)};
+      if (group.edges.empty()) return;
+      const Part around = bounds(group, [](size_t) { return true; }).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
       const Grid bright(whole), usual(whole), rows(whole), peak(covered), blurred(around), given(around);
       brightest(bright, usual, rows, covered);
       highest<2>(bright, peak, rows, covered);
@@ -1013,11 +1069,12 @@ class Repair {
       go_on(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
       fetch(map_.nearness, given, valid);
-      for (const int i : lamps) {
-        Line line = regress(given, usual, blurred, weights.data(), i / width_, i % width_);
+      each_edge(group, [&](size_t, const Edge &lamp, int y, int x) {
+        Line line = regress(given, usual, blurred, weights.data(), y, x);
         line.fit *= is_lost(lost_px);
-        map_.out[i] += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - map_.out[i], 0.0f);
-      }
+        float &out = map_.out[lamp.i];
+        out += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - out, 0.0f);
+      });
     });
   }
 
@@ -1036,13 +1093,13 @@ class Repair {
   }
 
   // The pixels of lamps in a part; up: its nearness, and that of what is REACH around.
-  std::vector<int> lamps_of(const Part &part, const Grid &up) const {
+  std::vector<Edge> lamps_of(const Part &part, const Grid &up) const {
     const Part whole = part.grown(USUAL_REACH);
     const Grid bright(whole), usual(part), rows(whole);
     brightest(bright, usual, rows, part);
     vec any{};
     each_vector(part, [&](int y, int x) { any = most(any, load<vec>(bright.at(y, x)) > 4.0f * load<vec>(usual.at(y, x)) ? all(1.0f) : vec{}); });
-    std::vector<int> found;
+    std::vector<Edge> found;
     if (!(largest(any) > 0)) return found;
     const Part &around = up;
     const Grid down(around), high(part), low(part), peak(part);
@@ -1055,7 +1112,7 @@ class Repair {
         const size_t i = (size_t)y * width_ + x;
         const float own = *bright.at(y, x);
         if (own > 4.0f * *usual.at(y, x) && own > 0.1f * *peak.at(y, x) && *high.at(y, x) + *low.at(y, x) > 0.5f * step(i) && std::fabs(map_.nearness[i]) <= LARGEST)
-          found.push_back((int)i);
+          found.push_back({(int)i, 0, 0, 0});
       }
     return found;
   }
@@ -1088,11 +1145,13 @@ class Repair {
   const torchdof_map &map_;
   const int height_, width_, channels_;
   const size_t area_;
-  Buffer<float> near_, far_, witness_, score_;
+  Buffer<float> near_, far_, witness_, score_, evidence_;
   Buffer<uint8_t> marks_, kind_;
+  Buffer<Judgement> judged_;  // of the pixels listed last
+  Buffer<Around> around_;
+  mutable std::vector<Scratch> scratch_;  // of threads
   std::vector<float> shares_;
-  double length_ = 0;  // of all steps, in pixels
-  int64_t middles_ = 0;
+  Found found_;
 };
 
 }  // namespace

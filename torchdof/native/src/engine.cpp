@@ -21,7 +21,10 @@ Job::Job(const torchdof_scene &scene)
     l.per_after = k == scene.layers - 1 ? 0.0f : (float)(1.0 / (scene.nodes[k + 1] - l.node));
     const int side = 2 * l.half + 1;
     for (int e = 0; e < colours; e++, values += side * side) l.kernels.push_back(make_kernel(values, l.half, !scene.shares));
-    if (scene.shares && l.half) l.shares = scene.shares + k;
+    if (scene.shares && l.half) {
+      l.shares = scene.shares + k;
+      l.spots = ends_dark(*l.shares, scene.distances);
+    }
     layers.push_back(std::move(l));
   }
 }

@@ -23,6 +23,7 @@ constexpr int LANES = 8;
 constexpr int LANES = 4;
 #endif
 typedef float vec __attribute__((vector_size(LANES * 4)));
+typedef int32_t ivec __attribute__((vector_size(LANES * 4)));
 
 template <typename V>
 inline V load(const float *p) {
@@ -37,6 +38,8 @@ inline void store(float *p, V v) {
 inline vec all(float v) { return v - vec{}; }
 inline vec most(vec a, vec b) { return a > b ? a : b; }
 inline vec least(vec a, vec b) { return a < b ? a : b; }
+inline ivec convert(vec v) { return __builtin_convertvector(v, ivec); }
+inline vec convert(ivec v) { return __builtin_convertvector(v, vec); }
 inline vec clamp01(vec v) { return least(most(v, vec{}), all(1.0f)); }
 inline float largest(vec v) {
   float m = v[0];
@@ -125,7 +128,7 @@ struct Kernel {
   bool symmetric = true;       // left on right
   float sum = 0;
   std::vector<float> taps;     // see convolution.cpp
-  std::vector<int> reach;      // of each input row, to the sides
+  std::vector<int> first, last;  // columns apart from where each input row has taps; none: first > last
 };
 struct Layer {
   int scale = 1, half = 0;
@@ -133,6 +136,7 @@ struct Layer {
   float before = 0, per_before = 0, at = 0, per_after = 0;  // ramps to the layer and beyond it
   bool first = false;
   const torchdof_shares *shares = nullptr;
+  bool spots = false;           // shares are 0 where their samples end, and beyond
   std::vector<Kernel> kernels;  // one, or one a colour
 };
 
@@ -178,6 +182,23 @@ inline V at_or_behind(const Layer &l, V place, bool ease) {
 template <typename V>
 inline V behind(const Layer &l, V place, bool ease) {
   return ramp((place - l.at) * l.per_after, ease);
+}
+
+constexpr float HAIR = 0.06f;  // share of a surface up to which, in a layer, it does not yet hide what is known behind it
+constexpr float GOES_ON = 0.1f;  // share of a pixel, beyond a hidden one's, from which on its farther surface goes on wholly
+// By how much the farther surface of a mixed pixel, which goes on behind the nearer one, may count more than its share; and by
+// how much it does in a layer that has so much of the nearer one at or behind it.
+template <typename V>
+inline V going_on(V share) {
+  const V zero = {}, one = zero + 1.0f;
+  V known = (share - HIDDEN_WEIGHT) * (1.0f / GOES_ON);
+  known = known > zero ? known : zero;
+  return (one - share) * (known < one ? known : one);
+}
+template <typename V>
+inline V where_it_shows(V going_on, V nearer) {
+  const V one = V{} + 1.0f, hidden = nearer * (1.0f / HAIR);
+  return going_on * (one - (hidden < one ? hidden : one));
 }
 
 struct Job {
@@ -304,8 +325,10 @@ struct LayerIndex {
 };
 
 // Parts of blocks of pixels that lie between two nodes, row by row of blocks: start[r] to start[r + 1] are those of row r.
-// values: weight and light; and these times how far between the nodes each pixel lies.
+// values: weight and light; and these times how far between the nodes each pixel lies. With the bit ROOM_ONLY a node is that
+// of weight which is room alone.
 struct Pieces {
+  static constexpr uint16_t ROOM_ONLY = 0x8000;
   std::vector<int> start, column;
   std::vector<uint16_t> node;
   std::vector<float> values;
@@ -360,6 +383,7 @@ class Turned {
       const float *p = of[k]->boxes + 3 * low, weight = both_ ? k ? part : 1.0f - part : 1.0f;
       for (int i = 0; i < 3; i++) box[i] += weight * (p[i] + near * (p[3 + i] - p[i]));
     }
+    middle_ = box[0], length_ = box[1], width_ = box[2];
     for (int k = 0; k <= both_; k++) {
       Samples &s = samples_[k];
       const int rows = of[k]->rows, count = rows * of[k]->columns;
@@ -379,9 +403,29 @@ class Turned {
     const float first = samples_[0].at(u, v);
     return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, v) : first;
   }
+  // The same at dy, dy - 1 and so on of one radius.
+  vec shares(float dy, float dx) const {
+    const float across = dx * squeeze_;
+    vec step;
+    for (int i = 0; i < LANES; i++) step[i] = dy - i;
+    const vec u = step * down_ + across * right_, v = across * down_ - step * right_;
+    return samples_[0].at(u, most(v, -v));
+  }
+  // From where to where in a column there are samples.
+  void rows_of(float dx, float &low, float &high) const {
+    const float across = dx * squeeze_;
+    low = -FAR, high = FAR;
+    auto within = [&](float per_row, float from, float to) {
+      if (std::fabs(per_row) < ASIDE) return;
+      low = std::max(low, std::min(from / per_row, to / per_row));
+      high = std::min(high, std::max(from / per_row, to / per_row));
+    };
+    within(down_, middle_ - length_ - across * right_, middle_ + length_ - across * right_);
+    within(right_, across * down_ - width_, across * down_ + width_);
+  }
 
  private:
-  static constexpr float ASIDE = 1e-6f;
+  static constexpr float ASIDE = 1e-6f, FAR = 1e6f;
   struct Samples {
     const float *values, *next;  // of the distance before the place and of the one after it
     int columns;
@@ -399,16 +443,36 @@ class Turned {
       }
       return clamp01(mean[0] + near * (mean[1] - mean[0]));
     }
+    vec at(vec u, vec v) const {
+      const vec row = least(most(u * per_u + first_u, vec{}), all(last_row)), column = least(most(v * per_v, vec{}), all(last_column));
+      const ivec i = convert(least(row, all(last_row - 1.0f))), j = convert(least(column, all(last_column - 1.0f)));
+      const vec down = row - convert(i), right = column - convert(j);
+      const ivec first = i * columns + j;
+      vec mean[2];
+      for (int k = 0; k < 2; k++) {
+        const float *p = k ? next : values;
+        vec corner[4];
+        for (int lane = 0; lane < LANES; lane++) {
+          const float *from = p + first[lane];
+          corner[0][lane] = from[0], corner[1][lane] = from[1], corner[2][lane] = from[columns], corner[3][lane] = from[columns + 1];
+        }
+        const vec upper = corner[0] + right * (corner[1] - corner[0]), lower = corner[2] + right * (corner[3] - corner[2]);
+        mean[k] = upper + down * (lower - upper);
+      }
+      return clamp01(mean[0] + near * (mean[1] - mean[0]));
+    }
   };
   Samples samples_[2];
-  float squeeze_, part_, down_, right_;
+  float squeeze_, part_, down_, right_, middle_, length_, width_;
   bool both_;
 };
 inline float per_half_diagonal(const torchdof_scene &scene) {
   return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);
 }
-// A kernel, made not one-sided, with what does not pass left out and its light made whole again.
-void cut_kernel(const Kernel &whole, const Turned &turned, Kernel &cut);
+// Whether shares are 0 at the borders of their samples.
+bool ends_dark(const torchdof_shares &shares, int distances);
+// A kernel of a layer, made not one-sided, with what does not pass left out and its light made whole again.
+void cut_kernel(const Layer &layer, int colour, const Turned &turned, Kernel &cut);
 // Columns from which a strip at column x is spread, counted from its input's first: a bit for each 16 of them.
 inline uint32_t strip_inputs(int x, int half) {
   uint32_t columns = 0;
