@@ -39,7 +39,7 @@ _SMALLEST_WINDOW = 15
 _AS_GOOD = 2e-3
 _GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
 _FINE = 0.5  # share of fine noise from which on its level can be judged
-_EXACT_PX = 2.0  # radius of a blur below which kernels made of pixels are themselves a little off at a dot's edge
+_EXACT_PX = 4.0  # radius of a dot, and of its blur, below which pixels leave what looks like a tone curve
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
 
@@ -171,7 +171,7 @@ def fit_pair(
     # what demosaicing leaves at an edge is louder than what it leaves of the noise
     if edge is not None and linear and pair.fine_share > _FINE:
         linear = check_noise(pair, solution, edge.level, files[1])
-    if edge is not None and linear and fit.radius > _EXACT_PX:
+    if edge is not None and linear and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX:
         check_levels(pair, freest, edge.level, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])

@@ -21,7 +21,7 @@ from torchdof.validation import number
 from ..problems import DotNotFoundError, FitError, ManifestError
 from ..result import Array
 from .crop import Capture
-from .manifest import Captures, inside
+from .manifest import Captures, Colours, inside
 from .target import DOT_MM, SQUARE_MM, Target, find_target
 from .tone import WINDOW, Tone, tone_curve, untoned
 
@@ -71,18 +71,24 @@ class Photographs:
 
 
 def read_photographs(
-    folder: str | os.PathLike[str], *, square_mm: float = SQUARE_MM, root: str | os.PathLike[str] | None = None
+    folder: str | os.PathLike[str],
+    *,
+    square_mm: float = SQUARE_MM,
+    colours: Colours = "mean",
+    root: str | os.PathLike[str] | None = None,
 ) -> Photographs:
     """Read a folder of photographs of the target, without any description.
 
     Args:
         folder: with the photographs; other files are left alone.
         square_mm: side of the black square as printed, mm.
+        colours: "mean", or "each" for a kernel a colour in the table.
         root: folder that every photograph must lie in, links followed, for a service that reads folders of strangers.
             None reads wherever links lead.
 
     Raises:
-        FitError: fewer than two photographs show the target, no EXIF tells the lens, or one lies outside of the root.
+        FitError: fewer than two photographs show the target, no EXIF tells the lens, one lies outside of the root, or
+            one has no three colours where each is asked for.
         ValueError: the square's side is none.
         OSError: a picture is damaged.
     """
@@ -103,6 +109,8 @@ def read_photographs(
     pictures, advice, facts, width, integers = [], [], dict[str, float](), 0, True
     for path in files:
         picture = read_image(path)
+        if colours == "each" and len(picture.channels) < 3:
+            raise FitError("colours = 'each' needs pictures of three colours", file=str(path))
         light = picture.pixels[0, : 3 if len(picture.channels) >= 3 else 1].mean(0).double().numpy()
         try:
             target = find_target(light, file=str(path))
@@ -153,7 +161,7 @@ def read_photographs(
     if not moved:
         raise FitError("all photographs were taken at one distance: step back, without refocusing", file=str(folder))
     captures = Captures(
-        pairs=tuple(_pair(sharp, p, str(Path(folder)), taken, tone) for p in moved),
+        pairs=tuple(_pair(sharp, p, str(Path(folder)), taken, tone, colours) for p in moved),
         focus_m=focus_m,
         width_px=width,
         focal_length_mm=facts["focal_length_mm"],
@@ -172,14 +180,18 @@ def read_photographs(
 
 
 def _pair(
-    sharp: Photograph, blurred: Photograph, folder: str, taken: Mapping[str, Array], tone: Tone | None
+    sharp: Photograph, blurred: Photograph, folder: str, taken: Mapping[str, Array], tone: Tone | None, colours: Colours
 ) -> Capture:
     """The windows of the dot in two photographs; and, of what was `taken`, with the tone curve a standard error off."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
 
     def cut(light: Array, target: Target) -> Array:
         x, y = round(target.x), round(target.y)
-        return light[y - half : y + half + 1, x - half : x + half + 1]
+        return light[..., y - half : y + half + 1, x - half : x + half + 1]
+
+    def colours_of(picture: Photograph) -> Array:
+        seen = read_image(Path(folder, picture.file)).pixels[0, :3].double().numpy()
+        return np.stack([c if tone is None else untoned(c, tone.bend) for c in cut(seen, picture.target)])
 
     still, moved = (cut(p.light, p.target) for p in (sharp, blurred))
     raw = [cut(taken[p.file], p.target) for p in (sharp, blurred)]
@@ -191,6 +203,7 @@ def _pair(
         blurred.distance_m,
         files=files,
         white=1.0 if sharp.clipped else None,
+        colours=(colours_of(sharp), colours_of(blurred)) if colours == "each" else None,
         uncertain=tuple((untoned(raw[0], bend), untoned(raw[1], bend)) for bend in others),
     )
 

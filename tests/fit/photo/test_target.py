@@ -1,10 +1,12 @@
 """The printed target: the page, finding it on a desk, and what photographs of it tell without any description."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from torchdof.fit import fit_captures
 from torchdof.fit import problems as p
 from torchdof.fit.photo.photographs import read_photographs
 from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, write_target
@@ -69,6 +71,18 @@ def test_photographs_tell_their_distances_and_the_focus(folder):
     assert (captures.focal_length_mm, captures.f_number) == pytest.approx((5.4, 1.8))
     assert captures.sensor_width_mm == pytest.approx(36 * 5.4 / 26)
     assert any("five to nine" in sentence for sentence in found.advice)
+
+
+def test_each_colour_of_photographs_has_a_kernel_of_its_own(folder):
+    # the desk is grey: what one colour tells, all do
+    captures = read_photographs(folder[0], colours="each").captures
+    (pair,) = [c for c in captures if c.distance_m > 0.4]
+    assert pair.colours is not None and pair.colours[1].shape == (3, *pair.blurred.shape)
+    np.testing.assert_allclose(pair.colours[1].mean(0), pair.blurred, atol=1e-6)
+    with pytest.warns(p.SingleDistanceWarning):
+        found = fit_captures(replace(captures, pairs=(pair,)), "disc")
+    assert found.table.channels == 3 and [c.name for c in found.colours] == ["red", "green", "blue"]
+    assert [c.fits[0].radius for c in found.colours] == pytest.approx([found.fits[0].radius] * 3, rel=0.01)
 
 
 def test_a_target_printed_at_another_size_scales_the_distances(folder):
