@@ -35,7 +35,7 @@ _UNFOCUSED_PX = 1.0  # no camera leaves an edge softer than this in focus
 _FOCUSED_PX = 0.5  # what it leaves on average: between a perfect lens and a demosaiced picture
 _MATTERS = 0.02  # share of the kernel's size
 _MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
-_BENT, _BENT_CHI = 0.08, 30.0  # least share of a tone curve, and chi squared of two degrees of freedom
+_BENT, _BENT_CHI = 0.1, 30.0  # least share of a tone curve, and chi squared of two degrees of freedom
 _STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
 
@@ -131,10 +131,10 @@ def check_levels(pair: Forward, solution: Solution, level: float, file: str | No
     if chi_squared < _BENT_CHI or float(np.linalg.norm(bend)) < _BENT:
         return True
     text = (
-        f"what the fit leaves goes with the level, as under a tone curve (an S-curve of {100 * abs(bend[1]):.0f} % or "
-        "more, a picture style): the kernel's size may be off by 5 % and more; develop without it"
+        f"what the fit leaves goes with the level, as under a tone curve (an S-curve of {100 * abs(bend[1]):.0f} %, a "
+        "picture style): then the kernel is 5 % too small and more; develop without it. Colours that are blurred "
+        f"unlike each other leave as much (colours = 'each'), and a blur that is not of family {solution.family!r}"
     )
-    text += f". Or family {solution.family!r} is too simple" if solution.family != "radial" else ""
     warn(NotLinearWarning(text, file=file, number=float(bend[1])), stacklevel)
     return False
 

@@ -143,8 +143,8 @@ def read_photographs(
         pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
         advice.append(
             "a tone curve was found by the light of the dot and the edges of the square, and undone ("
-            f"{bend[0]:+.2f}, {bend[1]:+.2f}, {bend[2]:+.2f}); the stated errors count how exactly it is known, raw "
-            "pictures need no such guess"
+            f"{bend[0]:+.2f}, {bend[1]:+.2f}, {bend[2]:+.2f}); the stated errors count how exactly it is known, "
+            "and blurs of a few px may still be 5 % too small; raw pictures need no such guess"
         )
     sharp = max(pictures, key=lambda p: p.sharpness)
     focal_px = facts["focal_length_mm"] * width / facts["sensor_width_mm"]
