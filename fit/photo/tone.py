@@ -47,7 +47,7 @@ class Tone:
     errors: Array
 
 
-def untoned(light: Array, bend: Sequence[float]) -> Array:
+def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
     """Light with a tone curve undone.
 
     On the encoded level e, with u = 2 e - 1, undoing has the slope `exp(b1 u + b2 (u^2 - 1/3) + b3 (u^3 - 3/5 u))`, but
