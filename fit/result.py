@@ -28,7 +28,7 @@ class BlurFit:
             `fit_pair`). Floats, and for `radial` the array "values" [P]. A profile fit (`fit_profile`, model "ratio")
             has the strength "N" too.
         stderr: one standard error for each parameter, calibrated against repeated simulated captures.
-        radius: of the uniform disc with the kernel's second moment (forward model), px; NaN for a profile.
+        radius: of the uniform disc with the PSF's second moment (forward model), px; NaN for a profile.
         radius_stderr: its standard error. Unlike single parameters, which may trade with each other, it is well fixed.
         residual: norm of (data - model) over norm of (data above background): 0 is perfect, 1 explains nothing.
         noise: the noise that was expected in the data, as a share of the same norm. NaN where it is not known.

@@ -31,6 +31,8 @@ class Capture:
         exposure: of `blurred` over `sharp`, as stated, or None.
         position_px: the dot's place (x, y) in the sharp frame, from the frame's centre.
         colours: red, green and blue of `sharp` and of `blurred`, `[3, H, W]` each; None fits their mean alone.
+        uncertain: `sharp` and `blurred` again, as they would be with what was guessed about them (a tone curve) one
+            standard error off, in independent directions. Standard errors count what that does to a fit.
     """
 
     sharp: Array
@@ -41,6 +43,7 @@ class Capture:
     exposure: float | None = None
     position_px: tuple[float, float] = (0.0, 0.0)
     colours: tuple[Array, Array] | None = None
+    uncertain: tuple[tuple[Array, Array], ...] = ()
 
 
 def cut_pairs(

@@ -17,7 +17,7 @@ from ..problems import (
     warn,
 )
 from ..result import Array, BlurFit, Mask
-from .dot import noise_of
+from .dot import mixed_differences, noise_of
 from .forward import Forward, Solution, without_level
 from .noise import independent_share
 
@@ -26,6 +26,7 @@ __all__ = [
     "UNEVEN",
     "asymmetry_of",
     "check_fit",
+    "left_open",
     "noise_near",
     "signal_pixels",
     "size_of_blur",
@@ -75,7 +76,7 @@ def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
         for order in range(1, _HARMONICS + 1):
             templates += [hat * np.cos(order * angle), hat * np.sin(order * angle)]
     basis = np.stack([t.ravel()[pair.flat] for t in templates], axis=1)
-    basis = _left_open(pair, solution, basis)
+    basis = left_open(pair, solution, basis)
     left, values, _ = np.linalg.svd(basis, full_matrices=False)
     left = left[:, values > 1e-6 * values.max()]
     found, spread = unexplained(pair, solution, left)
@@ -92,14 +93,17 @@ def unexplained(pair: Forward, solution: Solution, basis: Array) -> tuple[Array,
         Their products with the residual `[n]`, what the fit could have taken up left out, and the covariance `[n, n]`
         of those products under noise alone.
     """
-    basis = _left_open(pair, solution, basis)
+    basis = left_open(pair, solution, basis)
     residual = pair.values - solution.model.ravel()[pair.flat]
-    # a smooth deviation would take the shape itself for noise: its level beside the dot and within it is enough
-    deviation = np.full(residual.shape, noise_near(pair, solution, signal_pixels(pair)))
+    # a smooth deviation would take the shape itself for noise: its level beside the dot and within it is enough. And
+    # noise is at most what is left: a JPEG has less of it in the dark than goes with that in the light
+    near = signal_pixels(pair)
+    left = float(np.sqrt(np.mean((pair.data[near] - solution.model[near]) ** 2))) if near.any() else np.inf
+    deviation = np.full(residual.shape, min(noise_near(pair, solution, near), left))
     return basis.T @ residual, basis.T @ pair.noise_times(basis, deviation, pair.noise_correlation)
 
 
-def _left_open(pair: Forward, solution: Solution, basis: Array) -> Array:
+def left_open(pair: Forward, solution: Solution, basis: Array) -> Array:
     """Patterns without what the fit could have taken up, which is not seen in its residual."""
     slopes = solution.slopes if solution.slopes is not None else np.zeros((basis.shape[0], 0))
     known, _ = np.linalg.qr(slopes[:, np.abs(slopes).max(axis=0) > 0]) if slopes.shape[1] else (slopes, None)
@@ -109,10 +113,8 @@ def _left_open(pair: Forward, solution: Solution, basis: Array) -> Array:
 def noise_near(pair: Forward, solution: Solution, near: Mask) -> float:
     """Deviation of a pixel's noise where the light is, from what varies from pixel to pixel in the residual."""
     residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
-    mixed_differences = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
     inside = near[1:-1, 1:-1]
-    seen = float(np.mean(mixed_differences[inside] ** 2)) if inside.any() else 0.0
+    seen = float(np.mean(mixed_differences(residual)[inside] ** 2)) if inside.any() else 0.0
     light = float(np.mean(np.maximum(pair.data[near] - solution.background, 0.0))) if near.any() else 0.0
     known = noise_of(pair.data) ** 2 + pair.shot_noise * light
     # what is more is not noise of the camera's kind, and need not go together in neighbours
@@ -257,7 +259,7 @@ def _check_parameters(pair: Forward, solution: Solution, file: str | None, stack
 
 
 def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
-    """The kernel's rms radius and its standard error, px; single parameters may trade with each other."""
+    """The PSF's rms radius and its standard error, px; single parameters may trade with each other."""
     if solution.family == "radial":
         return _size_of_profile(solution)
     shape = list(solution.params)
@@ -265,9 +267,7 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     varied = {n: np.full(len(shape) + 1, float(solution.params[n])) for n in shape}
     for i, n in enumerate(shape):
         varied[n][i + 1] += steps[n]
-    kernels = pair.kernels(solution.family, varied)
-    away = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
-    rms = np.sqrt((kernels * (away[:, None] ** 2 + away[None, :] ** 2)).sum((1, 2)))
+    rms = pair.rms(solution.family, varied)
     slope = np.array([(rms[i + 1] - rms[0]) / steps[n] for i, n in enumerate(shape)])
     index = [solution.names.index(n) for n in shape]
     covariance = solution.covariance[np.ix_(index, index)]

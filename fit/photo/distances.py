@@ -13,11 +13,12 @@ from torchdof.optics.psf import FAMILIES, LENGTHS
 
 from ..problems import FitWarning
 from ..result import Array, BlurFit
+from .forward import OPENINGS
 from .manifest import Capture
 from .opening import common_opening, turned
 from .pair import fit_pair
 
-__all__ = ["KNOTS", "fit_distances", "fit_one", "fit_openings"]
+__all__ = ["KNOTS", "counted", "fit_distances", "fit_one", "fit_openings"]
 
 KNOTS = 33
 """Values of a free profile, the same at all distances."""
@@ -86,6 +87,38 @@ def fit_one(
         reach=reach,
         aperture=aperture,
         files=pair.files,
+    )
+
+
+def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
+    """A fit whose standard errors also count what was guessed about its pictures."""
+    if not pair.uncertain:
+        return fit
+    family = "image" if fit.family in OPENINGS else fit.family
+    reach = float(fit.params["radius"]) if family == "radial" else None
+
+    def again(sharp: Array, blurred: Array) -> BlurFit:
+        start = None if family == "image" else fit
+        return fit_one(
+            replace(pair, sharp=sharp, blurred=blurred), focus_m, family, start, 45.0, None, reach, fit.aperture
+        )
+
+    with warnings.catch_warnings():
+        # the fit of the pictures as they are has said it
+        warnings.simplefilter("ignore", FitWarning)
+        plain = again(pair.sharp, pair.blurred)
+        others = [again(*pictures) for pictures in pair.uncertain]
+    changes = {n: np.stack([np.subtract(o.params[n], plain.params[n]) for o in others]) for n in plain.params}
+    apart = np.linalg.norm([o.radius - plain.radius for o in others])
+    along = np.stack([changes[n] if n in changes else np.zeros(len(others)) for n in fit.names])
+    return replace(
+        fit,
+        stderr={
+            n: np.hypot(e, np.linalg.norm(changes[n], axis=0)) if n in changes else e for n, e in fit.stderr.items()
+        },
+        covariance=fit.covariance
+        + (along @ along.T if family != "radial" else changes["values"].T @ changes["values"]),
+        radius_stderr=float(np.hypot(fit.radius_stderr, apart)),
     )
 
 

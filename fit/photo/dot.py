@@ -9,10 +9,11 @@ import numpy as np
 from ..problems import DotNotFoundError, SeveralDotsError, WindowError
 from ..result import Array
 
-__all__ = ["Dot", "find_dot", "find_dots", "noise_inside", "noise_of", "radial_mean"]
+__all__ = ["Dot", "find_dot", "find_dots", "mixed_differences", "noise_inside", "noise_of", "radial_mean"]
 
 _THRESHOLD = 0.15  # of the peak: low enough to keep an uneven ring in one piece
 _SMALLEST_PX = 9
+_TOGETHER = 1.9  # neighbouring second differences share pixels: their mean square is as uncertain as of so many fewer
 _OTHER_DOT = 0.08  # light of a second dot, over the first's, that is not dirt
 
 
@@ -174,27 +175,35 @@ def radial_mean(picture: Array, distance: Array) -> tuple[Array, Array]:
 
 
 def noise_inside(picture: Array, dot: Dot) -> tuple[float, int] | None:
-    """Deviation of a pixel's noise within a sharp dot, and from how many pixels; None where the dot is too small."""
+    """Deviation of a pixel's noise within a sharp dot, and how certain it is; None where the dot is too small.
+
+    The latter as one over the square of its relative standard error.
+    """
     rows, columns = np.indices(picture.shape)
     inside = np.hypot(columns - dot.x, rows - dot.y) < dot.radius - 4
     if inside.sum() < 25:
         return None
-    across = picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]
-    return float(np.sqrt(np.mean(across[inside[:, 1:-1]] ** 2) / 6)), int(inside.sum())
+    # as `noise_of` measures it, which sees another share of noise that goes together in neighbours than one axis does
+    found = float(np.sqrt(np.mean(mixed_differences(picture)[inside[1:-1, 1:-1]] ** 2)))
+    return found, int(inside.sum() / _TOGETHER)
 
 
 def noise_of(picture: Array) -> float:
     """Standard deviation of a pixel's noise, from second differences that a smooth picture does not have."""
-    rows = picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]
-    mixed_differences = rows[2:] - 2 * rows[1:-1] + rows[:-2]
+    differences = mixed_differences(picture)
     # the border is where a dot's own edges are not
     frame = max(3, min(picture.shape) // 5)
-    edge = np.ones(mixed_differences.shape, dtype=bool)
+    edge = np.ones(differences.shape, dtype=bool)
     edge[frame:-frame, frame:-frame] = False
-    sizes = np.abs(mixed_differences[edge])
-    middle = float(np.median(sizes))
-    if middle > 1e-9 * float(np.abs(picture).max()):
-        return 1.4826 * middle / 6.0
-    # most pixels are interpolated (a colour of a mosaic): those that are not carry the noise
-    kept = sizes[sizes <= 5 * np.percentile(sizes, 90)]
-    return float(np.sqrt(np.mean(kept**2))) / 6.0
+    sizes = np.abs(differences[edge])
+    # pixels of a mosaic have unlike noise: its mean square counts, not its median. Where most are interpolated (one
+    # colour of a mosaic), those that are not carry it
+    usual = 1.4826 * float(np.median(sizes))
+    usual = usual if usual > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(sizes, 90))
+    return float(np.sqrt(np.mean(sizes[sizes <= 5 * usual] ** 2)))
+
+
+def mixed_differences(picture: Array) -> Array:
+    """Second differences down and across `[H - 2, W - 2]`, as large as independent noise."""
+    rows = picture[:, 2:] - 2 * picture[:, 1:-1] + picture[:, :-2]
+    return (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0

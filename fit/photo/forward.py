@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from torchdof.optics.aperture import Aperture
-from torchdof.optics.psf import FAMILIES, pixel_kernels, support
+from torchdof.optics.psf import FAMILIES, LENGTHS, pixel_kernels, support
 
 from ..result import Array, Mask
 from ..solve import best_of
@@ -33,6 +33,7 @@ SHAPES = {**FAMILIES, **OPENINGS}
 
 _LEAST, _MOST = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}
 _DRAWN_PX = 16.0
+_FEWEST, _LEAST_FINE = 300, 1e-4  # dark pixels that tell a spread; share of fine noise that there is at least
 _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
 
 
@@ -109,10 +110,11 @@ class Forward:
         beside = self.data - self.data_dot.background
         self.noise_correlation = correlation_of(beside, dark)
         self.fine_share = fine_share(self.noise_correlation)
-        if dark.any():  # a JPEG's blocks have no fine noise at all: then the paper's own spread is the measure
+        if dark.sum() >= _FEWEST:
+            # a correlation of which chance hides a part makes more of the noise fine than there is, and a mosaic's is
+            # not even alike in all pixels: the paper's own spread is the measure
             spread = 1.4826 * float(np.median(np.abs(beside[dark] - np.median(beside[dark]))))
-            fine = noise_of(self.data)
-            self.fine_share = max(self.fine_share, min((fine / spread) ** 2, 1.0)) if spread > 0 else self.fine_share
+            self.fine_share = min(max((noise_of(self.data) / spread) ** 2, _LEAST_FINE), 1.0) if spread > 0 else 1.0
         # every level near 1, so that one tolerance serves all pictures
         self.unit = max(float(np.abs(self.values - self.data_dot.background).max()), np.finfo(float).tiny)
 
@@ -154,16 +156,17 @@ class Forward:
         spread = irfft2(np.conj(source) * self._transform(full.reshape(self.data.shape)), self.grid)
         return np.asarray(np.roll(spread, (size // 2, size // 2), (0, 1))[:size, :size])
 
-    def kernels(self, family: str, params: dict[str, Array]) -> Array:
-        """Kernels `[n, k, k]` for parameters `[n]`, as wide as they need and at most as wide as the window."""
+    def kernels(self, family: str, params: dict[str, Array], widest: int | None = None) -> Array:
+        """Kernels `[n, k, k]` for parameters `[n]`: as wide as they need, at most the window or `widest` px a side."""
+        most = self.half if widest is None else widest
         tensors = {k: torch.from_numpy(np.atleast_1d(v)) for k, v in params.items()}
         if family in OPENINGS:
             radius = tensors["radius"]
-            size = 2 * min(int(np.ceil(float(radius.max()))) + 1, self.half) + 1
+            size = 2 * min(int(np.ceil(float(radius.max()))) + 1, most) + 1
             each = [self.opening_with({n: float(v[i]) for n, v in tensors.items()}) for i in range(len(radius))]
             drawn = [pixel_kernels("disc", {"radius": r}, size, None, o) for r, o in zip(radius, each, strict=True)]
             return torch.stack(drawn).numpy()
-        half = min(int(np.ceil(support(family, tensors))) + 1, self.half)
+        half = min(int(np.ceil(support(family, tensors))) + 1, most)
         return pixel_kernels(family, tensors, 2 * half + 1).numpy()
 
     def opening_with(self, params: dict[str, float]) -> Aperture:
@@ -174,11 +177,17 @@ class Forward:
         turn, curvature = params.get("rotation_deg", known.rotation_deg), params.get("curvature", known.curvature)
         return replace(known, rotation_deg=turn, curvature=curvature)
 
-    def _size_of_opening(self) -> float:
-        """Radius of the uniform disc with the opening's second moment, over the radius of the circle around it."""
-        kernel = pixel_kernels("disc", {"radius": _DRAWN_PX}, None, None, self.opening).numpy()
-        away = np.arange(kernel.shape[-1]) - kernel.shape[-1] // 2
-        return float(np.sqrt(2 * (kernel * (away[:, None] ** 2 + away**2)).sum())) / _DRAWN_PX
+    def rms(self, family: str, params: dict[str, Array]) -> Array:
+        """Rms radius of the PSFs `[n]` of parameters `[n]`, px.
+
+        They are drawn so large that their kernels' pixels, which are never negative, do not matter.
+        """
+        lengths = [np.abs(v).max() for n, v in params.items() if n in LENGTHS]
+        enlarged = max(1.0, _DRAWN_PX / max(lengths))
+        drawn = {n: enlarged * np.asarray(v) if n in LENGTHS else np.asarray(v) for n, v in params.items()}
+        kernels = self.kernels(family, drawn, int(np.ceil(enlarged * self.half)))
+        away = np.arange(kernels.shape[-1]) - kernels.shape[-1] // 2
+        return np.asarray(np.sqrt((kernels * (away[:, None] ** 2 + away**2)).sum((1, 2))) / enlarged)
 
     def solve(self, family: str, tolerance: float = 1e-7) -> Solution:
         """Fit one family from several starts (or from `start`, and from the moments beside it).
@@ -395,7 +404,8 @@ class Forward:
             if family in self.start:
                 return []
             added = (self.data_dot.radius**2 - (self.magnification * self.source.dot.radius) ** 2) / 4
-            return [{"radius": float(np.sqrt(max(4 * added, 0.6))) / self._size_of_opening()}]
+            of_one = np.sqrt(2) * float(self.rms(family, {n: np.ones(1) for n in SHAPES[family] if n == "radius"})[0])
+            return [{"radius": float(np.sqrt(max(4 * added, 0.6))) / of_one}]
         added = (self.data_dot.radius**2 - (self.magnification * self.source.dot.radius) ** 2) / 4
         s = float(np.sqrt(max(added, 0.15)))
         s = min(s, self.half / 3)

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+
+from torchdof.io.transfer import decode, encode
 
 from ..problems import NotInFocusWarning, NotLinearWarning, warn
 from ..result import Array
-from .dot import Dot, noise_inside, noise_of
+from .diagnostics import left_open, unexplained
+from .dot import Dot, mixed_differences, noise_inside, noise_of
 from .dot_model import Edge, draw_edge, soft_edge, with_softness
 from .forward import Forward, Solution
 
-__all__ = ["EXPLAINED", "SENSOR_BLUR_PX", "check_focus", "check_linearity", "check_noise", "focused"]
+__all__ = [
+    "EXPLAINED",
+    "SENSOR_BLUR_PX",
+    "check_focus",
+    "check_levels",
+    "check_linearity",
+    "check_noise",
+    "focused",
+]
 
 EXPLAINED = 1.15
 """Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
@@ -23,6 +35,7 @@ _UNFOCUSED_PX = 1.0  # no camera leaves an edge softer than this in focus
 _FOCUSED_PX = 0.5  # what it leaves on average: between a perfect lens and a demosaiced picture
 _MATTERS = 0.02  # share of the kernel's size
 _MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
+_BENT, _BENT_CHI = 0.1, 30.0  # least share of a tone curve, and chi squared of two degrees of freedom
 _STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
 
@@ -59,8 +72,8 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stackl
     return True
 
 
-def check_noise(pair: Forward, solution: Solution, level: float, file: str | None, stacklevel: int = 4) -> None:
-    """Warn where the noise is largest at middling levels: light's grows along a line, and a tone curve bends that.
+def check_noise(pair: Forward, solution: Solution, level: float, file: str | None, stacklevel: int = 4) -> bool:
+    """Whether the noise is not largest at middling levels; warns where it is, as light's grows along a straight line.
 
     Args:
         pair: the pictures.
@@ -70,14 +83,12 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
         stacklevel: where the warning points.
     """
     residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    rows = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
-    mixed_differences = (rows[2:] - 2 * rows[1:-1] + rows[:-2]) / 6.0
     share = ((np.nan_to_num(solution.model) - solution.background) / (solution.gain * level))[1:-1, 1:-1]
     middling = (share > _MIDDLING[0]) & (share < _MIDDLING[1]) & pair.used[1:-1, 1:-1]
     count = int(middling.sum())
     if count < _FEWEST:
-        return
-    found = float(np.mean(mixed_differences[middling] ** 2))
+        return True
+    found = float(np.mean(mixed_differences(residual)[middling] ** 2))
     light = solution.gain * level * float(share[middling].mean())
     expected = noise_of(pair.data) ** 2 + pair.shot_noise * light
     # second differences of neighbours go together: a third of them is independent
@@ -89,6 +100,43 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
             "without them"
         )
         warn(NotLinearWarning(text, file=file, number=float(np.sqrt(found / expected))), stacklevel)
+        return False
+    return True
+
+
+def check_levels(pair: Forward, solution: Solution, level: float, file: str | None, stacklevel: int = 4) -> bool:
+    """Whether what a fit leaves has nothing to do with the level; warns where a tone curve would explain it.
+
+    No kernel makes all places of one level brighter, and all of another darker. A tone curve does, also one so weak
+    that the residual hardly grows. What the fit's own parameters could have taken up is left out.
+
+    Args:
+        pair: the pictures.
+        solution: what was found.
+        level: of the sharp dot.
+        file: named in the warning.
+        stacklevel: where the warning points.
+    """
+    light = (solution.model.ravel()[pair.flat] - solution.background) / (solution.gain * level)
+    encoded = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None, None], "srgb", False, False)
+    step = 1e-3  # of the encoded level
+    steeper = (decode(encoded + step, "srgb", False, False) - decode(encoded - step, "srgb", False, False)) / (2 * step)
+    e, slope = encoded.flatten().numpy(), solution.gain * level * steeper.flatten().numpy()
+    # brighter all over, and an S-curve's contrast
+    curves = np.stack([slope * e * (1 - e), -slope * e * (1 - e) * (1 - 2 * e)], axis=1)
+    found, spread = unexplained(pair, solution, curves)
+    seen = left_open(pair, solution, curves)
+    bend = np.linalg.lstsq(seen.T @ seen, found, rcond=None)[0]
+    chi_squared = float(found @ np.linalg.pinv(spread) @ found)
+    if chi_squared < _BENT_CHI or float(np.linalg.norm(bend)) < _BENT:
+        return True
+    text = (
+        f"what the fit leaves goes with the level, as under a tone curve (an S-curve of {100 * abs(bend[1]):.0f} %, a "
+        "picture style): then the kernel is 5 % too small and more; develop without it. Colours that are blurred "
+        f"unlike each other leave as much (colours = 'each'), and a blur that is not of family {solution.family!r}"
+    )
+    warn(NotLinearWarning(text, file=file, number=float(bend[1])), stacklevel)
+    return False
 
 
 def focused(edge: Edge) -> Edge:

@@ -22,7 +22,7 @@ from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
 from .mosaic import PATTERNS, demosaiced
 
-__all__ = ["Capture", "Captures", "inside", "read_captures", "read_pair"]
+__all__ = ["Capture", "Captures", "Colours", "inside", "read_captures", "read_pair"]
 
 MANIFEST = "capture.toml"
 Colours = Literal["mean", "each"]

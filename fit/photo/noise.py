@@ -66,7 +66,9 @@ def correlate(pictures: Array, correlation: Array) -> Array:
 
     if np.count_nonzero(correlation) == 1:
         return pictures
-    return np.stack([convolve(p, correlation, mode="constant") for p in pictures])
+    reach = int(np.abs(np.argwhere(correlation) - correlation.shape[0] // 2).max())
+    middle = slice(correlation.shape[0] // 2 - reach, correlation.shape[0] // 2 + reach + 1)
+    return np.stack([convolve(p, correlation[middle, middle], mode="constant") for p in pictures])
 
 
 def fine_share(correlation: Array) -> float:

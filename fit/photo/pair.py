@@ -21,7 +21,7 @@ from .dot import find_dot, noise_inside
 from .dot_model import Edge, soft_edge, with_softness
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
-from .linearity import EXPLAINED, check_focus, check_linearity, check_noise, focused
+from .linearity import EXPLAINED, check_focus, check_levels, check_linearity, check_noise, focused
 from .noise import independent_share
 from .opening import hides_a_polygon, solve_image, solve_opening, solve_polygon
 from .profile_fit import fit_profile
@@ -39,6 +39,7 @@ _SMALLEST_WINDOW = 15
 _AS_GOOD = 2e-3
 _GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
 _FINE = 0.5  # share of fine noise from which on its level can be judged
+_EXACT_PX = 4.0  # radius of a dot, and of its blur, below which pixels leave what looks like a tone curve
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
 
@@ -169,7 +170,9 @@ def fit_pair(
     check_fit(pair, solution, fit, files, fit if freest is solution else describe(pair, freest, ""))
     # what demosaicing leaves at an edge is louder than what it leaves of the noise
     if edge is not None and linear and pair.fine_share > _FINE:
-        check_noise(pair, solution, edge.level, files[1])
+        linear = check_noise(pair, solution, edge.level, files[1])
+    if edge is not None and linear and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX:
+        check_levels(pair, freest, edge.level, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)

@@ -7,9 +7,11 @@ itself away (`tone`) and is undone.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from torchdof.io import foreign
 from torchdof.io.images import read_image
@@ -19,15 +21,15 @@ from torchdof.validation import number
 from ..problems import DotNotFoundError, FitError, ManifestError
 from ..result import Array
 from .crop import Capture
-from .manifest import Captures, inside
+from .manifest import Captures, Colours, inside
 from .target import DOT_MM, SQUARE_MM, Target, find_target
-from .tone import WINDOW, tone_curve, untoned
+from .tone import WINDOW, Tone, tone_curve, untoned
 
 __all__ = ["Photograph", "Photographs", "read_photographs"]
 
 _READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 _SAME_PLACE = 0.03  # as a share of the distance
-_CURVED = 0.05  # least bend of a tone curve that is worth saying
+_FEWEST = 4  # photographs from which on they tell of a tone curve
 
 
 @dataclass(frozen=True)
@@ -58,29 +60,35 @@ class Photographs:
     Attributes:
         captures: for `fit_captures`.
         pictures: every photograph with a target, by distance.
-        tone: (a, b) of the tone curve that was undone, see :func:`untoned`.
+        tone: three numbers of the tone curve that was undone, see :func:`untoned`.
         advice: what to do better, a sentence each.
     """
 
     captures: Captures
     pictures: tuple[Photograph, ...]
-    tone: tuple[float, float]
+    tone: tuple[float, float, float]
     advice: tuple[str, ...]
 
 
 def read_photographs(
-    folder: str | os.PathLike[str], *, square_mm: float = SQUARE_MM, root: str | os.PathLike[str] | None = None
+    folder: str | os.PathLike[str],
+    *,
+    square_mm: float = SQUARE_MM,
+    colours: Colours = "mean",
+    root: str | os.PathLike[str] | None = None,
 ) -> Photographs:
     """Read a folder of photographs of the target, without any description.
 
     Args:
         folder: with the photographs; other files are left alone.
         square_mm: side of the black square as printed, mm.
+        colours: "mean", or "each" for a kernel a colour in the table.
         root: folder that every photograph must lie in, links followed, for a service that reads folders of strangers.
             None reads wherever links lead.
 
     Raises:
-        FitError: fewer than two photographs show the target, no EXIF tells the lens, or one lies outside of the root.
+        FitError: fewer than two photographs show the target, no EXIF tells the lens, one lies outside of the root, or
+            one has no three colours where each is asked for.
         ValueError: the square's side is none.
         OSError: a picture is damaged.
     """
@@ -101,6 +109,8 @@ def read_photographs(
     pictures, advice, facts, width, integers = [], [], dict[str, float](), 0, True
     for path in files:
         picture = read_image(path)
+        if colours == "each" and len(picture.channels) < 3:
+            raise FitError("colours = 'each' needs pictures of three colours", file=str(path))
         light = picture.pixels[0, : 3 if len(picture.channels) >= 3 else 1].mean(0).double().numpy()
         try:
             target = find_target(light, file=str(path))
@@ -122,21 +132,20 @@ def read_photographs(
             f"EXIF does not tell {', '.join(missing)}: share the originals, or describe them in a capture.toml",
             file=str(folder),
         )
-    tone = (
-        tone_curve([(p.light, p.target) for p in pictures], square_mm)
-        if integers and len(pictures) >= 4
-        else (0.0, 0.0)
-    )
-    if max(map(abs, tone)) > _CURVED:
-        pictures = [replace(p, light=untoned(p.light, tone)) for p in pictures]
+    tone, taken = None, {p.file: p.light for p in pictures}
+    if integers and len(pictures) >= _FEWEST:
+        tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
+    elif integers:
+        advice.append(f"{len(pictures)} photographs do not tell whether they have a tone curve: take {_FEWEST} or more")
+    bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
+    if any(bend):
+        pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]
         pictures = [replace(p, target=find_target(p.light, file=p.file)) for p in pictures]
         advice.append(
-            "a tone curve was found by the light of the dot and the edges of the square, and undone (a = "
-            f"{tone[0]:+.2f}, b = {tone[1]:+.2f}); blurs of a few px may still be 5 % off, raw pictures need no such "
-            "guess"
+            "a tone curve was found by the light of the dot and the edges of the square, and undone ("
+            f"{bend[0]:+.2f}, {bend[1]:+.2f}, {bend[2]:+.2f}); the stated errors count how exactly it is known, "
+            "and blurs of a few px may still be 5 % too small; raw pictures need no such guess"
         )
-    else:
-        tone = (0.0, 0.0)
     sharp = max(pictures, key=lambda p: p.sharpness)
     focal_px = facts["focal_length_mm"] * width / facts["sensor_width_mm"]
     image_px, focus_m = focal_px, 1.0
@@ -152,7 +161,7 @@ def read_photographs(
     if not moved:
         raise FitError("all photographs were taken at one distance: step back, without refocusing", file=str(folder))
     captures = Captures(
-        pairs=tuple(_pair(sharp, p, str(Path(folder))) for p in moved),
+        pairs=tuple(_pair(sharp, p, str(Path(folder)), taken, tone, colours) for p in moved),
         focus_m=focus_m,
         width_px=width,
         focal_length_mm=facts["focal_length_mm"],
@@ -163,21 +172,40 @@ def read_photographs(
             "target_square_mm": square_mm,
             "pictures": [p.file for p in pictures],
             "sharp": sharp.file,
-            "tone_curve": list(tone),
+            "tone_curve": list(bend),
             "from_exif": ["focal_length_mm", "f_number", "sensor_width_mm"],
         },
     )
-    return Photographs(captures, tuple(pictures), tone, tuple(advice))
+    return Photographs(captures, tuple(pictures), bend, tuple(advice))
 
 
-def _pair(sharp: Photograph, blurred: Photograph, folder: str) -> Capture:
+def _pair(
+    sharp: Photograph, blurred: Photograph, folder: str, taken: Mapping[str, Array], tone: Tone | None, colours: Colours
+) -> Capture:
+    """The windows of the dot in two photographs; and, of what was `taken`, with the tone curve a standard error off."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
-    cut = [
-        p.light[round(t.y) - half : round(t.y) + half + 1, round(t.x) - half : round(t.x) + half + 1]
-        for p, t in ((sharp, sharp.target), (blurred, blurred.target))
-    ]
+
+    def cut(light: Array, target: Target) -> Array:
+        x, y = round(target.x), round(target.y)
+        return light[..., y - half : y + half + 1, x - half : x + half + 1]
+
+    def colours_of(picture: Photograph) -> Array:
+        seen = read_image(Path(folder, picture.file)).pixels[0, :3].double().numpy()
+        return np.stack([c if tone is None else untoned(c, tone.bend) for c in cut(seen, picture.target)])
+
+    still, moved = (cut(p.light, p.target) for p in (sharp, blurred))
+    raw = [cut(taken[p.file], p.target) for p in (sharp, blurred)]
     files = (os.path.join(folder, sharp.file), os.path.join(folder, blurred.file))
-    return Capture(cut[0], cut[1], blurred.distance_m, files=files, white=1.0 if sharp.clipped else None)
+    others = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]
+    return Capture(
+        still,
+        moved,
+        blurred.distance_m,
+        files=files,
+        white=1.0 if sharp.clipped else None,
+        colours=(colours_of(sharp), colours_of(blurred)) if colours == "each" else None,
+        uncertain=tuple((untoned(raw[0], bend), untoned(raw[1], bend)) for bend in others),
+    )
 
 
 def _sharpness(light: Array, target: Target) -> float:

@@ -19,7 +19,7 @@ from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
 from ..result import Array, BlurFit
 from .agreement import check_agreement, frame_width, promised_px
 from .colours import Colour, fit_colours
-from .distances import fit_distances, fit_one, fit_openings
+from .distances import counted, fit_distances, fit_one, fit_openings
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
 from .manifest import Capture, Captures
@@ -160,6 +160,7 @@ def fit_captures(
         ordered, opening = fit_openings(pairs, captures.focus_m, family, firsts, report)
     else:
         ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
+    ordered = [counted(pair, captures.focus_m, fit) for pair, fit in zip(pairs, ordered, strict=True)]
     radius_px = [f.radius for f in ordered]
     captures = replace(captures, width_px=frame_width(captures, radius_px))
     check_agreement(captures, radius_px)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,61 +18,81 @@ from torchdof.io.transfer import decode, encode
 from ..result import Array
 from .target import DOT_MM, Target
 
-__all__ = ["WINDOW", "tone_curve", "untoned"]
+__all__ = ["WINDOW", "Tone", "tone_curve", "untoned"]
 
 WINDOW = 0.36
 """Half the dot's window, of the square's side."""
 
-_PRINTED = 0.01  # how exactly the dot's light can be known
-_BENT = (0.15, 0.3)  # expected size of a and b
-_CERTAIN = 9.0  # drop of chi squared that calls for a tone curve
+_PRINTED = 0.005  # how exactly the dot's light can be known
+_BENT = (0.7, 0.7, 0.2)  # expected size of the three numbers of a tone curve
+_CERTAIN = 9.0  # drop of chi squared that calls for a tone curve: noise alone does as much once in thirty times
 _ASIDE, _ALONG = 0.1, 0.35  # how far an edge is looked at to either side, and along it, of the square's side
 _BIN = 0.5  # px
-_EVEN = 0.008  # how exactly an edge can be known to be even, at eight places
-_BLURRED = 1.2  # px, sigma of an edge from which on it is wide enough to look at
+_EVEN, _PLACES = 0.006, 8  # how exactly two opposite edges can be known to be even, at so many places
+_BLURRED = 2.3  # px from a tenth to nine tenths, from which on an edge is wide enough to look at
+_LEVELS = np.linspace(0.0, 1.0, 1025)
 
 
-def untoned(light: Array, tone: tuple[float, float]) -> Array:
-    """Light with a tone curve undone: on the encoded level e, `e + a e (1 - e) + b e (1 - e) (1 - 2 e)`.
+@dataclass(frozen=True)
+class Tone:
+    """A tone curve, as far as pictures tell it.
 
-    An S-curve `e - t e (1 - e) (1 - 2 e)`, which is `(1 - t) e + t e^2 (3 - 2 e)`, is undone by b near t.
+    Attributes:
+        bend: three numbers, see :func:`untoned`; zeros where noise would explain the pictures as well.
+        errors: steps of them by one standard error, in three independent directions `[3, 3]`; with what was seen and
+            not believed.
     """
-    e = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None], "srgb", False, False)
-    e = e + e * (1 - e) * (tone[0] + tone[1] * (1 - 2 * e))
-    return np.asarray(decode(e.clamp(0.0, 1.0), "srgb", False, False)[0, 0].numpy())
+
+    bend: tuple[float, float, float]
+    errors: Array
 
 
-def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> tuple[float, float]:
+def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
+    """Light with a tone curve undone.
+
+    On the encoded level e, with u = 2 e - 1, undoing has the slope `exp(b1 u + b2 (u^2 - 1/3) + b3 (u^3 - 3/5 u))`, but
+    for the factor that keeps white white: whatever the three numbers, darker stays darker. An S-curve that mixes a
+    share t of `e^2 (3 - 2 e)` in is undone by b2 near t.
+    """
+    u = 2 * _LEVELS - 1
+    slope = np.exp(bend[0] * u + bend[1] * (u**2 - 1 / 3) + bend[2] * (u**3 - 0.6 * u))
+    undone = np.concatenate([[0.0], np.cumsum(slope[1:] + slope[:-1])])
+    encoded = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None], "srgb", False, False)[0, 0].numpy()
+    level = torch.from_numpy(np.interp(encoded, _LEVELS, undone / undone[-1]))
+    return np.asarray(decode(level[None, None], "srgb", False, False)[0, 0].numpy())
+
+
+def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> Tone:
     """The tone curve under which dots and edges are what they must be; none where noise would explain them as well.
 
     Args:
         pictures: light `[H, W]`, and where the target is in it.
         square_mm: side of the square as printed.
-
-    Returns:
-        (a, b) as :func:`untoned` takes them.
     """
     from scipy.optimize import least_squares
 
     dots = [_dot(light, target, square_mm) for light, target in pictures]
-    edges = [edge for light, target in pictures for edge in _edges(light, target)]
+    edges = [pair for light, target in pictures for pair in _edges(light, target)]
 
     def misfit(values: Array) -> Array:
-        tone, found = (float(values[0]), float(values[1])), []
+        bend, found = values[:3], []
         for window, inside, around, white, area, error in dots:
-            level = untoned(window, tone)
-            black, paper = float(level[around].mean()), float(untoned(np.array([[white]]), tone)[0, 0])
+            level = untoned(window, bend)
+            black, paper = float(level[around].mean()), float(untoned(np.array([[white]]), bend)[0, 0])
             light = float((level - black)[inside].sum()) / (paper - black) / area
-            found.append((math.log(max(light, 1e-3)) - values[2]) / error)
-        uneven = [_unevenness(untoned(edge[None], tone)[0]) for edge in edges]
-        return np.concatenate([found, *uneven, values[:2] / _BENT])
+            found.append((math.log(max(light, 1e-3)) - values[3]) / error)
+        uneven = [_unevenness(*untoned(np.stack(pair), bend)) for pair in edges]
+        return np.concatenate([found, *uneven, bend / _BENT])
 
-    bounds = ([-0.8, -0.8, -1.0], [0.8, 0.8, 1.0])
-    solution = least_squares(misfit, [0.0, 0.0, 0.0], bounds=bounds, x_scale=0.1)
-    straight = least_squares(lambda v: misfit(np.array([0.0, 0.0, v[0]])), [0.0])
-    if 2 * (straight.cost - solution.cost) < _CERTAIN:
-        return 0.0, 0.0
-    return float(solution.x[0]), float(solution.x[1])
+    solution = least_squares(misfit, np.zeros(4), x_scale=0.1)
+    straight = least_squares(lambda v: misfit(np.array([0.0, 0.0, 0.0, v[0]])), [0.0])
+    # what no curve explains makes the curve less certain
+    seen = len(dots) + _PLACES * len(edges)
+    spread = np.linalg.inv(solution.jac.T @ solution.jac)[:3, :3] * max(2 * solution.cost / seen, 1.0)
+    clear = 2 * (straight.cost - solution.cost) > _CERTAIN
+    bend = solution.x[:3] if clear else np.zeros(3)
+    values, directions = np.linalg.eigh(spread + np.outer(solution.x[:3] - bend, solution.x[:3] - bend))
+    return Tone((float(bend[0]), float(bend[1]), float(bend[2])), (directions * np.sqrt(np.maximum(values, 0.0))).T)
 
 
 def _dot(light: Array, target: Target, square_mm: float) -> tuple[Array, Array, Array, float, float, float]:
@@ -87,11 +108,15 @@ def _dot(light: Array, target: Target, square_mm: float) -> tuple[Array, Array, 
     return window, inside, around, target.white, area, math.hypot(noise, _PRINTED)
 
 
-def _edges(light: Array, target: Target) -> list[Array]:
-    """Levels across each side of the square from the paper to the ink, in steps of `_BIN`; of blurred sides alone."""
+def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
+    """Levels across two opposite sides of the square, from paper to ink in steps of `_BIN`; of blurred sides alone.
+
+    Light that falls off from one side to the other bends both edges, against each other.
+    """
     reach, along = int(_ASIDE * target.side_px), int(_ALONG * target.side_px)
-    profiles = []
+    pairs = []
     for picture, x, y in ((light, target.x, target.y), (light.T, target.y, target.x)):
+        profiles = []
         for side in (-1, 1):
             left = round(x + side * target.side_px / 2) - reach
             rows = slice(round(y) - along, round(y) + along + 1)
@@ -110,22 +135,25 @@ def _edges(light: Array, target: Target) -> list[Array]:
             kept = (index >= 0) & (index < int(1.8 * reach / _BIN))
             count = np.bincount(index[kept])
             level = np.bincount(index[kept], strip[kept]) / np.maximum(count, 1)
-            fall = np.maximum(-np.diff(level), 0.0)
-            steps = _BIN * np.arange(fall.size)
-            middle = float(fall @ steps / fall.sum())
-            near = np.abs(steps - middle) < 0.6 * reach
-            if count.all() and math.sqrt(float((fall * (steps - middle) ** 2)[near].sum() / fall.sum())) > _BLURRED:
+            end = level.size // 6
+            share = (level - level[-end:].mean()) / (level[:end].mean() - level[-end:].mean())
+            if count.all() and _BIN * float(((share > 0.1) & (share < 0.9)).sum()) > _BLURRED:
                 profiles.append(level)
-    return profiles
+        if len(profiles) == 2:
+            shorter = min(profile.size for profile in profiles)
+            pairs.append((profiles[0][:shorter], profiles[1][:shorter]))
+    return pairs
 
 
-def _unevenness(level: Array) -> Array:
-    """How far both sides of an edge are from being alike, at equal distances from its middle, over the error."""
-    end = level.size // 6
-    paper, ink = float(level[:end].mean()), float(level[-end:].mean())
-    share = (level - ink) / (paper - ink)
-    middle = float(share.sum()) - 0.5  # of an even edge, in bins
-    away = np.arange(1.0, level.size // 3)
-    bins = np.arange(level.size)
-    uneven = np.interp(middle + away, bins, share) + np.interp(middle - away, bins, share) - 1
-    return np.asarray(uneven / (_EVEN * math.sqrt(away.size / 8)))
+def _unevenness(one: Array, other: Array) -> Array:
+    """How far both sides of an edge are from alike, at equal distances from its middle: of two, over the error."""
+    uneven: Array = np.zeros(1)
+    for level in (one, other):
+        end = level.size // 6
+        paper, ink = float(level[:end].mean()), float(level[-end:].mean())
+        share = (level - ink) / (paper - ink)
+        middle = float(share.sum()) - 0.5  # of an even edge, in bins
+        away = np.arange(1.0, level.size // 3)
+        bins = np.arange(level.size)
+        uneven = uneven + np.interp(middle + away, bins, share) + np.interp(middle - away, bins, share) - 1
+    return np.asarray(uneven / (2 * _EVEN * math.sqrt(uneven.size / _PLACES)))

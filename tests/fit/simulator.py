@@ -246,13 +246,15 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
     radius = {}
     for i, distance in enumerate([focus_m, *distances]):
         scale = image_px / distance / 1000  # px a mm
-        turn, (x0, y0) = np.deg2rad(1.5), (0.02 * width, -0.015 * width)
+        turn, (x0, y0) = np.deg2rad(1.5), place_of_target(i, width)
         axis_x, axis_y = ((np.arange(n * fine) + 0.5) / fine - n / 2 for n in (width, height))
         x, y = np.meshgrid(axis_x - x0, axis_y - y0)
         x, y = (x * np.cos(turn) + y * np.sin(turn)) / scale, (y * np.cos(turn) - x * np.sin(turn)) / scale
         light = np.where((np.abs(x) < 105) & (np.abs(y + 17) < 148), 0.8, 0.3 + 0.05 * np.sin(x / 30))
-        light[(np.abs(x) < 50) & (np.abs(y) < 50)] = 0.035
-        light[np.hypot(x, y) < 2.5] = 0.8
+        # an edge between samples lights them by the share that it leaves of them
+        inside = np.minimum(*(np.clip((50 - np.abs(v)) * scale * fine + 0.5, 0, 1) for v in (x, y)))
+        light += inside * (0.035 - light)
+        light += np.clip((2.5 - np.hypot(x, y)) * scale * fine + 0.5, 0, 1) * (0.8 - light)
         light = light.reshape(height, fine, width, fine).mean((1, 3)) * (1 + 0.1 * np.linspace(-1, 1, width))
         radius[distance] = focal_mm / 2000 / f_number * image_px * abs(1 / focus_m - 1 / distance)
         if radius[distance]:
@@ -271,6 +273,15 @@ def write_photographs(folder, focus_m, distances, width=800, tone=0.5, noise=0.0
         out.write_image(np.ascontiguousarray(np.repeat(pixels[..., None], 3, 2)))
         out.close()
     return radius
+
+
+def place_of_target(i: int, width: int) -> tuple[float, float]:
+    """Where the target's middle lies in photograph `i` of `write_photographs`, px from the frame's centre.
+
+    No hand holds a dot at the same place among the pixels, whose pattern would then err alike in all pictures.
+    """
+    x, y = np.random.default_rng(900 + i).uniform(-3, 3, 2)
+    return 0.02 * width + x, -0.015 * width + y
 
 
 def _centre(square: np.ndarray, height: int, width: int) -> np.ndarray:

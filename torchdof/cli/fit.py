@@ -160,7 +160,8 @@ def fit(
             _draw_table(table, plots, out.stem, console)
         return
     if captures is not None and captures.is_dir() and not (captures / MANIFEST).is_file():
-        photographs = read_photographs(captures, square_mm=square_mm, root=root)
+        wanted: Literal["mean", "each"] = "each" if colours == "each" else "mean"
+        photographs = read_photographs(captures, square_mm=square_mm, colours=wanted, root=root)
         _tell(photographs, console)
         command = f"torchdof fit {captures.name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(photographs.captures, family, accuracy_db, command, None, console)

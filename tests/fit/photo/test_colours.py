@@ -44,6 +44,8 @@ def check(result, distances, tolerance):
         assert np.allclose(colour.lateral_px, places, atol=3 * tolerance)
 
 
+# the mean of discs of three sizes is no disc, and what it leaves looks like a tone curve's
+@pytest.mark.filterwarnings("ignore:what the fit leaves goes with the level:torchdof.fit.problems.NotLinearWarning")
 def test_lateral_and_longitudinal_colour_are_told_apart(simulator, tmp_path):
     result = fit_captures(captures(simulator), "disc")
     check(result, DISTANCES, 0.012)

@@ -305,6 +305,20 @@ def test_a_tone_curve_behind_a_demosaiced_edge_shows_in_the_residual_or_the_nois
         fit_pair(*pair, "gaussian")
 
 
+@pytest.mark.parametrize("bayer", [False, True])
+def test_a_weak_tone_curve_in_a_jpeg_shows_in_what_goes_with_the_level(simulator, bayer):
+    # 4 % of the radius; the edge is not steep, and compression hides what the curve does to the noise
+    camera = simulator.Simulator(tone=0.2, level=0.8, size=91, jpeg=90, black=0.02, bayer=bayer)
+    with pytest.warns(p.NotLinearWarning, match="goes with the level, as under a tone curve"):
+        fit_pair(*camera.pair("disc", {"radius": 6.0}, 2), "disc", fit_magnification=False)
+
+
+@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # there is no noise to hide behind
+def test_the_radius_is_that_of_the_light_and_not_of_a_kernel_whose_pixels_cannot_be_negative(simulator):
+    pair = simulator.Simulator(size=41, dot_radius=8.0, snr_db=60).pair("disc", {"radius": 0.9})
+    assert fit_pair(*pair, "disc", fit_magnification=False).radius == pytest.approx(0.9, rel=0.01)  # 1.07 by its kernel
+
+
 def eye(clipped, radius=8.0, fine=8, size=31):
     """A disc of which a second disc lets only a part through, as at a frame's corner."""
     axis = (np.arange(size * fine) + 0.5) / fine - size / 2

@@ -173,3 +173,16 @@ def test_a_scene_rendered_with_the_fitted_table_is_the_lens_s_picture(nine):
     assert -10 * np.log10(error) > 45
     untouched = float(((image - pictures[1]) ** 2).mean())
     assert -10 * np.log10(untouched) < 30
+
+
+@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.SingleDistanceWarning")
+def test_standard_errors_count_what_was_guessed_about_the_pictures(simulator):
+    camera = simulator.Simulator(size=61, dot_radius=8.0, magnification=0.5)
+    sharp, blurred = camera.pair("disc", {"radius": 5.0}, 1)
+    guess = camera.pair("disc", {"radius": 5.2}, 1)
+    plain, wary = (
+        fit_captures(Captures((Capture(sharp, blurred, 2.0, uncertain=others),), 1.0, WIDTH), "disc", smooth=False)
+        for others in ((), (guess,))
+    )
+    assert wary.fits[0].radius == plain.fits[0].radius and wary.fits[0].radius_stderr == pytest.approx(0.2, rel=0.1)
+    assert wary.fits[0].stderr["radius"] == pytest.approx(np.sqrt(wary.fits[0].covariance[0, 0]), rel=1e-6)

@@ -1,10 +1,12 @@
 """The printed target: the page, finding it on a desk, and what photographs of it tell without any description."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from torchdof.fit import fit_captures
 from torchdof.fit import problems as p
 from torchdof.fit.photo.photographs import read_photographs
 from torchdof.fit.photo.target import DOT_MM, SQUARE_MM, Target, find_target, write_target
@@ -42,12 +44,13 @@ def folder(simulator, tmp_path_factory):
     return folder, radius
 
 
-def test_the_target_is_found_on_a_desk_and_measured(folder):
+def test_the_target_is_found_on_a_desk_and_measured(simulator, folder):
     light = read_image(folder[0] / "img_0001.jpg").pixels[0].mean(0).double().numpy()
     target = find_target(light)
     image_px = 26 / 36 * 640 / (1 - 0.0054 / 0.2)
     assert target.side_px == pytest.approx(SQUARE_MM * image_px / 300, rel=2e-3)
-    assert (target.x, target.y) == pytest.approx((319.5 + 12.8, 239.5 - 9.6), abs=0.3)
+    x, y = simulator.place_of_target(1, 640)
+    assert (target.x, target.y) == pytest.approx((319.5 + x, 239.5 + y), abs=0.3)
     assert target.white == pytest.approx(0.8, rel=0.03) and target.elongation < 1.01
     with pytest.raises(p.DotNotFoundError, match="no target found"):
         find_target(np.random.default_rng(0).random((200, 300)))
@@ -68,6 +71,18 @@ def test_photographs_tell_their_distances_and_the_focus(folder):
     assert (captures.focal_length_mm, captures.f_number) == pytest.approx((5.4, 1.8))
     assert captures.sensor_width_mm == pytest.approx(36 * 5.4 / 26)
     assert any("five to nine" in sentence for sentence in found.advice)
+
+
+def test_each_colour_of_photographs_has_a_kernel_of_its_own(folder):
+    # the desk is grey: what one colour tells, all do
+    captures = read_photographs(folder[0], colours="each").captures
+    (pair,) = [c for c in captures if c.distance_m > 0.4]
+    assert pair.colours is not None and pair.colours[1].shape == (3, *pair.blurred.shape)
+    np.testing.assert_allclose(pair.colours[1].mean(0), pair.blurred, atol=1e-6)
+    with pytest.warns(p.SingleDistanceWarning):
+        found = fit_captures(replace(captures, pairs=(pair,)), "disc")
+    assert found.table.channels == 3 and [c.name for c in found.colours] == ["red", "green", "blue"]
+    assert [c.fits[0].radius for c in found.colours] == pytest.approx([found.fits[0].radius] * 3, rel=0.01)
 
 
 def test_a_target_printed_at_another_size_scales_the_distances(folder):
@@ -99,12 +114,12 @@ def _photographs(simulator, tone, seed=0):
 
 
 def test_a_tone_curve_is_found_by_the_light_of_the_dot_and_undone(simulator):
-    assert tone_curve(_photographs(simulator, 0.0), SQUARE_MM) == (0.0, 0.0)
-    tone = tone_curve(_photographs(simulator, 0.5), SQUARE_MM)
+    assert tone_curve(_photographs(simulator, 0.0), SQUARE_MM).bend == (0.0, 0.0, 0.0)
+    bend = tone_curve(_photographs(simulator, 0.5), SQUARE_MM).bend
     levels = np.linspace(0.05, 0.75, 20)[None]
     curved = simulator.Simulator(tone=0.5, snr_db=None).record(levels, np.random.default_rng(0))
     # up to a common factor, which no kernel feels
-    before, after = (v / v[0, -1] - levels / levels[0, -1] for v in (curved, untoned(curved, tone)))
+    before, after = (v / v[0, -1] - levels / levels[0, -1] for v in (curved, untoned(curved, bend)))
     assert np.abs(after).max() < 0.4 * np.abs(before).max()
 
 
@@ -114,7 +129,7 @@ def test_a_tone_curve_is_found_by_the_edges_of_the_square(simulator, tmp_path, t
     simulator.write_photographs(tmp_path, 0.2, [0.28, 0.4, 0.6], width=800, tone=tone)
     found = read_photographs(tmp_path)
     if tone == 0.0:
-        assert found.tone == (0.0, 0.0)
+        assert found.tone == (0.0, 0.0, 0.0)
         return
     levels = np.linspace(0.05, 0.75, 20)[None]
     curved = simulator.Simulator(tone=tone, snr_db=None).record(levels, np.random.default_rng(0))
