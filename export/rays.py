@@ -109,19 +109,16 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
 
 
 def _covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:
-    """How many cells above and left of each may show something in a bin: ``[bins, B, rows + 1, columns + 1]``.
-
-    Of each cell only the nearest and farthest of its places are looked at.
-    """
-    shown = [torch.where(cover > 0, place, _NEVER) for place, cover in places]
-    least = -torch.stack([_largest(-place) for place in shown]).amax(0)
-    shown = [torch.where(cover > 0, place, -_NEVER) for place, cover in places]
-    most = torch.stack([_largest(place) for place in shown]).amax(0)
-    index = torch.arange(bins).to(least.dtype)[:, None, None, None]
-    covered = ((least < index + 1.0) & (most > index - 1.0)).to(least.dtype)
-    return functional.pad(covered.cumsum(-1).cumsum(-2), (1, 0, 1, 0))
-
-
-def _largest(values: Tensor) -> Tensor:
-    """Largest of each cell of a map ``[B, 1, H, W]``: ``[B, rows, columns]``."""
-    return functional.max_pool2d(values, COARSE_CELL, ceil_mode=True)[:, 0]
+    """How many cells above and left of each show something in a bin: ``[bins, B, rows + 1, columns + 1]``."""
+    batch, _, height, width = places[0][0].shape
+    rows, columns = ((n + COARSE_CELL - 1) // COARSE_CELL for n in (height, width))
+    item, row, column = (torch.arange(n) for n in (batch, height, width))
+    cell = (item[:, None, None] * rows + row[:, None] // COARSE_CELL) * columns + column // COARSE_CELL
+    shown = places[0][0].new_zeros((bins + 2) * batch * rows * columns)
+    for place, cover in places:  # in the bins before and after it; what covers nothing, beyond all
+        before = torch.where(cover > 0, place, float(bins)).long()[:, 0]
+        for bin_of in (before, before + 1):
+            index = (bin_of * (batch * rows * columns) + cell).flatten()
+            shown = shown.scatter(0, index, torch.ones_like(place).flatten())
+    shown = shown.unflatten(0, (bins + 2, batch, rows, columns))[:bins]
+    return functional.pad(shown.cumsum(-1).cumsum(-2), (1, 0, 1, 0))
