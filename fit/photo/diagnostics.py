@@ -23,6 +23,7 @@ from .noise import independent_share
 
 __all__ = [
     "CHANCE",
+    "FAR_ABOVE",
     "UNEVEN",
     "asymmetry_of",
     "check_fit",
@@ -39,7 +40,9 @@ UNEVEN = 0.02
 CHANCE = 1e-6
 """How seldom noise may do as much."""
 
-_FAR_ABOVE = 1.6  # residual over noise
+FAR_ABOVE = 1.6
+"""Residual over noise from which on it is said."""
+
 _MATTERS, _SEEN = 0.005, 1e-3
 _HARMONICS, _RINGS = 8, 4
 _SPOT, _SPOT_MATTERS = 8.0, 0.003
@@ -170,7 +173,7 @@ def check_fit(
         )
         warn(ResidualWarning(text, file=file, number=fit.residual_over_noise), stacklevel)
     ratio = freest.residual_over_noise
-    if (freest.residual > _MATTERS and ratio > _FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0):
+    if (freest.residual > _MATTERS and ratio > FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0):
         text = (
             f"the residual is {100 * freest.residual:.1f} %, {ratio:.1f} times the noise; is the image linear, not "
             "sRGB encoded, a single white dot, and not a strong JPEG?"

@@ -16,7 +16,7 @@ from ..problems import FitError, SaturatedWarning, warn
 from ..result import Array, BlurFit
 from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
-from .diagnostics import check_fit
+from .diagnostics import FAR_ABOVE, check_fit
 from .dot import find_dot, noise_inside
 from .dot_model import Edge, soft_edge, with_softness
 from .family_choice import COST, choose, looks_alike
@@ -167,11 +167,14 @@ def fit_pair(
             pair.fit_moves, solution, freest = ALL_MOVES, free, free
     fit = describe(pair, solution, why)
     # a family that was chosen for being cheap is not to blame for what the freest kernel explains
-    check_fit(pair, solution, fit, files, fit if freest is solution else describe(pair, freest, ""))
+    judged = fit if freest is solution else describe(pair, freest, "")
+    check_fit(pair, solution, fit, files, judged)
     # what demosaicing leaves at an edge is louder than what it leaves of the noise
     if edge is not None and linear and pair.fine_share > _FINE:
         linear = check_noise(pair, solution, edge.level, files[1])
-    if edge is not None and linear and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX:
+    # a residual far above the noise was said already, whatever it goes with
+    large = edge is not None and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
+    if edge is not None and linear and large and judged.residual_over_noise < FAR_ABOVE:
         check_levels(pair, freest, edge.level, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
