@@ -47,10 +47,11 @@ def test_kernels_of_a_file_are_those_of_its_table(shape: str) -> None:
     plan = Plan.all(3.0, 1 / 255, rays=True)
     values, origins, halves, is_round, per_px, *_ = kernels_of(table, plan)
     middle = len(halves) // 2
+    values_at: Any = ray_loop.values_at
     for coc_px in (-2.75, 0.5, 3.0):
         expected = table.kernels(torch.tensor([coc_px]), 1).float()[0, :, None]
         half = expected.shape[-1] // 2 + 2  # what lies beyond a kernel is 0
         node = np.array([middle + round(coc_px * per_px)])
         arrays = [t.numpy() for t in (values, origins, halves, is_round)]
-        got = torch.from_numpy(ray_loop.values_at(*arrays, node, np.arange(-half, half + 1)))
+        got = torch.from_numpy(values_at(*arrays, node, np.arange(-half, half + 1)))
         torch.testing.assert_close(got, torch.nn.functional.pad(expected, (2, 2, 2, 2)), rtol=1e-6, atol=1e-9)

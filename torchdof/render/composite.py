@@ -45,6 +45,7 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
     """
+    frame = frame.near_to_far()
     colours, backed = frame.colours, frame.behind is not None
 
     # Beside light goes the share 1 - a that is left of what is behind, in sums of what is positive: behind bright light

@@ -48,7 +48,7 @@ class Frame:
     """Surfaces of a frame, continued over its border; what the layers scatter is cut out of it.
 
     Args:
-        surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area; several are near to far.
+        surfaces: ``[B, ., h + 2 margin, w + 2 margin]`` where ``h, w`` is the area; stacked ones are near to far.
         nodes: Places of the layers on the blur axis, near to far.
         ramps: Of these, as :func:`torchdof.render.layer_weights.ramps` gives them.
         behind: Light behind all surfaces, ``[B, C, h, w]``; None: nothing is.
@@ -79,6 +79,17 @@ class Frame:
         """The part of a map of the frame that reaches so far beyond its area."""
         start = self.margin - halo
         return values[..., start : start + self.area[0] + 2 * halo, start : start + self.area[1] + 2 * halo]
+
+    def near_to_far(self) -> "Frame":
+        """The same with the nearer one of two surfaces first, pixel by pixel."""
+        if self.stacked or len(self.surfaces) == 1:
+            return self
+        own, other = self.surfaces
+        is_nearer = other.x < own.x
+        pairs = [(a, b) for a, b in zip(own, other, strict=True) if a is not None and b is not None]
+        near = Placed(*(torch.where(is_nearer, b, a) for a, b in pairs))
+        far = Placed(*(torch.where(is_nearer, a, b) for a, b in pairs))
+        return dataclasses.replace(self, surfaces=[near, far])
 
     def occupied(self) -> list[bool]:
         """Whether anything lies in each layer; in traced code, which cannot look, anything may."""
@@ -194,21 +205,9 @@ def framed(
         light = continued(light, weight, limit, ends, margin + multiple - 1) if lit else functional.pad(light, ends)
         x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
-    if len(placed) == 2 and not stacked:
-        placed = _near_to_far(*placed)
     if behind is not None:
         behind = functional.pad(behind_pixels(behind, size), beyond, mode="replicate")
     return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)
-
-
-def _near_to_far(own: Placed, other: Placed) -> list[Placed]:
-    """Both surfaces of each pixel, the nearer one first."""
-    is_nearer = other.x < own.x
-    pairs = [(a, b) for a, b in zip(own, other, strict=True) if a is not None and b is not None]
-    return [
-        Placed(*(torch.where(is_nearer, b, a) for a, b in pairs)),
-        Placed(*(torch.where(is_nearer, a, b) for a, b in pairs)),
-    ]
 
 
 def surfaces_of_image(
