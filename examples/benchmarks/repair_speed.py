@@ -51,8 +51,8 @@ def main() -> None:
     parser.add_argument("scenes", type=Path, help="folder of scenes, as torchdof bench --truth takes it")
     parser.add_argument("--repeat", type=int, default=5, help="turns; by default %(default)s")
     arguments = parser.parse_args()
-    torch.set_grad_enabled(False)
-    table(list(read_scenes(arguments.scenes)), arguments.repeat)
+    with torch.no_grad():
+        table(list(read_scenes(arguments.scenes)), arguments.repeat)
 
 
 if __name__ == "__main__":

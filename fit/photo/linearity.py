@@ -35,6 +35,7 @@ _UNFOCUSED_PX = 1.0  # no camera leaves an edge softer than this in focus
 _FOCUSED_PX = 0.5  # what it leaves on average: between a perfect lens and a demosaiced picture
 _MATTERS = 0.02  # share of the kernel's size
 _MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
+_DRAWN = 1e-3  # of the level; less is left of pictures without noise, whose edges were drawn in another way
 _BENT, _BENT_CHI = 0.1, 30.0  # least share of a tone curve, and chi squared of two degrees of freedom
 _STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
@@ -93,7 +94,7 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
     expected = noise_of(pair.data) ** 2 + pair.shot_noise * light
     # second differences of neighbours go together: a third of them is independent
     most = _LOUDER * (1 + 4 * np.sqrt(2 * 3 / count))
-    if found > most * expected and found > (1e-4 * level) ** 2:
+    if found > most * expected and found > (_DRAWN * level) ** 2:
         text = (
             f"the noise at middling levels is {np.sqrt(found / expected):.1f} times what paper and dot have: "
             "a tone curve (an S-curve, a picture style), or compression. The kernel's size may be off by 15 %; develop "

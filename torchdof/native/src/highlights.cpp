@@ -151,6 +151,7 @@ void Job::extract_highlights() {
     }
     for (const Candidate &p : all) {
       const float share = (1.0f - p.limit / p.peak) * fades(p);
+      const float left = (1.0f - fades(p)) + fades(p) * (p.limit / p.peak);  // 1 - share, whose rounding is seen beside it
       const size_t at = (size_t)p.row * width + p.column;
       float weight = 1.0f, *light;
       size_t step;
@@ -169,7 +170,7 @@ void Job::extract_highlights() {
       rays.push_back({p.row, p.column, (int)below, (float)(steps - below), p.coc});
       for (int c = 0; c < channels; c++) {
         const float excess = light[c * step] * share;
-        light[c * step] -= excess;
+        light[c * step] *= left;
         ray_light.push_back(excess * weight);
       }
     }
