@@ -17,7 +17,8 @@ from torchdof.distributed import RenderShards, make_dataset, pairs_in, shard_row
 from torchdof.io.images import Picture, write_image
 
 ROOT = Path(__file__).parents[2]
-HAS_RAY = importlib.util.find_spec("ray") is not None
+_RAY = importlib.util.find_spec("ray")
+HAS_RAY = _RAY is not None and _RAY.origin is not None  # a folder of that name beside the checkout has no origin
 NEEDS_RAY = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed: pip install 'torchdof[ray]'")
 
 
