@@ -110,9 +110,10 @@ def extract(surface: Surface, limit: Tensor, from_px: float = _LEAST_PX) -> tupl
         return surface, None
     bright, peak, fades, coc, most = (t.index_select(0, kept) for t in (bright, peak, fades, coc, most))
     most = torch.maximum(most, least)
-    excess = pixels.pick(light, bright) * ((1.0 - most / peak) * fades)
+    taken_from, ordinary = pixels.pick(light, bright), most / peak
+    excess = taken_from * ((1.0 - ordinary) * fades)
     # not what the excess leaves: its rounding is brighter than a dark scene
-    left = pixels.put(light, bright, pixels.pick(light, bright) * ((1.0 - fades) + fades * (most / peak)))
+    left = pixels.put(light, bright, taken_from * ((1.0 - fades) + fades * ordinary))
     left = where_needed(lambda: is_bright.any(), left, light)
     highlights = Highlights(bright, excess if weight is None else excess * pixels.pick(weight, bright), coc)
     return surface._replace(light=left), highlights
