@@ -25,13 +25,13 @@ constexpr int LANES = 4;
 typedef float vec __attribute__((vector_size(LANES * 4)));
 typedef int32_t ivec __attribute__((vector_size(LANES * 4)));
 
-template <typename V>
-inline V load(const float *p) {
+template <typename V, typename T>
+inline V load(const T *p) {
   typedef V unaligned __attribute__((aligned(4)));
   return *(const unaligned *)p;
 }
-template <typename V>
-inline void store(float *p, V v) {
+template <typename V, typename T>
+inline void store(T *p, V v) {
   typedef V unaligned __attribute__((aligned(4)));
   *(unaligned *)p = v;
 }
@@ -47,6 +47,26 @@ inline float largest(vec v) {
   return m;
 }
 inline float smallest(vec v) { return -largest(-v); }
+// Of eight values those of the lanes' indices.
+inline vec pick(const float *values, ivec index) {
+#if defined(__AVX2__)
+  return (vec)__builtin_ia32_permvarsf256(load<vec>(values), index);
+#else
+  vec picked;
+  for (int i = 0; i < LANES; i++) picked[i] = values[index[i]];
+  return picked;
+#endif
+}
+inline bool any_of(ivec mask) {
+#if defined(__AVX2__)
+  return __builtin_ia32_movmskps256((vec)mask) != 0;
+#else
+  typedef long long wide __attribute__((vector_size(LANES * 4)));
+  const wide bits = (wide)mask;
+  return (bits[0] | bits[1]) != 0;
+#endif
+}
+inline bool any_positive(vec v) { return any_of(v > vec{}); }
 inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
 inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
 inline int ceil_div(int a, int b) { return (a + b - 1) / b; }
@@ -314,6 +334,7 @@ struct LayerIndex {
   int words, rows, columns;   // words of bits of a cell; cells
   std::vector<uint64_t> bits;    // layers that occur in each cell, a bit each
   std::vector<uint8_t> single;   // cells that show the first surface alone, whole
+  std::vector<uint8_t> mixed;    // those with pixels, of two surfaces, whose farther one goes on behind the nearer
   std::vector<Buffer<uint16_t>> intervals;
 
   const uint64_t *cell(size_t i) const { return &bits[i * words]; }
