@@ -1023,11 +1023,10 @@ class Composite {
   }
 
   void lay_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
-    float least = 1.0f;
+    vec least_cover = all(1.0f);
     for (int e = 0; e < E_; e++)
-      for (int y = 0; y < rows; y++)
-        for (int x = 0; x < columns; x++) least = std::min(least, b.canvas[C_ + e][y * TILE + x]);
-    if (!(least < 1.0f - COVERED)) return;
+      for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = least(least_cover, load<vec>(b.canvas[C_ + e] + i));
+    if (!any_of(least_cover < all(1.0f - COVERED))) return;
     const int h = job_.behind_height, w = job_.behind_width;
     for (int y = 0; y < rows; y++) {
       const float at_y = (y0 + y - 0.5f * (H_ - 1)) / BEHIND_STEP + 0.5f * (h - 1);  // both have one centre

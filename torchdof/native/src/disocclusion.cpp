@@ -474,6 +474,7 @@ class Filling {
     int first = 0;
     // of each level, rows around the cell: for each of its columns the sample before it and the next one
     std::vector<vec> samples;
+    std::vector<float> lines;  // the same as the level has them
   };
 
   // Gives the pixels of a cell what the levels show behind them. It is what `behind` and `mix` tell, of LANES pixels at once.
@@ -484,6 +485,7 @@ class Filling {
     const int rows = std::min(CELL, job_.height - y0), columns = std::min(CELL, W - x0);
     const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
     to.samples.resize(to.count * of_level + planes);
+    to.lines.resize(ROWS * planes * CELL);
     vec *const shown = &to.samples[to.count * of_level];
     int tops[FINE_LEVELS + 1];
     for (int i = to.first; i < to.count; i++) {
@@ -492,24 +494,27 @@ class Filling {
       const int bottom = std::min(ys[rows - 1].before + 1, level.height - 1), left = xs->before;
       const int last = std::min(xs[columns - 1].before + 1, level.width - 1) - left;
       tops[i] = ys->before;
-      int32_t samples[2][CELL];
+      ivec samples[2][VECTORS];
       for (int x = 0; x < CELL; x++) {
-        samples[0][x] = xs[std::min(x, columns - 1)].before - left;
-        samples[1][x] = std::min(samples[0][x] + 1, last);
+        samples[0][x / LANES][x % LANES] = xs[std::min(x, columns - 1)].before - left;
+        samples[1][x / LANES][x % LANES] = std::min(xs[std::min(x, columns - 1)].before - left + 1, last);
       }
+      float *line = to.lines.data();
+      for (int row = tops[i]; row <= bottom; row++, line += planes * CELL)
+        for (int x = 0; x <= last; x++)
+          for (int k = 0; k < planes; k++) line[k * CELL + x] = level.at(row, left + x)[k];
       vec *out = &to.samples[i * of_level];
-      for (int row = tops[i]; row <= bottom; row++)
+      line = to.lines.data();
+      for (int row = tops[i]; row <= bottom; row++, line += planes * CELL)
         for (int side = 0; side < 2; side++)
-          for (int k = 0; k < planes; k++) {
-            float line[CELL] = {};
-            for (int x = 0; x <= last; x++) line[x] = level.at(row, left + x)[k];
-            for (int v = 0; v < VECTORS; v++) *out++ = pick(line, load<ivec>(samples[side] + v * LANES));
-          }
+          for (int k = 0; k < planes; k++)
+            for (int v = 0; v < VECTORS; v++) *out++ = pick(line + k * CELL, samples[side][v]);
     }
     for (int y = 0; y < rows; y++) {
       const int within = (y0 + y) % BLOCK * BLOCK + x0 % BLOCK;
-      float here_of[CELL] = {};
-      memcpy(here_of, s_.coc + (size_t)(y0 + y) * W + x0, columns * sizeof(float));
+      const float *here_of = s_.coc + (size_t)(y0 + y) * W + x0;
+      float cut[CELL] = {};
+      if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
       for (int v = 0; v < VECTORS; v++) {
         const vec here = load<vec>(here_of + v * LANES), size = most(here, -here);
         ivec wanted = size > all(0.5f);

@@ -70,11 +70,12 @@ void Job::find_threshold() {
   parallel(threshold_rows, [&](int row, int) {
     float brightest[COUNT];
     for (int column = 0; column < threshold_columns; column++) {
+      int xs[CELL_STEPS];
+      for (int j = 0; j < CELL_STEPS; j++) xs[j] = mirrored(column * THRESHOLD_CELL + j * STEP + STEP / 2 - threshold_left, width);
       for (int i = 0; i < CELL_STEPS; i++) {
         const int y = mirrored(row * THRESHOLD_CELL + i * STEP + STEP / 2 - threshold_top, height);
         for (int j = 0; j < CELL_STEPS; j++) {
-          const int x = mirrored(column * THRESHOLD_CELL + j * STEP + STEP / 2 - threshold_left, width);
-          const size_t at = (size_t)y * width + x;
+          const size_t at = (size_t)y * width + xs[j];
           float most = light[at];
           for (int c = 1; c < channels; c++) most = std::max(most, light[c * area + at]);
           brightest[i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : most;
@@ -99,22 +100,22 @@ void Job::extract_highlights() {
     for (int bx = 0; bx < surfaces.block_columns; bx++) {
       const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
       const float least_limit = least_threshold(*this, by * BLOCK, x0);
-      if (!surfaces.whole() && !surfaces.has_block(block) && !(block_peak[block] > least_limit)) continue;
+      if (!surfaces.whole()) {
+        vec peak = all(block_peak[block]);
+        const float *of_block = surfaces.blocks[block];  // light of both surfaces comes first
+        for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES) peak = most(peak, load<vec>(of_block + i));
+        if (!any_of(peak > all(least_limit))) continue;
+      }
       for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
         for (int i = 0; i < count; i++) {
           if (!surfaces.row(i, y, x0, light.data(), coc, weight)) continue;
-          float most[BLOCK];
-          for (int x = 0; x < n; x++) most[x] = light[0][x];
-          for (int c = 1; c < channels; c++)
-            for (int x = 0; x < n; x++) most[x] = std::max(most[x], light[c][x]);
-          bool any = false;
-          for (int x = 0; x < n; x++) any |= most[x] > least_limit;
-          if (!any) continue;
           for (int x = 0; x < n; x++) {
-            if (!(most[x] > least_limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > from_px)) continue;
+            float brightest = light[0][x];
+            for (int c = 1; c < channels; c++) brightest = std::max(brightest, light[c][x]);
+            if (!(brightest > least_limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > from_px)) continue;
             const float limit = threshold_at(*this, y, x0 + x);
-            if (!(most[x] > limit)) continue;
-            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, most[x], coc[x], limit});
+            if (!(brightest > limit)) continue;
+            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit});
           }
         }
       }
