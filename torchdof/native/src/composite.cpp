@@ -241,10 +241,11 @@ class Composite {
                 if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
                 for (int x = 0; x < CELL; x += LANES) {
                   const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc), w = weight ? load<vec>(weight + x) : all(1.0f);
+                  const auto weighs = w != vec{};
                   store(places + y * CELL + x, place);
-                  store(shown + y * CELL + x, w != vec{} ? place : all(NEVER));
-                  lows = least(lows, place);
-                  highs = most(highs, place);
+                  store(shown + y * CELL + x, weighs ? place : all(NEVER));
+                  lows = least(lows, weighs ? place : all(NEVER));
+                  highs = most(highs, weighs ? place : all(-NEVER));
                   least_weight = least(least_weight, w);
                   most_weight = most(most_weight, w);
                   float *const own_coc = own_cocs + y * CELL + x, *const own_weight = own_weights + y * CELL + x;
