@@ -35,6 +35,7 @@ from .arguments import (
     Blades,
     Curvature,
     DepthChannel,
+    DepthEdgesName,
     DepthOffset,
     DepthScale,
     DepthUnknown,
@@ -128,14 +129,7 @@ def render(
     depth_unknown: DepthUnknown = None,
     fill_depth: FillDepth = None,
     depth_channel: DepthChannel = None,
-    depth_edges: Annotated[
-        Literal["auto", "repair", "as-given"],
-        typer.Option(
-            help="Move and sharpen the edges of the depth to where IMAGE has them: unless they prove exact, each one, "
-            "or not at all.",
-            rich_help_panel=DEPTH,
-        ),
-    ] = "auto",
+    depth_edges: DepthEdgesName = "auto",
     table: TableName = "disc",
     blades: Blades = 0,
     rotation: Rotation = 0.0,
