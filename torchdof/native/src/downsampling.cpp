@@ -205,6 +205,16 @@ class Downsampling {
     }
   }
 
+  // Whether a block, continued beyond the frame, lies in cells with mixed pixels.
+  bool mixed(int y0, int x0) const {
+    auto cell = [&](int at, int size) { return std::clamp(at, 0, size - 1) / CELL; };
+    const int H = job_.height, W = job_.width, end = to_.scale - 1;
+    for (int row = cell(y0, H); row <= cell(y0 + end, H); row++)
+      for (int column = cell(x0, W); column <= cell(x0 + end, W); column++)
+        if (index_.mixed[(size_t)row * index_.columns + column]) return true;
+    return false;
+  }
+
   // Weights of both surfaces of a block's pixels, in the layer before each and in the one behind it. The farther one of a
   // mixed pixel goes on behind the nearer: there it counts for more than its share, and what it thereby has too much of in
   // the layers up to the nearer one is to be taken from their room. False if there is no such pixel.
@@ -257,8 +267,7 @@ class Downsampling {
   void gather(int row, int column, bool inside) {
     const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width, C = C_;
     const float *coc, *weight;
-    const bool two = s_.count == 2 && s_.row(1, std::clamp(y0, 0, H - 1), std::clamp(x0, 0, W - 1), light_.data(), coc, weight) &&
-                     share_out(y0, x0, inside);
+    const bool two = s_.count == 2 && mixed(y0, x0) && share_out(y0, x0, inside);
     for (int i = 0; i < s_.count; i++) {
       if (inside) {
         if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
