@@ -531,8 +531,8 @@ inline uint32_t strip_inputs(int x, int half) {
 // kernel's half more on each side and begins there. Input row i matters where rows[i] has one of the bits of `columns`.
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
 
-// Depth edges; edges.cpp
-void repair_edges(const torchdof_map &map);
+// Depth edges; false if they are right as they are; edges.cpp
+bool repair_edges(const torchdof_map &map);
 
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 
