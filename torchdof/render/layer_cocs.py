@@ -63,8 +63,8 @@ def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = 
 def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
     """A node between fixed ones: moved towards one that comes near, and in the end onto it."""
     near = min(fixed, key=lambda other: abs(node - other))
-    room = abs(node - near) / spacing(node, tolerance)
-    return near + (node - near) * min(max((room - _NEAR) / _NEAR, 0.0), 1.0)
+    gap = abs(node - near) / spacing(node, tolerance)
+    return near + (node - near) * min(max((gap - _NEAR) / _NEAR, 0.0), 1.0)
 
 
 def ends(coc_px: Tensor) -> tuple[float, float]:
