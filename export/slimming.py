@@ -241,7 +241,8 @@ class _Fills(onnx_ir.passes.InPlacePass):
                 graph.remove(node, safe=True)
             cut: Any = node.inputs[0].producer() if node.op_type == "Split" and node.inputs[0] is not None else None
             if cut is not None and cut.op_type == "Slice" and node.attributes["axis"].as_int() == 1:
-                whole, size, sizes = cut.inputs[0], node.inputs[0].shape, node.inputs[1]
+                split_input: Any = node.inputs[0]
+                whole, size, sizes = cut.inputs[0], split_input.shape, node.inputs[1]
                 numbers = None if sizes is None else onnx_ir.convenience.get_const_tensor(sizes)
                 alike = whole.shape is not None and [a == b for a, b in zip(whole.shape, size, strict=True)]
                 start = onnx_ir.convenience.get_const_tensor(cut.inputs[1])
