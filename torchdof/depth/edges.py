@@ -28,6 +28,8 @@ STEP_PX = 1.0
 """Difference in the circle of confusion from which on the edge between two surfaces is worth repair."""
 
 _STEP = 0.1  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
+_NOISES = 12.0  # standard deviations of a map's noise that a step stands out at least
+_NOISE_SAMPLED = 2**15  # pixels of a frame among which noise is looked for
 _RINGS = 3  # pixels beside a step that may be on its wrong side
 _REACH = 5  # pixels around one that tell what the two surfaces look like
 _FALLOFF_PX = 2.5
@@ -157,7 +159,8 @@ def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tenso
     """
     given = nearness.float().expand(image.shape[0], -1, -1, -1)
     valid = given.abs() <= _LARGEST
-    edges = _find(torch.where(valid, given, 0.0), valid, torch.as_tensor(step, dtype=given.dtype, device=given.device))
+    step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
+    edges = _find(torch.where(valid, given, 0.0), valid, torch.maximum(step, _NOISES * _noise(given, valid)))
     mended = repair(image, nearness, step, auto=True)
     return edges.is_edge * (1 + edges.is_ramp.byte()), (mended != nearness) & valid
 
@@ -166,6 +169,7 @@ def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tenso
 def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     valid = nearness.abs() <= _LARGEST
     given = torch.where(valid, nearness, 0.0)
+    step = torch.maximum(step, _NOISES * _noise(given, valid))
     light = torch.where(torch.isfinite(image), image, 0.0).clamp(0.0, _BRIGHTEST)
     edges = _find(given, valid, step)
     is_near = 2.0 * given > edges.near + edges.far
@@ -221,6 +225,18 @@ def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tens
 @_operator.register_fake
 def _(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     return torch.empty_like(nearness, memory_format=torch.contiguous_format)
+
+
+def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
+    """Standard deviation of an item's noise, ``[B, 1, 1, 1]``: from how the middle pixel of all bends its row."""
+    height, width = nearness.shape[-2:]
+    every = (height * width + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
+    rows, valid_rows = (functional.pad(t[..., ::every, :], (0, 2)) for t in (nearness, valid))
+    known = valid_rows.narrow(-1, 0, width) & valid_rows.narrow(-1, 1, width) & valid_rows.narrow(-1, 2, width)
+    bends = torch.where(known, rows.diff().diff().abs(), torch.inf).flatten(1).sort(1).values
+    middle = (known.flatten(1).sum(1, keepdim=True) - 1).clamp_min(0) // 2
+    bend = bends.gather(1, middle)
+    return torch.where(bend < torch.inf, 0.6053 * bend, 0.0)[..., None, None]  # 1.4826 / sqrt(6), of a Gaussian
 
 
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
