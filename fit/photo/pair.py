@@ -175,7 +175,7 @@ def fit_pair(
     # a residual far above the noise was said already, whatever it goes with
     large = edge is not None and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
     if edge is not None and linear and large and judged.residual_over_noise < FAR_ABOVE:
-        check_levels(pair, freest, edge.level, files[1])
+        check_levels(pair, freest, edge, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)
