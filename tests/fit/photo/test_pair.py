@@ -453,3 +453,10 @@ def test_a_blur_that_the_noise_hides_is_never_a_number_in_silence(simulator):
 def test_summary_tells_the_parameters_and_the_residual(simulator):
     fit = fit_pair(*simulator.Simulator().pair("gaussian", {"sigma": 3.0}), "gaussian")
     assert "sigma = 3" in fit.summary() and "x the noise" in fit.summary()
+
+
+def test_a_distance_at_which_nothing_of_the_dot_would_be_seen_is_named(simulator):
+    # a metre read as centimetres; the normal equations of nothing had no factor, and that was the message
+    pair = simulator.Simulator(size=61, dot_radius=8.0).pair("disc", {"radius": 5.0})
+    with pytest.raises(p.DistanceError, match="0.064 px here, and nothing of it be seen; is the distance misread"):
+        fit_pair(*pair, "radial", magnification=0.008)
