@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterator
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof.optics.camera import Camera
@@ -55,6 +56,8 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         ("bad depths", (2, 41, 50), _ramp(-0.8, 0.8)),
         ("several tiles", (1, 257, 129), _ramp(-0.5, 0.9)),
     ]
+    if portable.dof.options.depth_edges != "as given":
+        frames.append(("soft depth edges", (2, 75, 140), _steps))
     if large:
         frames.append(("960 x 540", (1, 540, 960), _steps))
     for name, (batch, height, width), shape in frames:
@@ -66,7 +69,10 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         if name == "lamps":
             image = 0.1 * image
             image[:, :, 2::11, 3::13] *= 500.0
-        if float(coc.min()) < float(coc.max()):
+        if name == "soft depth edges":  # of surfaces that the image tells apart
+            image = 0.2 * image + 0.6 * (coc < 0) + 0.1
+            coc = functional.avg_pool2d(coc, (1, 5), stride=1, padding=(0, 2), count_include_pad=False)
+        elif float(coc.min()) < float(coc.max()):
             # where a depth lies midway between its neighbours, to the last bit, rounding decides whose surface it is
             coc = coc * (1.0 + 0.03 * torch.rand(coc.shape, generator=random))
         if portable.inputs == "coc_px":

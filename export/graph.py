@@ -8,10 +8,12 @@ import torch._dynamo.config
 from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
+from torchdof.depth.edges import DepthEdges
 from torchdof.optics.camera import Camera
 from torchdof.render.exporting import where_needed
 from torchdof.render.plan import Blur, Plan
 
+from .lists import in_parts
 from .rays import kernels_of
 from .tiling import in_tiles
 
@@ -27,7 +29,7 @@ OUTPUT = "out"
 class Portable(nn.Module):
     """The module as its ONNX file computes it: all layers up to ``max_coc_px``, bad values passed through sharp.
 
-    It takes the depth as it is given; what its camera cannot be gives NaN.
+    What its camera cannot be gives NaN.
 
     Called outside an export it renders the same thing with eager PyTorch, and that is what a file is verified against.
 
@@ -35,12 +37,19 @@ class Portable(nn.Module):
         dof: The module. Its camera's numbers must be floats.
         inputs: ``"depth"`` or ``"coc_px"``: the map that the graph takes.
         width: Image width that a table with lengths in millimetres or fractions of the width is pinned to.
+        depth_edges: What the graph does with the edges of the map.
 
     Raises:
         ValueError: If the camera has tensors, or the width is missing or superfluous.
     """
 
-    def __init__(self, dof: DepthOfField, inputs: str = "depth", width: int | None = None) -> None:
+    def __init__(
+        self,
+        dof: DepthOfField,
+        inputs: str = "depth",
+        width: int | None = None,
+        depth_edges: DepthEdges = "as given",
+    ) -> None:
         super().__init__()
         if inputs not in INPUTS:
             raise ValueError(f"inputs must be one of {', '.join(INPUTS)}, got {inputs!r}")
@@ -54,7 +63,7 @@ class Portable(nn.Module):
         self.inputs, self.width = inputs, width
         self.dof = copy.copy(dof)
         table = pinned(dof.options.table, width)
-        self.dof.options = dataclasses.replace(dof.options, table=table, check=False, depth_edges="as given")
+        self.dof.options = dataclasses.replace(dof.options, table=table, check=False, depth_edges=depth_edges)
         self.called = copy.copy(dof)
         self.called.options = dataclasses.replace(dof.options, table=table, check=False)
         self.eval()
@@ -140,5 +149,5 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     # what torch would keep of each operator, to know one like it again, takes longer than it saves: sizes are symbols
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
     kernels = kernels_of(table, portable.plan)
-    with torch.no_grad(), in_tiles(kernels), uncached:
+    with torch.no_grad(), in_tiles(kernels), in_parts(), uncached:
         return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)

@@ -45,6 +45,7 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
         "table": {"name": dof.options.table.name, "family": dof.options.table.family, "unit": dof.options.table.unit}
         | {"sha256": table_hash(dof.options.table)},
         "options": options,
+        "depth_edges": portable.dof.options.depth_edges,
         "width": portable.width,
         "layers": len(portable.plan.nodes),
         "opset": opset,
@@ -68,7 +69,7 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
     Returns:
         ``version``, ``inputs`` and ``output`` (name to shape, type and unit), ``camera`` (its focus and f-number are
         those of the module; the graph takes them as inputs), ``table`` (name, family, unit and SHA-256 of its JSON),
-        ``options``, ``width`` (that a table was pinned to, or None), ``layers`` and ``opset``.
+        ``options``, ``depth_edges``, ``width`` (that a table was pinned to, or None), ``layers`` and ``opset``.
 
     Raises:
         ValueError: If it is not such a file.

@@ -123,7 +123,7 @@ def verify(
     model = load(path)
     facts = facts_of(model, str(path))
     inputs = "depth" if "depth" in facts["inputs"] else "coc_px"
-    portable = Portable(dof, inputs, facts["width"])
+    portable = Portable(dof, inputs, facts["width"], facts["depth_edges"])
     check_format(model, os.fspath(path))
     _check_origin(facts, dof)
     channels = _check_interface(model, inputs)

@@ -73,12 +73,12 @@ def export_once(name: str, folder: Path) -> Exported:
 
 
 def command_once(folder: Path) -> tuple[Path, str]:
-    """A file of blur radii that ``torchdof export`` wrote, alone in its folder, and what it printed; written once."""
+    """A file of blur radii that repairs edges, alone in its folder, and what ``torchdof export`` printed of it."""
     path, told = folder / "command" / "dof.onnx", folder / "command.json"
     with FileLock(folder / "command.lock"):
         if not told.exists():
             path.parent.mkdir()
-            options = ["--inputs", "coc_px", "--max-coc", "2", "--no-occlusion", "--json"]
+            options = ["--inputs", "coc_px", "--max-coc", "2", "--no-occlusion", "--depth-edges", "auto", "--json"]
             result = CliRunner().invoke(app, ["export", "-o", str(path), *options], catch_exceptions=False)
             assert result.exit_code == 0, result.output
             told.write_text(result.stdout)

@@ -17,7 +17,7 @@ FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "ex
 FLOORS = {
     "validation": set(),
     "batch": {"validation"},
-    "pixels": set(),
+    "pixels": {"validation"},
     "native": set(),
     "io": {"validation"},
     "optics": {"validation", "io"},
@@ -27,7 +27,7 @@ FLOORS = {
     "reference": {"validation", "io", "optics", "render"},
     "module": {"validation", "batch", "optics", "depth", "options", "render"},
     "fit": {"validation", "io", "optics"},
-    "export": {"validation", "pixels", "io", "optics", "options", "render", "reference", "module"},
+    "export": {"validation", "pixels", "io", "optics", "depth", "options", "render", "reference", "module"},
     "augmentation": {"validation", "io", "optics", "options", "module"},
     "distributed": {"validation", "io", "optics", "depth", "options", "augmentation"},
     "bench": {"validation", "io", "optics", "depth", "options", "render", "reference", "module", "export"},

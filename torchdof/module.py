@@ -17,6 +17,7 @@ from .optics.camera import CAMERA_NUMBERS, Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import pipeline
 from .render.attention import Attention
+from .render.exporting import where_needed
 from .render.plan import Plan
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
@@ -373,18 +374,17 @@ def _rendered(render: Callable[..., Tensor], light: Tensor, *arguments: Any) -> 
 
 def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     """A map of the coc with its edges where the image has them, as far as the options ask for that."""
-    if options.depth_edges == "as given" or _is_smooth(coc_px):
+    if options.depth_edges == "as given" or (not validation.is_traced() and not _has_steps(coc_px)):
         return coc_px
-    mended = -repair(image, -coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto")
+    mended = repair(image, coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto", of_coc=True)
+    mended = where_needed(lambda: _has_steps(coc_px), mended, coc_px)
     return torch.where(mended == coc_px, coc_px, mended) if coc_px.requires_grad else mended
 
 
-def _is_smooth(coc_px: Tensor) -> bool:
-    """Whether no two pixels of a map are so far apart that a repair could change one: half a step, beside lamps."""
-    if validation.is_traced():
-        return False
+def _has_steps(coc_px: Tensor) -> Tensor:
+    """Whether two pixels of a map are so far apart that a repair could change one: half a step, beside lamps."""
     low, high = coc_px.detach().aminmax()
-    return bool(high - low < 0.5 * STEP_PX)
+    return ~(high - low < 0.5 * STEP_PX)  # holes tell nothing
 
 
 _has_rendered = threading.Event()

@@ -3,10 +3,22 @@
 Depth edges, hidden surfaces and highlights concern few pixels; these are looked at as lists ``[P]``.
 """
 
+from collections.abc import Callable
+from contextvars import ContextVar
+
 import torch
 from torch import Tensor
 
-__all__ = ["around", "corners", "indices", "pick", "places", "put"]
+from . import validation
+
+__all__ = ["around", "by_parts", "corners", "graph_parts", "indices", "pick", "places", "put"]
+
+
+_PART = 40_000  # pixels that are looked at together
+
+graph_parts: ContextVar[Callable[[Callable[[Tensor], Tensor], Tensor], Tensor] | None]
+graph_parts = ContextVar("graph_parts", default=None)
+"""What :func:`by_parts` does in an exported graph; set by whoever exports one."""
 
 
 def indices(mask: Tensor) -> Tensor:
@@ -56,3 +68,11 @@ def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) 
     first = (item * height + top.long()) * width + left.long()
     below, beside = min(1, height - 1) * width, min(1, width - 1)
     return [first, first + beside, first + below, first + (below + beside)], row - top, column - left
+
+
+def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
+    """What a function finds at pixels ``[P]``, so many at a time that what it needs stays small: ``[n, P]``."""
+    if validation.is_traced():
+        in_graph = graph_parts.get()
+        return look(pixels) if in_graph is None else in_graph(look, pixels)
+    return torch.cat([look(part) for part in pixels.split(_PART)], 1)

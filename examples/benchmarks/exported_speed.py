@@ -28,6 +28,7 @@ from torchdof.bench import exported
 from torchdof.bench.inputs import shipped
 from torchdof.bench.speed import unit_work
 from torchdof.bench.timer import in_turns, processor_seconds
+from torchdof.reference.degraded import KINDS, degrade
 
 __all__ = ["feed_of", "main"]
 
@@ -35,11 +36,13 @@ Feed = dict[str, np.ndarray]
 _FOCUS_M = 2.0
 
 
-def feed_of(options: dict[str, Any], camera: Camera, size: tuple[int, int], in_focus: bool) -> Feed:
-    """Inputs of a file that takes depth, ``size`` rows and columns of the built-in scene."""
+def feed_of(
+    options: dict[str, Any], camera: Camera, size: tuple[int, int], in_focus: bool, kind: str = "exact"
+) -> Feed:
+    """Inputs of a file that takes depth, ``size`` rows and columns of the built-in scene, its depth made worse."""
     scene = shipped(*size)
     infinity_px = 1.05 * options["max_coc_px"]
-    depth = _FOCUS_M / (1.0 - scene.coc_px.double() / infinity_px)
+    depth = degrade((_FOCUS_M / (1.0 - scene.coc_px.double() / infinity_px)).float(), kind)
     wide = camera.replace(focus_m=_FOCUS_M, f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), size[1])
     values = {"image": scene.image, "depth": torch.full_like(depth, _FOCUS_M) if in_focus else depth}
     values |= {"focus_m": torch.tensor([_FOCUS_M]), "f_number": wide.flatten() / infinity_px}
@@ -75,6 +78,9 @@ def main() -> None:
     parser.add_argument("models", nargs="+", help="files written by torchdof export, for the disc")
     parser.add_argument("--size", default="960x540", help="WIDTHxHEIGHT")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument(
+        "--depth", choices=KINDS, default="exact", help="how bad the depth is made; by default it is exact"
+    )
     parser.add_argument("--runs", type=int, default=3, help="timed rounds after one to warm up; the median counts")
     parser.add_argument("--web", type=Path, metavar="FOLDER", help="also in onnxruntime-web, which is in this folder")
     arguments = parser.parse_args()
@@ -87,7 +93,9 @@ def main() -> None:
         runner, name = exported.session(model, arguments.threads), Path(model).stem
         facts = runner.get_modelmeta().custom_metadata_map
         camera, options = Camera(**json.loads(facts["torchdof.camera"])), json.loads(facts["torchdof.options"])
-        feed, focused = (feed_of(options, camera, (height, width), in_focus) for in_focus in (False, True))
+        feed, focused = (
+            feed_of(options, camera, (height, width), in_focus, arguments.depth) for in_focus in (False, True)
+        )
         works[f"{name}, onnxruntime"] = functools.partial(runner.run, None, feed)
         works[f"{name}, onnxruntime, in focus"] = functools.partial(runner.run, None, focused)
         on_web[f"{name}, onnxruntime-web"] = (model, feed)

@@ -65,6 +65,14 @@ def test_a_depth_map_that_the_image_knows_nothing_of_is_left_alone(scene: Scene,
     assert torch.equal(repair_edges(torch.rand_like(scene.image), depth, "auto"), depth)
 
 
+def test_noise_is_no_edge_and_edges_in_noise_are(scene: Scene) -> None:
+    exact, thin = (-8.0 * scene.camera.coc_px(degrade(scene.depth, kind), 192) for kind in ("exact", "near -1px"))
+    noise = 0.3 * torch.randn(exact.shape)  # a step high within five pixels
+    assert torch.equal(edges.repair(scene.image, exact + noise, 1.0, True), exact + noise)
+    left = (edges.repair(scene.image, thin + noise, 1.0, True) - exact).abs() > 10.0
+    assert float(left.float().mean()) < 0.25 * float(((thin - exact).abs() > 10.0).float().mean())
+
+
 @pytest.mark.parametrize("steepness", [0.02, 0.3, 1.0])
 @pytest.mark.parametrize("how", ["auto", "repair"])
 def test_a_slope_stays_a_slope(steepness: float, how: edges.DepthEdges) -> None:
@@ -213,6 +221,8 @@ def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
     fast = native.repair_edges(scene.image[0], nearness[0, 0], torch.tensor(1.0), auto)
     same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3, equal_nan=True)
     assert float(same.float().mean()) > 0.999  # where both surfaces are equally likely, rounding may decide
+    coc = native.repair_edges(scene.image[0], -nearness[0, 0], torch.tensor(1.0), auto, of_coc=True)
+    torch.testing.assert_close(coc, -fast, rtol=0, atol=0, equal_nan=True)
 
 
 @compiled
@@ -230,7 +240,9 @@ def test_engines_agree_on_frames_of_which_a_part_decides(scene: Scene, kind: str
 @compiled
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 3), (65, 130)])
 def test_engines_agree_on_frames_of_any_size(size: tuple[int, int]) -> None:
-    image, nearness = torch.rand(1, 2, *size), 9 * torch.rand(1, 1, *size)
+    blocks = 9 * torch.rand(1, 1, 1 + size[0] // 5, 1 + size[1] // 5)  # values beside each other are no noise
+    nearness = blocks.repeat_interleave(5, -2).repeat_interleave(5, -1)[..., : size[0], : size[1]].contiguous()
+    image = torch.rand(1, 2, *size)
     plain = edges._repair(image, nearness, torch.full_like(nearness, 0.5), False)
     fast = native.repair_edges(image[0], nearness[0, 0], torch.full(size, 0.5), False)
     same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3)

@@ -10,7 +10,7 @@ import torch
 from torchdof import Camera
 from torchdof.depth import DepthWarning, check, from_relative
 from torchdof.depth.reading import read_depth
-from torchdof.depth.sanity import coc_doubts, depth_doubts
+from torchdof.depth.sanity import coc_mistakes, depth_mistakes
 from torchdof.reference.scenes import read_scenes
 
 SCENES = Path(__file__).parents[1] / "data" / "scenes"
@@ -110,14 +110,14 @@ def test_eight_bits_are_no_metres(metres: torch.Tensor) -> None:
 
 
 def test_disparity_without_its_scale_is_told(metres: torch.Tensor) -> None:
-    (doubt,) = depth_doubts(metres / 192.03, Camera(focus_m=3.0), "inverse")
-    assert "the baseline in metres times the focal length in pixels (--depth-scale, not given)" in doubt.message
-    assert "--depth-kind relative" in doubt.message
+    (mistake,) = depth_mistakes(metres / 192.03, Camera(focus_m=3.0), "inverse")
+    assert "the baseline in metres times the focal length in pixels (--depth-scale, not given)" in mistake.message
+    assert "--depth-kind relative" in mistake.message
 
 
 def test_a_scale_that_was_given_in_vain_is_to_be_left_out(metres: torch.Tensor) -> None:
-    (doubt,) = depth_doubts(metres / 1000, Camera(focus_m=3.0), "z", 0.001)
-    assert "leave --depth-scale out" in doubt.message
+    (mistake,) = depth_mistakes(metres / 1000, Camera(focus_m=3.0), "z", 0.001)
+    assert "leave --depth-scale out" in mistake.message
 
 
 @pytest.mark.parametrize(
@@ -153,9 +153,9 @@ def test_the_warning_can_be_filtered(metres: torch.Tensor) -> None:
 
 
 def test_depths_given_for_circles_of_confusion_are_told() -> None:
-    assert coc_doubts(torch.linspace(-30, 30, 96).expand(1, 1, 8, 96)) == []
-    (doubt,) = coc_doubts(torch.linspace(800, 5000, 96).expand(1, 1, 8, 96))
-    assert "--depth-kind" in doubt.message
+    assert coc_mistakes(torch.linspace(-30, 30, 96).expand(1, 1, 8, 96)) == []
+    (mistake,) = coc_mistakes(torch.linspace(800, 5000, 96).expand(1, 1, 8, 96))
+    assert "--depth-kind" in mistake.message
 
 
 def test_what_is_no_depth_is_refused() -> None:

@@ -15,6 +15,7 @@ __all__ = [
     "Blades",
     "Curvature",
     "DepthChannel",
+    "DepthEdgesName",
     "DepthOffset",
     "DepthScale",
     "DepthUnknown",
@@ -129,6 +130,14 @@ ValueRange = Annotated[
 DepthUnknown = Annotated[
     float | None,
     typer.Option(help="A value that means 'not measured', such as 0, -1 or inf.", rich_help_panel=DEPTH),
+]
+DepthEdgesName = Annotated[
+    Literal["auto", "repair", "as-given"],
+    typer.Option(
+        help="Move and sharpen the edges of the depth to where the image has them: unless they prove exact, each one, "
+        "or not at all.",
+        rich_help_panel=DEPTH,
+    ),
 ]
 DepthChannel = Annotated[
     str | None, typer.Option(help="Channel (or array of an .npz) that is depth.", rich_help_panel=DEPTH)

@@ -17,6 +17,7 @@ from torchdof.cli.arguments import (
     AsJson,
     Blades,
     Curvature,
+    DepthEdgesName,
     FovDeg,
     MethodName,
     NoOcclusion,
@@ -56,6 +57,7 @@ def export(
     tolerance: ToleranceText = "final",
     no_occlusion: NoOcclusion = False,
     method: MethodName = "layered",
+    depth_edges: DepthEdgesName = "as-given",
     inputs: Annotated[
         Literal["depth", "coc_px"],
         typer.Option(
@@ -113,7 +115,16 @@ def export(
         check=False,
     )
     with Console(stderr=True).status("tracing") as status:
-        report = to_onnx(dof, out, inputs=inputs, channels=channels, width=width, opset=opset, progress=status.update)
+        report = to_onnx(
+            dof,
+            out,
+            inputs=inputs,
+            channels=channels,
+            width=width,
+            depth_edges="as given" if depth_edges == "as-given" else depth_edges,
+            opset=opset,
+            progress=status.update,
+        )
     print(json_line({"out": str(out), **dataclasses.asdict(report)}) if as_json else f"{report}\nwrote {out}")
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..depth.holes import resolve_holes
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
-from ..depth.sanity import coc_doubts, depth_doubts
+from ..depth.sanity import coc_mistakes, depth_mistakes
 from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
@@ -21,8 +21,8 @@ from ..module import blur_by_coc, depth_of_field
 from ..optics.camera import Camera
 from ..options import Options
 from ..validation import coc_of_lens, image_and_map, same_aspect
-from .doubts import Said
 from .settings import RenderSettings
+from .warn_once import WarnOnce
 
 __all__ = ["Frame", "Rendered", "read_frame", "read_metres", "render_frame", "tint_focus"]
 
@@ -141,7 +141,7 @@ def render_frame(
     out: str | os.PathLike[str],
     settings: RenderSettings,
     frame: int = 0,
-    said: Said | None = None,
+    warned: WarnOnce | None = None,
     source: Frame | None = None,
 ) -> Rendered:
     """Reads an image and its depth, blurs, and writes the result whole or not at all.
@@ -152,7 +152,7 @@ def render_frame(
         out: File to write.
         settings: What the user said.
         frame: Number of the frame, for focus that moves.
-        said: What was warned of in frames before; None warns of everything.
+        warned: What was warned of in frames before; None warns of everything.
         source: What is in ``image`` and ``depth`` where it was read already.
 
     Returns:
@@ -162,7 +162,7 @@ def render_frame(
         ValueError: If input is wrong or missing, or looks like a mistake and the settings are strict.
         OSError: If a file cannot be read or written.
     """
-    said = Said(settings.strict) if said is None else said
+    warned = WarnOnce(settings.strict) if warned is None else warned
     if any(os.path.realpath(source) == os.path.realpath(out) for source in (image, depth) if source is not None):
         raise ValueError(f"{out}: is one of the inputs; write to another file")
     start = time.perf_counter()
@@ -174,14 +174,14 @@ def render_frame(
     remarks: list[str] = []
     if settings.depth_kind == "coc":
         coc_px = values
-        said.say(depth or image, coc_doubts(coc_px))
+        warned.warn(depth or image, coc_mistakes(coc_px))
     else:
         camera, remarks = settings.camera(picture.metadata, width, frame)
         if settings.focus_at is not None:
             camera = camera.focus_at(values, *settings.focus_at)
         coc_px = camera.coc_px(values, width)
         coc_of_lens(coc_px, values, settings.stated(camera))
-        said.say(depth or image, depth_doubts(values, camera, settings.depth_kind, settings.depth_scale))
+        warned.warn(depth or image, depth_mistakes(values, camera, settings.depth_kind, settings.depth_scale))
     pixels = picture.pixels.to(settings.device)
     if settings.show_focus:
         pixels = tint_focus(pixels, coc_px, picture.has_alpha)

@@ -8,7 +8,7 @@ import typer
 
 from ..depth.holes import resolve_holes
 from ..depth.inspect import inspect_depth, panels
-from ..depth.sanity import depth_doubts
+from ..depth.sanity import depth_mistakes
 from ..io.images import read_image
 from ..io.sheet import write_sheet
 from ..optics.camera import CAMERA_NUMBERS
@@ -35,11 +35,11 @@ from .arguments import (
     Tilt,
     ValueRange,
 )
-from .doubts import Said
 from .frame import read_metres
 from .printed import json_line
 from .render import parse_fill, parse_point, parse_range
 from .settings import RenderSettings
+from .warn_once import WarnOnce
 
 __all__ = ["inspect"]
 
@@ -149,4 +149,4 @@ def inspect(
         if filled:
             typer.echo(f"filled        {filled} holes ({100 * filled / metres.numel():.1f} %), {settings.fill}")
         typer.echo(f"picture       {target}")
-    Said(strict).say(depth or image, depth_doubts(metres, camera, depth_kind, depth_scale))
+    WarnOnce(strict).warn(depth or image, depth_mistakes(metres, camera, depth_kind, depth_scale))

@@ -21,7 +21,7 @@ from rich.progress import (
 from torch import Tensor
 
 from ..depth.holes import Fill
-from ..depth.sanity import Doubt
+from ..depth.sanity import Mistake
 from ..depth.steady import SteadyFrames
 from ..io.sequence import FramePattern, parse_focus, parse_frames
 from ..options import tolerance_of_text
@@ -35,6 +35,7 @@ from .arguments import (
     Blades,
     Curvature,
     DepthChannel,
+    DepthEdgesName,
     DepthOffset,
     DepthScale,
     DepthUnknown,
@@ -59,14 +60,14 @@ from .arguments import (
     ValueRange,
     Vignetting,
 )
-from .doubts import Said
 from .frame import Frame, read_frame, render_frame
 from .printed import json_line
 from .settings import RenderSettings, load_aperture, load_table, pick_device
+from .warn_once import WarnOnce
 
 __all__ = ["parse_attention", "parse_fill", "parse_point", "parse_range", "render"]
 
-_EACH_ITS_OWN = Doubt(
+_EACH_ITS_OWN = Mistake(
     "range",
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
     "far have in all frames: --value-range LOW,HIGH",
@@ -128,14 +129,7 @@ def render(
     depth_unknown: DepthUnknown = None,
     fill_depth: FillDepth = None,
     depth_channel: DepthChannel = None,
-    depth_edges: Annotated[
-        Literal["auto", "repair", "as-given"],
-        typer.Option(
-            help="Move and sharpen the edges of the depth to where IMAGE has them: unless they prove exact, each one, "
-            "or not at all.",
-            rich_help_panel=DEPTH,
-        ),
-    ] = "auto",
+    depth_edges: DepthEdgesName = "auto",
     table: TableName = "disc",
     blades: Blades = 0,
     rotation: Rotation = 0.0,
@@ -318,16 +312,16 @@ def _render_sequence(
     if len(todo) < len(numbers):
         there = [target.name(n) for n in numbers if n not in set(todo)]
         typer.echo(_there(there) if as_json else f"{len(there)} of {len(numbers)} frames are there already")
-    said = Said(settings.strict)
+    warned = WarnOnce(settings.strict)
     if settings.depth_kind == "relative" and settings.value_range is None and len(numbers) > 1:
-        said.say(depth or image, [_EACH_ITS_OWN])
+        warned.warn(depth or image, [_EACH_ITS_OWN])
     steadied = _steadied(source, depths, depth, settings) if steady else None
     with _progress() as progress:
         task = progress.add_task("rendering", total=len(todo))
         for n in todo:
             depth_n = depths.name(n) if depths else depth
             read = steadied(n) if steadied else None
-            rendered = render_frame(source.name(n), depth_n, target.name(n), settings, n, said, read)
+            rendered = render_frame(source.name(n), depth_n, target.name(n), settings, n, warned, read)
             typer.echo(json_line(rendered.facts()) if as_json else str(rendered))
             progress.advance(task)
 

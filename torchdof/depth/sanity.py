@@ -16,7 +16,7 @@ from ..optics.camera import Camera
 from ..validation import real_tensor
 from .kinds import DepthKind
 
-__all__ = ["DepthWarning", "Doubt", "check", "coc_doubts", "depth_doubts"]
+__all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes"]
 
 _FACTORS = (0.001, 0.01, 1000.0, 100.0)  # millimetres and centimetres; and what was taken for such and is none
 _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # what counts as in focus: the larger of both
@@ -32,8 +32,8 @@ class DepthWarning(UserWarning):
 
 
 @dataclasses.dataclass(frozen=True)
-class Doubt:
-    """What looks like a mistake.
+class Mistake:
+    """What looks like one in a depth map or its camera.
 
     Args:
         name: "focus": nothing is in focus, or the focus is far from all depth; "far": everything is so far that nothing
@@ -58,7 +58,7 @@ def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
         strict: Raise instead of warning.
 
     Raises:
-        ValueError: If there is a doubt and ``strict``, or an argument is not as described.
+        ValueError: If something looks like a mistake and ``strict``, or an argument is not as described.
 
     Example:
         >>> millimetres = torch.linspace(800.0, 5000.0, 96).expand(1, 1, 64, 96)
@@ -68,15 +68,15 @@ def check(depth: Tensor, camera: Camera, *, strict: bool = False) -> None:
         ...     print(str(error).partition("?")[0])
         the focus at 2 m is nearer than all depth (800 to 5000 m); is it millimetres (--depth-scale 0.001)
     """
-    for doubt in depth_doubts(depth, camera):
+    for mistake in depth_mistakes(depth, camera):
         if strict:
-            raise ValueError(doubt.message)
-        warnings.warn(doubt.message, DepthWarning, stacklevel=2)
+            raise ValueError(mistake.message)
+        warnings.warn(mistake.message, DepthWarning, stacklevel=2)
 
 
-def depth_doubts(
+def depth_mistakes(
     depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"] = "z", scale: float | None = None
-) -> list[Doubt]:
+) -> list[Mistake]:
     """What looks wrong with a depth map seen by a camera.
 
     Args:
@@ -86,13 +86,13 @@ def depth_doubts(
         scale: the factor they were given, for what is advised.
 
     Returns:
-        The doubts, of each name at most one, of the first item that raises it.
+        The mistakes, of each name at most one, of the first item that raises it.
 
     Raises:
         ValueError: If an argument is not as described.
 
     Example:
-        >>> depth_doubts(torch.full((1, 1, 4, 6), 3.0), Camera(focus_m=3.0))
+        >>> depth_mistakes(torch.full((1, 1, 4, 6), 3.0), Camera(focus_m=3.0))
         []
     """
     real_tensor("depth", depth, "[B, 1, H, W] in metres")
@@ -102,23 +102,23 @@ def depth_doubts(
     lens = [getattr(camera, name) for name in _NUMBERS]
     numbers = [torch.as_tensor(value).reshape(-1) for value in (*lens, *in_focus)]
     batch = max(depth.shape[0], *(x.numel() for x in numbers))
-    found: dict[str, Doubt] = {}
+    found: dict[str, Mistake] = {}
     for item in range(batch):
         *lens, near, far = (float(x[min(item, x.numel() - 1)]) for x in numbers)
-        # straight: doubts do not ask where in the frame a depth lies
+        # straight: mistakes do not ask where in the frame a depth lies
         single = camera.replace(
             **dict(zip(_NUMBERS, lens, strict=True)), focus_range_m=(near, far), tilt_deg=0.0, swing_deg=0.0
         )
-        for doubt in _doubts(depth[min(item, depth.shape[0] - 1)], single, kind, scale):
-            found.setdefault(doubt.name, doubt)
+        for mistake in _mistakes(depth[min(item, depth.shape[0] - 1)], single, kind, scale):
+            found.setdefault(mistake.name, mistake)
     return list(found.values())
 
 
-def coc_doubts(coc_px: Tensor) -> list[Doubt]:
+def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
     """What looks wrong with a ready map of the circle of confusion, ``[B, 1, H, W]`` in pixels.
 
     Example:
-        >>> [doubt.name for doubt in coc_doubts(torch.full((1, 1, 4, 6), 1500.0))]
+        >>> [mistake.name for mistake in coc_mistakes(torch.full((1, 1, 4, 6), 1500.0))]
         ['blur']
     """
     real_tensor("coc_px", coc_px, "[B, 1, H, W] in pixels")
@@ -130,11 +130,13 @@ def coc_doubts(coc_px: Tensor) -> list[Doubt]:
         f"a blur radius of {_pixels(float(size.max()))} px on an image of {width} px is more than a lens makes; are "
         "these depths and no circles of confusion? (--depth-kind)"
     )
-    return [Doubt("blur", message)]
+    return [Mistake("blur", message)]
 
 
-def _doubts(depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"], scale: float | None) -> list[Doubt]:
-    """Doubts of one map ``[1, H, W]`` and a camera of plain numbers."""
+def _mistakes(
+    depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"], scale: float | None
+) -> list[Mistake]:
+    """Likely mistakes of one map ``[1, H, W]`` and a camera of plain numbers."""
     width, focus_m = depth.shape[-1], float(camera.focus_m)
     known = depth[depth > 0].detach()
     if not known.numel():
@@ -154,20 +156,20 @@ def _doubts(depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"]
     is_far_off = factor is not None and not near / _FAR_OFF <= focus_m <= far * _FAR_OFF
     if (not is_sharp and not (is_too_blurred and near <= focus_m <= far)) or is_far_off:
         told = _out_of_focus(near, far, extent, focus_m, of_bits, factor, kind, scale)
-        return [Doubt("focus", told if is_sharp else f"nothing is in focus: {told}")]
+        return [Mistake("focus", told if is_sharp else f"nothing is in focus: {told}")]
     found = []
     if of_bits and far <= 255 and far - near >= 64:
         found.append(
-            Doubt(
+            Mistake(
                 "bits", f"all depth is whole numbers {extent}, as files of 8 bits hold; if it is relative, {_RELATIVE}"
             )
         )
     elif _share_at(finite, 0.05) > _FAR_M and largest <= sharp_px and (of_bits or focus_m < math.inf):
         unit = _advice(0.001, scale)
         message = f"all depth is far {extent}, and nothing is blurred; is it {unit}? The focus too is in metres"
-        found.append(Doubt("far", message))
+        found.append(Mistake("far", message))
     if is_too_blurred:
-        found.append(Doubt("blur", _too_blurred(largest, width, far, extent, camera)))
+        found.append(Mistake("blur", _too_blurred(largest, width, far, extent, camera)))
     return found
 
 

@@ -12,7 +12,12 @@ from torch import Tensor
 
 from .layer_weights import blur_axis
 
-__all__ = ["border_nodes", "ends", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
+__all__ = ["DENSE", "border_nodes", "ends", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
+
+DENSE = 0.65
+"""Share of the tolerance for which coarse layers are spaced where nothing tells where a scene's borders lie.
+
+Measured on smooth slopes: from 0.8 on their layers are no denser than what a scene itself gets."""
 
 _FINEST = 0.5
 _FINEST_PARTS = 40.0
@@ -44,13 +49,13 @@ def spacing(x: float, tolerance: float) -> float:
 def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = math.inf) -> tuple[float, ...]:
     """Nodes outwards from focus by :func:`spacing`, the last on each side at or beyond the given end.
 
-    From ``dense_from`` on they are spaced as for half the tolerance.
+    From ``dense_from`` on they are spaced as for a share of the tolerance.
     """
     nodes = [0.0]
     for sign, limit in ((-1, -low), (1, high)):
         x = 0.0
         while x < limit:
-            x += spacing(x, tolerance if x < dense_from else 0.5 * tolerance)
+            x += spacing(x, tolerance if x < dense_from else DENSE * tolerance)
             nodes.append(sign * x)
     return tuple(sorted(nodes))
 
@@ -58,8 +63,8 @@ def spaced_nodes(low: float, high: float, tolerance: float, dense_from: float = 
 def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
     """A node between fixed ones: moved towards one that comes near, and in the end onto it."""
     near = min(fixed, key=lambda other: abs(node - other))
-    room = abs(node - near) / spacing(node, tolerance)
-    return near + (node - near) * min(max((room - _NEAR) / _NEAR, 0.0), 1.0)
+    gap = abs(node - near) / spacing(node, tolerance)
+    return near + (node - near) * min(max((gap - _NEAR) / _NEAR, 0.0), 1.0)
 
 
 def ends(coc_px: Tensor) -> tuple[float, float]:

@@ -15,7 +15,8 @@ namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
-constexpr int SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+constexpr float NOISES = 12.0f;
+constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
@@ -263,11 +264,9 @@ class Repair {
   explicit Repair(const torchdof_map &map)
       : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
 
-  void run() {
-    parallel(height_, [&](int y) {
-      memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
-    });
+  bool run() {
     allocate();
+    noise_step_ = NOISES * noise();
     const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
     const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
     const auto is_sampled = [&](int y, int x) { return (y + 3 * x) % every == 0; };
@@ -282,7 +281,10 @@ class Repair {
     decide(sampled);
     calibrate(sampled);
     const bool is_soft = ramps_of(sampled) > SOFT;
-    if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return;
+    if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
+    parallel(height_, [&](int y) {
+      memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
+    });
     if (spares) groups = find_in(tiles(), 0, is_soft);
     list(groups, [&](const Edge &edge) { return !map_.automatic || (marks_[edge.i] & RAMP ? is_soft : wrong(edge) > DOUBTFUL); });
     judge(groups);
@@ -291,6 +293,7 @@ class Repair {
     const float lost_px = choose(groups);
     move(groups, sigma, lost_px);
     if (is_soft) lift_lamps(sigma, lost_px);
+    return true;
   }
 
  private:
@@ -302,10 +305,26 @@ class Repair {
     });
   }
 
-  float step(size_t i) const { return map_.steps ? map_.steps[i] : map_.step; }
+  float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
   float wrong(const Edge &edge) const { return marks_[edge.i] & GIVEN_NEAR ? 1.0f - shares_[edge.kind] : shares_[edge.kind]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
+
+  // Standard deviation of the map's noise: from how the middle pixel of all bends its row.
+  float noise() const {
+    const int every = (int)(((int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
+    std::vector<float> bends;
+    for (int y = 0; y < height_; y += every) {
+      const float *row = map_.nearness + (size_t)y * width_;
+      for (int x = 0; x < width_ - 2; x++)
+        if (std::fabs(row[x]) <= LARGEST && std::fabs(row[x + 1]) <= LARGEST && std::fabs(row[x + 2]) <= LARGEST)
+          bends.push_back(std::fabs((row[x + 2] - row[x + 1]) - (row[x + 1] - row[x])));
+    }
+    if (bends.empty()) return 0.0f;
+    const auto middle = bends.begin() + (bends.size() - 1) / 2;
+    std::nth_element(bends.begin(), middle, bends.end());
+    return 0.6053f * *middle;
+  }
 
   // Share of ramps among a sample's pixels.
   double ramps_of(const std::vector<Group> &sampled) const {
@@ -458,7 +477,7 @@ class Repair {
   // Where there may be edges.
   Part changing(const Part &part) const {
     const Part around = in_frame(part.grown(STEP_HALO));
-    float least_step = map_.step;
+    float least_step = step(0);
     if (map_.steps) {
       least_step = NONE;
       for (int y = around.y0; y < around.bottom(); y++)
@@ -511,11 +530,11 @@ class Repair {
       store(down.at(y, x), is_valid ? -v : all(-NONE));
     });
     const auto step_at = [&](int y, int x) {
-      if (!map_.steps) return all(map_.step);
+      if (!map_.steps) return all(step(0));
       vec steps;
       const float *row = map_.steps + (size_t)std::min(std::max(y, 0), height_ - 1) * width_;
       for (int i = 0; i < LANES; i++) steps[i] = row[std::min(std::max(x + i, 0), width_ - 1)];
-      return steps;
+      return most(steps, all(noise_step_));
     };
     slopes(raw, slope, jump, is_wide ? ramps.grown(FLAT_REACH + 2) : beside);
     highest<REACH>(up, high, rows, ramps);
@@ -1055,7 +1074,7 @@ class Repair {
         high = most(high, load<vec>(near.at(y, x)));
         low = least(low, load<vec>(near.at(y, x)));
       });
-      if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * map_.step)) return;
+      if (!map_.steps && !(largest(high) - smallest(low) > 0.5f * step(0))) return;
       const Group group{part, lamps_of(part, near)};
       if (group.edges.empty()) return;
       const Part around = bounds(group, [](size_t) { return true; }).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
@@ -1145,8 +1164,9 @@ class Repair {
   const torchdof_map &map_;
   const int height_, width_, channels_;
   const size_t area_;
-  Buffer<float> near_, far_, witness_, score_, evidence_;
-  Buffer<uint8_t> marks_, kind_;
+  float noise_step_ = 0.0f;  // of a map's noise
+  Buffer<float> score_, evidence_;
+  Buffer<uint8_t> marks_;
   Buffer<Judgement> judged_;  // of the pixels listed last
   Buffer<Around> around_;
   mutable std::vector<Scratch> scratch_;  // of threads
@@ -1156,7 +1176,21 @@ class Repair {
 
 }  // namespace
 
-void repair_edges(const torchdof_map &map) { Repair(map).run(); }
+bool repair_edges(const torchdof_map &map) {
+  if (!map.of_coc) return Repair(map).run();
+  const Buffer<float> nearness((size_t)map.height * map.width);
+  auto negate = [&](const float *from, float *to) {
+    torchdof::parallel(map.threads, map.height, map.cancelled, [&](int y, int) {
+      for (size_t i = (size_t)y * map.width; i < (size_t)(y + 1) * map.width; i++) to[i] = -from[i];
+    });
+  };
+  negate(map.nearness, nearness.data());
+  torchdof_map negative = map;
+  negative.nearness = nearness.data();
+  const bool changed = Repair(negative).run();
+  if (changed) negate(map.out, map.out);
+  return changed;
+}
 
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

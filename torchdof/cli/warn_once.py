@@ -7,12 +7,12 @@ from typing import Any
 
 import typer
 
-from ..depth.sanity import DepthWarning, Doubt
+from ..depth.sanity import DepthWarning, Mistake
 
-__all__ = ["Said"]
+__all__ = ["WarnOnce"]
 
 
-class Said:
+class WarnOnce:
     """What was warned of already: what is wrong with a sequence is wrong with each of its frames.
 
     Args:
@@ -23,24 +23,24 @@ class Said:
         self._strict = strict
         self._names: set[str] = set()
 
-    def say(self, source: str | os.PathLike[str], doubts: Iterable[Doubt]) -> None:
-        """Warns of each doubt of a kind that was not warned of before.
+    def warn(self, source: str | os.PathLike[str], mistakes: Iterable[Mistake]) -> None:
+        """Warns of each likely mistake of a kind that was not warned of before.
 
         ``PYTHONWARNINGS=ignore`` silences them; what makes errors of them is strictness alone.
 
         Raises:
-            ValueError: If there is a doubt, and strictness is asked for.
+            ValueError: If there is one, and strictness is asked for.
         """
-        for doubt in doubts:
+        for mistake in mistakes:
             if self._strict:
-                raise ValueError(f"{source}: {doubt.message} (--strict)")
-            if doubt.name in self._names:
+                raise ValueError(f"{source}: {mistake.message} (--strict)")
+            if mistake.name in self._names:
                 continue
-            self._names.add(doubt.name)
+            self._names.add(mistake.name)
             with warnings.catch_warnings():
                 warnings.showwarning = _one_line
                 try:
-                    warnings.warn(f"{source}: {doubt.message}", DepthWarning, stacklevel=2)
+                    warnings.warn(f"{source}: {mistake.message}", DepthWarning, stacklevel=2)
                 except DepthWarning as warning:
                     _one_line(warning)
 

@@ -1,0 +1,76 @@
+"""A file that repairs depth edges: the same maps and the same pictures as the plain engine's."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof import Camera, blur_by_coc
+from torchdof.depth.edges import DepthEdges
+from torchdof.export import describe
+from torchdof.export.verification import TOLERANCE, local_range, session
+from torchdof.reference.degraded import degrade
+from torchdof.reference.scenes import Plane, plane_scene, posts, waves
+from torchdof.render.plan import Plan
+
+KINDS = ("half-res", "near -1px", "exact")
+
+
+@pytest.fixture(scope="module")
+def tensors() -> tuple[Tensor, Tensor]:
+    """Posts before a wall in focus, and their coc down to -2 px: soft, a pixel too thin, and exact."""
+    planes = [
+        Plane(6.0, waves(1, mean=(0.5, 0.4, 0.3))),
+        Plane(1.2, waves(3, mean=(0.35, 0.1, 0.1)), posts(67.0, 9.0, -0.4, 11.0)),
+    ]
+    scene = plane_scene(planes, Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.02, focus_m=6.0), (90, 141), 4)
+    near = [1.0 / degrade(scene.depth, kind) for kind in KINDS]
+    coc = [-2.0 * (n - 1.0 / 6.0) / (1.0 / 1.2 - 1.0 / 6.0) for n in near]
+    return scene.image.float().repeat(len(KINDS), 1, 1, 1), torch.cat(coc).float()
+
+
+def rendered(image: Tensor, coc: Tensor, edges: DepthEdges) -> Tensor:
+    """By the plain engine, with the layers of the file."""
+    plan = Plan.all(2.0, 1 / 255, rays=True)
+    with torch.no_grad():
+        return blur_by_coc(image, coc, plan=plan, max_coc_px=2.0, occlusion=False, check=False, depth_edges=edges)
+
+
+def error(got: np.ndarray, expected: Tensor, image: Tensor) -> float:
+    return float(((torch.from_numpy(np.array(got)) - expected).abs() / local_range(image, 4)).max())
+
+
+def test_a_file_repairs_what_the_module_repairs(
+    exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    path, _ = exported_by_command
+    image, coc = tensors
+    expected, given = (rendered(image, coc, edges) for edges in ("auto", "as given"))
+    assert [bool(d > 0.05) for d in (expected - given).abs().amax((1, 2, 3))] == [True, True, False]
+    got = session(path).run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    assert error(got, expected, image) <= TOLERANCE
+
+
+def test_a_file_without_edges_to_repair_is_bit_exact_in_focus(
+    exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor]
+) -> None:
+    path, _ = exported_by_command
+    assert describe(path)["depth_edges"] == "auto"
+    image = tensors[0]
+    got = session(path).run(None, {"image": image.numpy(), "coc_px": np.zeros_like(tensors[1])})[0]
+    assert np.array_equal(got, image.numpy())
+
+
+@pytest.mark.skipif(importlib.util.find_spec("openvino") is None, reason="openvino is not installed (pip)")
+def test_openvino_repairs_the_same(exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor]) -> None:
+    import openvino
+
+    path, _ = exported_by_command
+    compiled = openvino.Core().compile_model(str(path), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+    image, coc = tensors
+    got = compiled({"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    assert error(got, rendered(image, coc, "auto"), image) <= 10 * TOLERANCE
