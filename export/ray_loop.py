@@ -144,7 +144,9 @@ def hidden_of(
     taken = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
     side = op.Shape(step)
     none = op.ConstantOfShape(op.Concat(op.Shape(item, start=0, end=1), side, side, axis=0))
-    return op.Min(op.ScatterND(none, op.Unsqueeze(source, axis_1), taken, reduction="add"), 1.0)
+    # not by ScatterND: runtimes add in parallel there, and a source has several bins
+    into = op.Expand(op.Unsqueeze(source, axes), op.Shape(taken))
+    return op.Min(op.ScatterElements(none, into, taken, axis=0, reduction="add"), 1.0)
 
 
 @_script
@@ -178,49 +180,12 @@ def splat(
     height: Ints,
     width: Ints,
     across: Ints,
-) -> Floats:
-    """Light ``[C, B, H, W]`` of all sources, none of which is hidden, on a blank frame with room around it."""
-    splats = op.Reshape(blank, op.Constant(value_ints=[0, -1]))
-    start = op.Constant(value_int=0)
-    going = op.Size(half) > 0
-    while going:
-        stop = stop_of(half, start)
-        reach = op.Gather(half, stop - 1)
-        step = op.Range(-reach, reach + 1, 1)
-        at = op.Range(start, stop, 1)
-        node_at, part_at = op.Gather(node, at), op.Gather(part, at)
-        kernels = kernels_at(values, origins, halves, round, node_at, part_at, step)
-        splats = landed(splats, op.Gather(light, at), op.Gather(first, at), kernels, step, across)
-        start = stop
-        going = start < op.Size(half)
-    return op.Reshape(splats, op.Shape(blank))
-
-
-@_script
-def splat_past(
-    blank: Floats,
-    light: Floats,
-    coc: Floats,
-    item: Ints,
-    row: Ints,
-    column: Ints,
-    first: Ints,
-    node: Ints,
-    part: Floats,
-    half: Ints,
-    values: Floats,
-    origins: Ints,
-    halves: Ints,
-    round: Flag,
-    height: Ints,
-    width: Ints,
-    across: Ints,
     places: Floats,
     covers: Floats,
     cells: Floats,
     nearest: Floats,
 ) -> Floats:
-    """The same, but for what nearer surfaces take."""
+    """Light ``[C, B, H, W]`` of all sources on a blank frame with room around it, but for what nearer surfaces take."""
     splats = op.Reshape(blank, op.Constant(value_ints=[0, -1]))
     start = op.Constant(value_int=0)
     going = op.Size(half) > 0
@@ -250,5 +215,5 @@ def splat_past(
     return op.Reshape(splats, op.Shape(blank))
 
 
-FUNCTIONS = (stop_of, values_at, kernels_at, covered_at, count_in, hidden_of, landed, splat, splat_past)
+FUNCTIONS = (stop_of, values_at, kernels_at, covered_at, count_in, hidden_of, landed, splat)
 """All of them, by their names in the graph."""

@@ -97,14 +97,15 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
     lists = [light, coc, item, row, column, first, node, part, half]
     blank = coc_px.new_zeros(rays.light.shape[0], batch, down, across)
     sizes = [torch.scalar_tensor(n, dtype=torch.int64) for n in (height, width, across)]
-    inputs = [blank, *lists, *lens, *sizes]
+    nearest = coc_px.min()
     if obstacles:
-        nearest = coc_px.min()
         places = [(coc - nearest, cover) for coc, cover in obstacles]
-        inputs += [torch.stack([t.flatten() for t in maps], 1) for maps in zip(*places, strict=True)]
-        inputs += [_covered_cells(places, bins), nearest]
-    name = "splat_past" if obstacles else "splat"
-    splats = torch.onnx.ops.symbolic(f"torchdof::{name}", inputs, dtype=blank.dtype, shape=list(blank.shape), version=1)
+        maps = [torch.stack([t.flatten() for t in part], 1) for part in zip(*places, strict=True)]
+        maps.append(_covered_cells(places, bins))
+    else:  # in no bin is there anything
+        maps = [coc_px.new_zeros(1, 1), coc_px.new_zeros(1, 1), coc_px.new_zeros(0, 1, 1, 1)]
+    inputs = [blank, *lists, *lens, *sizes, *maps, nearest]
+    splats = torch.onnx.ops.symbolic("torchdof::splat", inputs, dtype=blank.dtype, shape=list(blank.shape), version=1)
     return splats.transpose(0, 1).narrow(-2, margin, height).narrow(-1, margin, width)
 
 

@@ -2,10 +2,10 @@
 
 import itertools
 import string
-from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
+import onnx
 import onnx_ir
 from onnx_ir.passes import common as passes
 from onnx_ir.tape import Tape
@@ -33,6 +33,8 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
         _Parts(),
         _Cuts(),
         _Averages(),
+        _Fills(),
+        _Ramps(),
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
         passes.RemoveUnusedNodesPass(),
@@ -57,16 +59,8 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
     passes.RemoveUnusedNodesPass()(model)
     for graph in (model.graph, *model.graph.subgraphs()):
         _as_nodes(graph)
-    kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
-    names = ("".join(letters) for n in (2, 3, 4) for letters in itertools.product(string.ascii_letters, repeat=n))
-    names = (name for name in names if name not in kept)
-    for graph in (model.graph, *model.graph.subgraphs()):
-        for value in (*graph.inputs, *graph.initializers.values()):
-            _shorten(value, kept, names)
-        for node in graph:
-            node.name = None
-            for value in node.outputs:
-                _shorten(value, kept, names)
+    _drop_defaults(model)
+    _shorten(model)
     return model
 
 
@@ -216,6 +210,116 @@ class _Averages(onnx_ir.passes.InPlacePass):
         return onnx_ir.passes.PassResult(model, modified=True)
 
 
+class _Fills(onnx_ir.passes.InPlacePass):
+    """Channels that only fill up a convolution: as a part of what is put together before it, and of the split after it.
+
+    What they hold does not matter, for nothing takes them: they are some of the others once more.
+    """
+
+    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
+        """Replace in the graph."""
+        graph = model.graph
+        for node in list(graph):
+            spare = _spare_channels(node) if node.op_type == "Pad" else 0
+            parts: Any = node.inputs[0].producer() if spare and node.inputs[0] is not None else None
+            if parts is not None and parts.op_type == "Concat" and parts.attributes["axis"].as_int() == 1:
+                filled, tape = list(parts.inputs), Tape()
+                for part in parts.inputs:
+                    while spare >= part.shape[1]:
+                        filled.append(part)
+                        spare -= part.shape[1]
+                if spare:
+                    name = f"{node.outputs[0].name}_fill"
+                    ends = {"start": 0, "stop": spare, "axis": 1}
+                    bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
+                    filled.append(tape.op("Slice", [parts.inputs[0], *bounds]))
+                whole = tape.op("Concat", filled, {"axis": 1})
+                whole.type, whole.shape = node.outputs[0].type, node.outputs[0].shape
+                graph.insert_before(node, list(tape.nodes))
+                node.outputs[0].replace_all_uses_with(whole)
+                graph.remove(node, safe=True)
+            cut: Any = node.inputs[0].producer() if node.op_type == "Split" and node.inputs[0] is not None else None
+            if cut is not None and cut.op_type == "Slice" and node.attributes["axis"].as_int() == 1:
+                whole, size, sizes = cut.inputs[0], node.inputs[0].shape, node.inputs[1]
+                numbers = None if sizes is None else onnx_ir.convenience.get_const_tensor(sizes)
+                alike = whole.shape is not None and [a == b for a, b in zip(whole.shape, size, strict=True)]
+                start = onnx_ir.convenience.get_const_tensor(cut.inputs[1])
+                if numbers is None or start is None or start.numpy().any() or alike != [True, False, True, True]:
+                    continue
+                more = [*numbers.numpy().tolist(), whole.shape[1] - size[1]]
+                sizes = _initializer(graph, np.array(more), f"{node.outputs[0].name}_sizes")
+                split = onnx_ir.node("Split", [whole, sizes], {"axis": 1}, num_outputs=len(more))
+                graph.insert_before(node, [split])
+                for old, new in zip(node.outputs, split.outputs, strict=False):
+                    new.type, new.shape = old.type, old.shape
+                    old.replace_all_uses_with(new)
+                graph.remove(node, safe=True)
+        return onnx_ir.passes.PassResult(model, modified=True)
+
+
+class _Ramps(onnx_ir.passes.InPlacePass):
+    """Straight lines that are clipped to 0 and 1, as one operator instead of three.
+
+    They are ``1 - clip(x / width)``, and of an eased ramp ``1 - slope (1 - w)`` of a clipped ``w``, which is below 0
+    only where its foot, which never is, is taken instead.
+    """
+
+    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
+        """Replace in the graph."""
+        for node in list(model.graph):
+            clip: Any = _operand(node.outputs[0], "Sub", 1.0)
+            clip = None if clip is None else clip.producer()
+            falls: Any = None if clip is None or clip.op_type != "Clip" else clip.inputs[0].producer()
+            if falls is not None and falls.op_type == "Div" and [_number(v) for v in clip.inputs[1:]] == [0.0, 1.0]:
+                width = _number(falls.inputs[1])
+                if width is not None:
+                    line = onnx_ir.node("HardSigmoid", [falls.inputs[0]], {"alpha": -1.0 / width, "beta": 1.0})
+                    line.outputs[0].type, line.outputs[0].shape = node.outputs[0].type, node.outputs[0].shape
+                    model.graph.insert_before(node, [line])
+                    node.outputs[0].replace_all_uses_with(line.outputs[0])
+            if node.op_type != "Max" or len(node.inputs) != 2:
+                continue
+            straight, lack, rest = node.inputs[0], _operand(node.inputs[0], "Sub", 1.0), None
+            scaled: Any = None if lack is None else lack.producer()
+            slope = None if scaled is None else _number(scaled.inputs[-1])
+            if scaled is not None and scaled.op_type == "Mul" and slope is not None:
+                rest = _operand(scaled.inputs[0], "Sub", 1.0)
+            clipped: Any = None if rest is None else rest.producer()
+            if rest is None or straight is None or slope is None or clipped.op_type != "Clip":
+                continue
+            # exactly 1 at 1: the offset is a multiple of what a number as large as the slope can tell apart
+            offset = round((1.0 - slope) * 2**23) / 2**23
+            line = onnx_ir.node("HardSigmoid", [clipped.inputs[0]], {"alpha": 1.0 - offset, "beta": offset})
+            line.outputs[0].type, line.outputs[0].shape = straight.type, straight.shape
+            model.graph.insert_before(clipped, [line])
+            straight.replace_all_uses_with(line.outputs[0])
+            for use in list(rest.uses()):
+                if use.node.op_type == "Clip" and use.node.inputs[1] is None:  # the foot
+                    use.node.replace_input_with(0, clipped.inputs[0])
+                    use.node.replace_input_with(1, clipped.inputs[1])
+        return onnx_ir.passes.PassResult(model, modified=True)
+
+
+def _operand(value: onnx_ir.Value | None, operator: str, number: float) -> onnx_ir.Value | None:
+    """What a number's difference, product or the like is taken with, if that is what a value is."""
+    node = None if value is None else value.producer()
+    is_it = node is not None and node.op_type == operator and _number(node.inputs[0]) == number
+    return node.inputs[1] if node is not None and is_it else None
+
+
+def _number(value: onnx_ir.Value | None) -> float | None:
+    """A constant of one number."""
+    tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
+    return float(tensor.numpy().item()) if tensor is not None and tensor.size == 1 else None
+
+
+def _spare_channels(node: onnx_ir.Node) -> int:
+    """How many channels a ``Pad`` adds behind those there are, if that is all that it does."""
+    pads = None if len(node.inputs) < 2 or node.inputs[1] is None else node.inputs[1].const_value
+    ends = [] if pads is None else pads.numpy().tolist()
+    return ends[5] if len(ends) == 8 and not any(ends[:5] + ends[6:]) else 0
+
+
 def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
     """The part that a slice cuts out, if it is exactly one of those that its input is made of."""
     whole, *bounds = node.inputs
@@ -246,10 +350,40 @@ def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.Dat
     return _initializer(graph, value.const_value.numpy().astype(kind.numpy()), f"cast_{number}")
 
 
-def _shorten(value: onnx_ir.Value, kept: Collection[str | None], names: Iterator[str]) -> None:
-    if value.name in kept:
-        return
-    value.name = next(names)
-    if not value.is_graph_output() and not value.is_graph_input() and not value.is_initializer():
-        # names, types and shapes of what lies between would be most of the file; inference finds them
-        value.shape = value.type = None
+def _drop_defaults(model: onnx_ir.Model) -> None:
+    """Attributes that state what holds without them."""
+    for node in model.graph.all_nodes():
+        known = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
+        for name, attribute in list(node.attributes.items()):
+            default = known[name].default_value
+            if default.type and onnx.helper.get_attribute_value(default) == _plain(attribute):
+                del node.attributes[name]
+
+
+def _plain(attribute: onnx_ir.Attr) -> Any:
+    """What an attribute holds, as :mod:`onnx` tells it; None of graphs and tensors."""
+    value = attribute.value
+    return value.encode() if isinstance(value, str) else value if isinstance(value, int | float) else None
+
+
+def _shorten(model: onnx_ir.Model) -> None:
+    """No names of nodes, and short ones of values, the shortest of those that are named most often.
+
+    Types and shapes of what lies between would be most of the file as well; inference finds them.
+    """
+    kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
+    values: list[onnx_ir.Value] = []
+    for graph in (model.graph, *model.graph.subgraphs()):
+        values += [*graph.inputs]
+        for node in graph:
+            node.name = None
+            values += node.outputs
+            for value in node.outputs:
+                if not value.is_graph_output():
+                    value.shape = value.type = None
+    values = sorted((v for v in values if v.name not in kept), key=lambda v: -len(v.uses()))
+    alphabet = string.ascii_letters
+    lengths = ([alphabet] + [alphabet + string.digits] * n for n in range(4))
+    names = ("".join(letters) for length in lengths for letters in itertools.product(*length))
+    for value, name in zip(values, (name for name in names if name not in kept), strict=False):
+        value.name = name

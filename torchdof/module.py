@@ -376,7 +376,7 @@ def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     """A map of the coc with its edges where the image has them, as far as the options ask for that."""
     if options.depth_edges == "as given" or (not validation.is_traced() and not _has_steps(coc_px)):
         return coc_px
-    mended = -repair(image, -coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto")
+    mended = repair(image, coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto", of_coc=True)
     mended = where_needed(lambda: _has_steps(coc_px), mended, coc_px)
     return torch.where(mended == coc_px, coc_px, mended) if coc_px.requires_grad else mended
 

@@ -119,9 +119,10 @@ def noise_near(pair: Forward, solution: Solution, near: Mask) -> float:
     inside = near[1:-1, 1:-1]
     seen = float(np.mean(mixed_differences(residual)[inside] ** 2)) if inside.any() else 0.0
     light = float(np.mean(np.maximum(pair.data[near] - solution.background, 0.0))) if near.any() else 0.0
-    known = noise_of(pair.data) ** 2 + pair.shot_noise * light
+    dark, light = noise_of(pair.data) ** 2, pair.shot_noise * light
+    known = dark / pair.fine_share + light / (pair.fine_share_of_light or pair.fine_share)
     # what is more is not noise of the camera's kind, and need not go together in neighbours
-    return float(np.sqrt(known / pair.fine_share + max(seen - known, 0.0)))
+    return float(np.sqrt(known + max(seen - dark - light, 0.0)))
 
 
 def check_fit(

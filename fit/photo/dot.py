@@ -7,9 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..problems import DotNotFoundError, SeveralDotsError, WindowError
-from ..result import Array
+from ..result import Array, Mask
 
-__all__ = ["Dot", "find_dot", "find_dots", "mixed_differences", "noise_inside", "noise_of", "radial_mean"]
+__all__ = [
+    "Dot",
+    "find_dot",
+    "find_dots",
+    "fine_share_inside",
+    "mixed_differences",
+    "noise_inside",
+    "noise_of",
+    "radial_mean",
+]
 
 _THRESHOLD = 0.15  # of the peak: low enough to keep an uneven ring in one piece
 _SMALLEST_PX = 9
@@ -174,14 +183,38 @@ def radial_mean(picture: Array, distance: Array) -> tuple[Array, Array]:
     return total[:whole] / np.maximum(count[:whole], 1), count[:whole].astype(np.float64)
 
 
+def _inside(picture: Array, dot: Dot) -> Mask | None:
+    """Pixels `[H, W]` that the edge of a sharp dot does not reach; None where they are too few."""
+    rows, columns = np.indices(picture.shape)
+    inside = np.asarray(np.hypot(columns - dot.x, rows - dot.y) < dot.radius - 4)
+    return inside if inside.sum() >= 25 else None
+
+
+def fine_share_inside(picture: Array, dot: Dot) -> float | None:
+    """Share of the noise's variance within a sharp dot that second differences see; None where the dot is too small.
+
+    A JPEG keeps fine noise in the light that it takes away in the dark. Uneven light, a parabola, is no noise.
+    """
+    inside = _inside(picture, dot)
+    if inside is None:
+        return None
+    rows, columns = np.nonzero(inside)
+    x, y = (columns - dot.x) / dot.radius, (rows - dot.y) / dot.radius
+    light = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    levels = picture[inside]
+    left = levels - light @ np.linalg.lstsq(light, levels, rcond=None)[0]
+    variance = float(left @ left) / (levels.size - light.shape[1])
+    fine = float(np.mean(mixed_differences(picture)[inside[1:-1, 1:-1]] ** 2))
+    return min(fine / variance, 1.0) if variance > 0 else 1.0
+
+
 def noise_inside(picture: Array, dot: Dot) -> tuple[float, int] | None:
     """Deviation of a pixel's noise within a sharp dot, and how certain it is; None where the dot is too small.
 
     The latter as one over the square of its relative standard error.
     """
-    rows, columns = np.indices(picture.shape)
-    inside = np.hypot(columns - dot.x, rows - dot.y) < dot.radius - 4
-    if inside.sum() < 25:
+    inside = _inside(picture, dot)
+    if inside is None:
         return None
     # as `noise_of` measures it, which sees another share of noise that goes together in neighbours than one axis does
     found = float(np.sqrt(np.mean(mixed_differences(picture)[inside[1:-1, 1:-1]] ** 2)))

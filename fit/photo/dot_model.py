@@ -8,8 +8,8 @@ import numpy as np
 
 from ..result import Array
 from ..solve import best_of
-from .dot import Dot, noise_inside
-from .noise import correlate, correlation_of, fine_share
+from .dot import Dot, noise_inside, radial_mean
+from .noise import correlate, correlation_of, noise_beside
 from .profile_fit import inverse
 
 __all__ = ["STEPS", "Edge", "draw_edge", "soft_edge", "with_softness"]
@@ -122,17 +122,22 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         moved[i] += h
         slope[:, i] = (model(levels, *moved) - model(levels, *solution)) / h
     variance = float(residual @ residual) / max(levels.size - len(solution), 1)
-    smooth = fine_share(correlation_of(picture - dot.background, ~near))
+    smooth = noise_beside(picture, dot.background, ~near)[1]
     expected = float(np.sqrt(np.mean(_variance(picture, dot)[near]) / smooth)) / dot.peak
-    # noise that goes together in neighbours does not average out along the edge
+    # a mosaic errs at the edge far more than within the dot, and noise that goes together in neighbours does not
+    # average out along the edge
     shown = np.zeros(picture.shape)
     shown[near] = residual
+    distance = np.hypot(grid[1] - dot.x - solution[0], grid[0] - dot.y - solution[1])
+    rings, _ = radial_mean(shown**2, distance)
+    deviation = np.sqrt(rings)[np.minimum(np.floor(distance + 0.5).astype(np.int64), rings.size - 1)]
     pictures = np.zeros((slope.shape[1], *picture.shape))
-    pictures[:, near] = slope.T
-    together = correlate(pictures, correlation_of(shown, near))[:, near]
+    pictures[:, near] = deviation[near] * slope.T
+    correlation = correlation_of(shown / np.maximum(deviation, np.finfo(float).tiny), near)
+    together = deviation[near] * correlate(pictures, correlation)[:, near]
     bread = inverse(slope.T @ slope)
     bread = np.where(np.isfinite(bread), bread, 0.0)
-    covariance = bread @ (slope.T @ together.T) @ bread * variance
+    covariance = bread @ (slope.T @ together.T) @ bread * levels.size / max(levels.size - len(solution), 1)
     return Edge(
         x=dot.x + float(solution[0]),
         y=dot.y + float(solution[1]),

@@ -18,7 +18,7 @@ from torchdof.optics.psf import FAMILIES, LENGTHS, pixel_kernels, support
 from ..result import Array, Mask
 from ..solve import best_of
 from .dot import Dot, noise_of
-from .noise import correlate, correlation_of, fine_share
+from .noise import correlate, correlation_of, noise_beside
 from .profile_fit import inverse
 from .source import Source
 
@@ -33,7 +33,6 @@ SHAPES = {**FAMILIES, **OPENINGS}
 
 _LEAST, _MOST = {"b": -1.0, "rotation_deg": -np.inf}, {"curvature": 1.0}
 _DRAWN_PX = 16.0
-_FEWEST, _LEAST_FINE = 300, 1e-4  # dark pixels that tell a spread; share of fine noise that there is at least
 _STEP = {"dx": 1e-4, "dy": 1e-4, "magnification": 1e-5}
 
 
@@ -69,6 +68,7 @@ class Forward:
         fit_moves: which of displacement and magnification are fitted.
         held_magnification: the one to use where it is not fitted, and to start from; None takes the expected one.
         shot_noise: how much the variance of a pixel's noise, as second differences see it, grows with its level.
+        fine_share_of_light: share of that growth that second differences see; None takes the dark paper's.
         distance: of each pixel from the blurred dot's centre `[H, W]`, px.
         noise_correlation: how the noise of neighbouring pixels goes together, from the dark paper.
         fine_share: share of the noise's variance that second differences see.
@@ -87,6 +87,7 @@ class Forward:
     start: dict[str, dict[str, float]] = field(default_factory=dict)
     prior: dict[str, tuple[float, float]] = field(default_factory=dict)
     shot_noise: float = 0.0
+    fine_share_of_light: float | None = None
     opening: Aperture | None = None
 
     def __post_init__(self) -> None:
@@ -107,14 +108,7 @@ class Forward:
         rows_, columns_ = np.indices(self.data.shape)
         self.distance = np.hypot(columns_ - self.data_dot.x, rows_ - self.data_dot.y)
         dark = self.used & (self.distance > self.data_dot.reach + 2)
-        beside = self.data - self.data_dot.background
-        self.noise_correlation = correlation_of(beside, dark)
-        self.fine_share = fine_share(self.noise_correlation)
-        if dark.sum() >= _FEWEST:
-            # a correlation of which chance hides a part makes more of the noise fine than there is, and a mosaic's is
-            # not even alike in all pixels: the paper's own spread is the measure
-            spread = 1.4826 * float(np.median(np.abs(beside[dark] - np.median(beside[dark]))))
-            self.fine_share = min(max((noise_of(self.data) / spread) ** 2, _LEAST_FINE), 1.0) if spread > 0 else 1.0
+        self.noise_correlation, self.fine_share = noise_beside(self.data, self.data_dot.background, dark)
         # every level near 1, so that one tolerance serves all pictures
         self.unit = max(float(np.abs(self.values - self.data_dot.background).max()), np.finfo(float).tiny)
 

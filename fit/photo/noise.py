@@ -9,14 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from ..result import Array, Mask
+from .dot import noise_of
 
-__all__ = ["LAGS", "correlate", "correlation_of", "fine_share", "independent_share"]
+__all__ = ["LAGS", "correlate", "correlation_of", "fine_share", "independent_share", "noise_beside"]
 
 LAGS = 6
 """Pixels up to which noise may go together; demosaicing reaches 2, a JPEG's blocks 7."""
 
 _FEWEST = 300  # pixels below which a correlation is not worth estimating
 _CLEAR = 4.0  # standard errors above which a correlation is taken for one
+_LEAST_FINE = 1e-4  # share of fine noise that there is at least
 
 
 def correlation_of(values: Array, used: Mask) -> Array:
@@ -75,7 +77,28 @@ def fine_share(correlation: Array) -> float:
     """Share of the noise's variance that mixed second differences see: 1 where neighbours are independent."""
     second = np.convolve([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
     middle = slice(LAGS - 2, LAGS + 3)
-    return float(max(np.sum(np.outer(second, second) * correlation[middle, middle]) / 36.0, 1e-4))
+    return float(max(np.sum(np.outer(second, second) * correlation[middle, middle]) / 36.0, _LEAST_FINE))
+
+
+def noise_beside(picture: Array, background: float, dark: Mask) -> tuple[Array, float]:
+    """How the noise of the paper beside a dot goes together, and what share of it second differences see.
+
+    Args:
+        picture: `[H, W]`.
+        background: level of the paper.
+        dark: `[H, W]`, which pixels show nothing else.
+
+    Returns:
+        The correlation as from :func:`correlation_of`, and the share.
+    """
+    beside = picture - background
+    correlation = correlation_of(beside, dark)
+    if dark.sum() < _FEWEST:
+        return correlation, fine_share(correlation)
+    # a correlation of which chance hides a part makes more of the noise fine than there is, and a mosaic's is not
+    # even alike in all pixels: the paper's own spread is the measure
+    spread = 1.4826 * float(np.median(np.abs(beside[dark] - np.median(beside[dark]))))
+    return correlation, min(max((noise_of(picture) / spread) ** 2, _LEAST_FINE), 1.0) if spread > 0 else 1.0
 
 
 def independent_share(correlation: Array) -> float:

@@ -17,7 +17,7 @@ from ..result import Array, BlurFit
 from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
 from .diagnostics import FAR_ABOVE, check_fit
-from .dot import find_dot, noise_inside
+from .dot import find_dot, fine_share_inside, noise_inside
 from .dot_model import Edge, soft_edge, with_softness
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
@@ -270,7 +270,16 @@ def prepared_pair(
     explained = close and edge.radius > 2 * edge.softness
     ideal = clipped or source == "dot" or (source == "auto" and explained)
     stand_in = IdealDot.of(dot, focused(edge)) if ideal else PictureOfDot.of(still, dot)
-    return Forward(stand_in, data, used, data_dot, magnification, shot_noise=shot_noise), edge, linear
+    pair = Forward(
+        stand_in,
+        data,
+        used,
+        data_dot,
+        magnification,
+        shot_noise=shot_noise,
+        fine_share_of_light=fine_share_inside(still, dot),
+    )
+    return pair, edge, linear
 
 
 def _with_magnification(pair: Forward) -> Forward:

@@ -221,6 +221,8 @@ def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
     fast = native.repair_edges(scene.image[0], nearness[0, 0], torch.tensor(1.0), auto)
     same = torch.isclose(fast, plain[0, 0], rtol=1e-3, atol=1e-3, equal_nan=True)
     assert float(same.float().mean()) > 0.999  # where both surfaces are equally likely, rounding may decide
+    coc = native.repair_edges(scene.image[0], -nearness[0, 0], torch.tensor(1.0), auto, of_coc=True)
+    torch.testing.assert_close(coc, -fast, rtol=0, atol=0, equal_nan=True)
 
 
 @compiled

@@ -84,6 +84,7 @@ class Simulator:
         exposure: light in the defocused picture over the sharp one.
         black: level added to both pictures.
         offset: level added to the defocused picture alone (stray light).
+        place: of the sharp dot (x, y) in px from the picture's centre; the defocused one is there, too.
         shift: displacement (x, y) of the defocused dot in px.
         magnification: size of the defocused picture's dot over the sharp one's.
         bits: quantisation; None for none.
@@ -106,6 +107,7 @@ class Simulator:
     exposure: float = 1.0
     black: float = 0.0
     offset: float = 0.0
+    place: tuple[float, float] = (0.0, 0.0)
     shift: tuple[float, float] = (0.0, 0.0)
     magnification: float = 1.0
     bits: int | None = None
@@ -122,8 +124,9 @@ class Simulator:
     def pair(self, family: str, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
         rng = np.random.default_rng(seed)
-        sharp = draw_dot(self.size, self.dot_radius)
-        moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, self.shift), self.size)
+        there = self.place[0] + self.shift[0], self.place[1] + self.shift[1]
+        sharp = draw_dot(self.size, self.dot_radius, self.place)
+        moved = np.pad(draw_dot(self.size, self.dot_radius * self.magnification, there), self.size)
         if self.edge_sigma:
             sharp, moved = (blur(p, "gaussian", {"sigma": self.edge_sigma}) for p in (sharp, moved))
         if self.texture:

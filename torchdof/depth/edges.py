@@ -110,14 +110,15 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     return torch.where(changed, 1.0 / mended.clamp_min(0.0), depth)
 
 
-def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) -> Tensor:
+def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool = False) -> Tensor:
     """Repairs a map of nearness, of any scale and offset; what is not finite, or above 1e15, stays and touches nothing.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer; the negative coc is one.
+        nearness: ``[B or 1, 1, H, W]``, linear in 1 / depth, larger is nearer.
         step: Difference in nearness from which on neighbours are two surfaces, ``[B, 1, H, W]`` or a number.
         auto: Whether edges that prove exact are left alone.
+        of_coc: Whether the map is of the coc instead, which is larger where it is farther.
 
     Returns:
         ``[B, 1, H, W]``, constant to autograd; where nothing is repaired, the given values themselves.
@@ -125,14 +126,17 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool) ->
     device = image.device.type
     if torch.is_autocast_enabled(device):  # it would convolve in half precision
         with torch.autocast(device, enabled=False):
-            return repair(image, nearness, step, auto)
+            return repair(image, nearness, step, auto, of_coc)
+    compiled = not validation.is_traced() and all(map(native.can_read, (image, nearness))) and native.chosen()
+    if of_coc and not compiled:
+        return -repair(image, -nearness, step, auto)
     light, given = image.detach().float(), nearness.detach().float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
         mended = _operator(light, given, step, auto)
-    elif not validation.is_traced() and all(map(native.can_read, (image, nearness))) and native.chosen():
+    elif compiled:
         steps = step.expand(light.shape[0], 1, *given.shape[-2:]) if step.ndim else step.expand(light.shape[0], 1)
-        items = [native.repair_edges(a, b[0], c[0], auto) for a, b, c in zip(light, given, steps, strict=True)]
+        items = [native.repair_edges(a, b[0], c[0], auto, of_coc) for a, b, c in zip(light, given, steps, strict=True)]
         mended = (items[0][None] if len(items) == 1 else torch.stack(items))[:, None]
     else:
         mended = _repair(light, given, step, auto)

@@ -40,7 +40,7 @@ HALF_LARGEST = 64
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 2  # of ``src/api.h``
+_REVISION = 3  # of ``src/api.h``
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 
@@ -114,6 +114,7 @@ class _Map(ctypes.Structure):
         ("channels", ctypes.c_int32),
         ("light", ctypes.c_void_p),
         ("nearness", ctypes.c_void_p),
+        ("of_coc", ctypes.c_int32),
         ("steps", ctypes.c_void_p),
         ("step", ctypes.c_float),
         ("automatic", ctypes.c_int32),
@@ -260,7 +261,7 @@ def render(
     return out
 
 
-def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
     """What :func:`torchdof.depth.edges.repair` computes, of one item, on as many threads as PyTorch uses.
 
     Args:
@@ -268,15 +269,16 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> T
         nearness: ``[H, W]``, float32.
         step: ``[H, W]`` or ``[]``, float32.
         auto: As there.
+        of_coc: As there.
 
     Returns:
-        ``[H, W]``, float32; the same bits for any number of threads.
+        ``[H, W]``, float32; the same bits for any number of threads. The given map itself, if its edges are right.
 
     Raises:
         MemoryError: If there is too little.
     """
     light, nearness, step = light.contiguous(), nearness.contiguous(), step.contiguous()
-    out, cancelled = torch.empty_like(nearness), ctypes.c_int32(0)
+    out, cancelled, changed = torch.empty_like(nearness), ctypes.c_int32(0), ctypes.c_int32(0)
     same = step.ndim == 0
     height, width = nearness.shape
     scene = _Map(
@@ -285,6 +287,7 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> T
         light.shape[0],
         light.data_ptr(),
         nearness.data_ptr(),
+        of_coc,
         None if same else step.data_ptr(),
         float(step) if same else 0.0,
         auto,
@@ -295,10 +298,10 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> T
     memory = (light, nearness, step, out)
 
     def run(held: object = memory) -> None:  # as long as this runs, whatever interrupts the caller
-        _check(_engine().torchdof_repair_edges(ctypes.byref(scene)))
+        _check(_engine().torchdof_repair_edges(ctypes.byref(scene), ctypes.byref(changed)))
 
     _interruptible(run, cancelled)
-    return out
+    return out if changed.value else nearness
 
 
 def convolve(values: Tensor, kernel: Tensor) -> Tensor:
@@ -411,7 +414,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_free.restype = None
     library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]
     library.torchdof_convolve.restype = None
-    library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map)]
+    library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map), ctypes.POINTER(ctypes.c_int32)]
     library.torchdof_instructions.restype = ctypes.c_char_p
     library.torchdof_use.argtypes = [ctypes.c_char_p]
     return library, ""

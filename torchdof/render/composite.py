@@ -21,7 +21,7 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 """``(light [B, C, H, W], kernels [1 or C, k, k], halo) -> [B, C, H - 2 halo, W - 2 halo]``."""
 
 Picture = tuple[Tensor, Tensor]
-"""Light ``[B, C, h, w]`` and what it is to be weighed with, of one channel or C; ``[B, C, n, h, w]`` of n layers."""
+"""Light ``[B, C, h, w]`` and what it is to be weighed with, of one channel or C."""
 
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 _KNOWN = 0.002  # share of scattered weight from which on a layer is known in full
@@ -50,23 +50,22 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
 
     # Beside light goes the share 1 - a that is left of what is behind, in sums of what is positive: behind bright light
     # the rounding of a difference would show. Where nothing is behind, a itself: what is divided by it in the end.
-    def normalised(layers: Tensor) -> Picture:
-        each = (layers.shape[1] - colours) // 2
-        light, weight, beyond = layers.split([colours, each, each], 1)
+    def normalised(lights: Sequence[Tensor], weight: Tensor, beyond: Tensor) -> list[Picture]:
         lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
         beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
         known = weight + beyond
-        return light / known, (beyond if backed else weight) / known
+        share = (beyond if backed else weight) / known
+        return [(light / k, s) for light, k, s in zip(lights, *_each(known, share, layers=len(lights)), strict=True)]
 
     def composited(front: Picture, behind: Picture) -> Picture:
         (light, share), (light_behind, share_behind) = front, behind
         left = share if backed else (1.0 - share).clamp_min(0.0)
-        share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
-        return torch.addcmul(light, left, light_behind), share
+        share = left * share_behind if backed else share + left * share_behind
+        return light + left * light_behind, share
 
     picture = _composite_layers(frame, blurs, scatter, composited, 1.0 if backed else 0.0, normalised)
     light, left = _parts(picture, colours)
-    out = mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
+    out = mean(picture, colours) if frame.behind is None else light + left * frame.behind
     return out[..., : frame.size[0], : frame.size[1]]
 
 
@@ -95,7 +94,7 @@ def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
         accumulate.
     """
     halo = frame.margin
-    weights = frame.layers(0, len(blurs), halo)[1][:, 0]
+    weights = frame.layers(0, len(blurs), halo)[1][:, :, 0]
     kernels = torch.stack([functional.pad(b.kernel, (halo - b.half,) * 4) for b in blurs])  # [n, 1 or C, k, k]
     light = frame.surfaces[0].light
     each = kernels.shape[1]
@@ -111,13 +110,13 @@ def _composite_layers(
     scatter: Scatter,
     composited: Callable[[Picture, Picture], Picture],
     empty: float = 0.0,
-    normalised: Callable[[Tensor], Picture] | None = None,
+    normalised: Callable[[Sequence[Tensor], Tensor, Tensor], list[Picture]] | None = None,
 ) -> Tensor:
     """All layers, far to near: light ``[B, C, h, w]`` and, after it, what it is to be weighed with.
 
     The weights have one channel, or C where each colour has a kernel of its own, and are ``empty`` where there is no
-    layer. ``composited`` puts what is in front and what is behind it together; ``normalised`` makes light and weights
-    of scattered layers, which without it are just that.
+    layer. ``composited`` puts what is in front and what is behind it together; ``normalised`` makes each layer's of the
+    light of scattered layers, their weights and the weights behind them.
     """
     order = [k for k, occupied in enumerate(frame.occupied()) if occupied][::-1]
     light, colours = frame.surfaces[0].light, frame.colours
@@ -147,11 +146,14 @@ def _composite_layers(
         if scale > 1:  # one pixel more on each side, to interpolate from
             part = blank(*(n // scale + 2 for n in frame.area))
         for group in groups:
-            layers = _scattered(frame, blurs, scatter, group, normalised is not None)
-            light, weight = _parts(layers, colours) if normalised is None else normalised(layers)
+            lights, *weights = _scattered(frame, blurs, scatter, group, normalised is not None)
+            if normalised is None:
+                layers = list(zip(lights, *_each(weights[0], layers=len(group)), strict=True))
+            else:
+                layers = normalised(lights, *weights)
             front = _parts(part, colours)
-            for i in reversed(range(len(group))):
-                front = composited((light[:, :, i], weight[:, :, i]), front)
+            for layer in reversed(layers):
+                front = composited(layer, front)
             part = where_needed(_needed(frame, blurs, group), torch.cat(front, 1), part)
         if scale > 1:
             fine = upsampled(part, scale)
@@ -164,28 +166,35 @@ def _composite_layers(
     return picture
 
 
-def _scattered(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool) -> Tensor:
-    """Scattered layers of a group, near to far: light, weight and, with visibility, the weight behind.
+def _scattered(
+    frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
+) -> tuple[Sequence[Tensor], Tensor] | tuple[Sequence[Tensor], Tensor, Tensor]:
+    """Scattered layers of a group, near to far: light of each, weights and, with visibility, the weights behind.
 
-    They are ``[B, C + 1 + 1, n, h, w]``, or ``[B, 3 C, n, h, w]`` where each colour has a kernel of its own.
+    Light is ``[B, C, h, w]``; the weights of n layers are ``[B, n, h, w]``, or ``[B, n C, h, w]`` where each colour has
+    a kernel of its own.
     """
     halo, half, each = max(blurs[k].halo for k in group), max(blurs[k].half for k in group), len(blurs[0].kernel)
-    shares, scale = blurs[group[0]].shares, blurs[group[0]].scale
-    layers = frame.layers(min(group), len(group), halo)
-    terms = torch.cat([term.expand(-1, max(each, term.shape[1]), -1, -1, -1) for term in layers[: 2 + visibility]], 1)
-    terms, kinds = downsampled(terms.flatten(1, 2), scale), terms.shape[1]
-    if shares is not None:  # one layer
-        kernel = blurs[group[0]].kernel
-        if scatter is fold:
-            scattered = fold(terms, kernel.repeat(kinds // each, 1, 1), half, None, [shares], frame.size)
-        else:
-            scattered = field.scattered(shares, terms, kernel, half, scale, frame.size)
-        return scattered.unflatten(1, (kinds, 1))
-    kernels = blurs[group[0]].kernel
-    if len(group) > 1 or each > 1:
-        padded = [functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in sorted(group)]
-        kernels = torch.cat(padded).repeat(kinds // each, 1, 1)
-    return scatter(terms, kernels, half).unflatten(1, (kinds, len(group)))
+    shares, scale, kernels = blurs[group[0]].shares, blurs[group[0]].scale, blurs[group[0]].kernel
+    terms = frame.layers(min(group), len(group), halo)[: 2 + visibility]
+    if each > 1:
+        terms = tuple(term.expand(-1, -1, each, -1, -1) for term in terms)
+    widths = [term.shape[2] for term in terms]  # C, and 1 or C
+    channels = downsampled(torch.cat([term.flatten(1, 2) for term in terms], 1), scale)
+    if shares is not None and scatter is fold:  # one layer, as where each colour has a kernel
+        kernels = kernels.repeat(channels.shape[1] // each, 1, 1)
+        scattered = fold(channels, kernels, half, None, [shares], frame.size)
+    elif shares is not None:
+        scattered = field.scattered(shares, channels, kernels, half, scale, frame.size)
+    else:
+        if len(group) > 1:
+            padded = torch.cat([functional.pad(blurs[k].kernel, (half - blurs[k].half,) * 4) for k in sorted(group)])
+            kernels = torch.cat([padded.repeat_interleave(width, 0) for width in widths])
+        elif each > 1:
+            kernels = kernels.repeat(len(terms), 1, 1)
+        scattered = scatter(channels, kernels, half)
+    parts = scattered.split([widths[0]] * len(group) + [width * len(group) for width in widths[1:]], 1)
+    return parts[: len(group)], *parts[len(group) :]
 
 
 def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[[], Tensor]:
@@ -193,6 +202,11 @@ def _needed(frame: Frame, blurs: Sequence[Blur], layers: list[int]) -> Callable[
     ends = (frame.nodes[0] - 1.0, *frame.nodes, frame.nodes[-1] + 1.0)
     halo = max(blurs[k].halo for k in layers)
     return functools.partial(frame.any_between, ends[min(layers)], ends[max(layers) + 2], halo)
+
+
+def _each(*weights: Tensor, layers: int) -> list[tuple[Tensor, ...]]:
+    """Weights ``[B, n or n C, h, w]`` of n layers, one by one."""
+    return [t.split([t.shape[1] // layers] * layers, 1) for t in weights]
 
 
 def _parts(values: Tensor, colours: int) -> Picture:

@@ -73,7 +73,7 @@ def behind_size(size: int, levels: int) -> int:
 
 def behind_pixels(behind: Tensor, size: tuple[int, int]) -> Tensor:
     """The map of what lies behind both surfaces at the pixels of an image of that size: ``[B, C, H, W]``."""
-    for dim, length in ((-2, size[0]), (-1, size[1])):
+    for dim, length in ((-1, size[1]), (-2, size[0])):
         samples = behind.shape[dim]
         place = _place(torch.arange(length, device=behind.device).to(behind.dtype), length, samples, BEHIND_STEP)
         before = place.clamp(0, samples - 2).long()
@@ -207,11 +207,11 @@ def _first_level(
         before = (2 * samples - size + 1) // 2
         ends += [before, 2 * samples + 2 - size - before]
     values = functional.pad(torch.cat([light, coc_px, weight], 1), ends, mode="replicate")
-    planes = functional.pixel_unshuffle(values, 2).unflatten(1, (-1, 4))  # [B, C + 2, 4, height + 1, width + 1]
+    planes = [values[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]  # [B, C + 2, h + 1, w + 1]
     around = []
     for row in range(3):
         for column in range(3):
-            plane = planes[:, :, row % 2 * 2 + column % 2]
+            plane = planes[row % 2 * 2 + column % 2]
             plane = plane.narrow(-2, row // 2, height).narrow(-1, column // 2, width)
             share = shares[1][:, row, None] * shares[0][:, column]
             around.append((plane, share / 4.0))
@@ -279,24 +279,24 @@ def search(
     levels: Sequence[Level], samples: Sequence[Samples], coc_px: Tensor, farthest: bool
 ) -> tuple[Tensor, Tensor]:
     """What levels show behind places ``[P, 1]`` or whole maps, given the samples of each level around each of them."""
-    total, seen = torch.zeros_like(coc_px), coc_px.new_zeros(levels[0].values.shape[1], *(1,) * (coc_px.ndim - 2))
+    total, seen = torch.zeros_like(coc_px), coc_px.new_zeros(levels[0].values.shape[1] - 1, *(1,) * (coc_px.ndim - 2))
     for level, around in zip(levels, samples, strict=True):
         # of the samples only those that lie behind: plain interpolation would mix in the foreground's own colour
         behind, weight = torch.zeros_like(coc_px), torch.zeros_like(coc_px)
         for sample, share in around:
             part = share * sample[:, -1:] * _is_behind(sample[:, -2:-1] - coc_px)
-            behind, weight = behind + sample * part, weight + part
+            behind, weight = behind + sample[:, :-1] * part, weight + part
         weight = torch.where(weight > 1e-4, weight, 0.0)
         behind = behind / weight.clamp_min(1e-4)
         looked = (coc_px.abs() / level.least_px - 1.0).clamp(0.0, 1.0)
         vote = looked * (weight if level.vote is None else level.vote * (weight / _SURE).clamp(max=1.0))
         if farthest:
-            apart = (behind - seen)[:, -2:-1]
+            apart = (behind - seen)[:, -1:]
             vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
             total = total * (1.0 - (looked * weight / _CERTAIN).clamp(max=1.0) * _is_behind(apart))
         total = total + vote
         seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
-    return seen[:, :-1], total
+    return seen, total
 
 
 def _samples(level: Level, item: Tensor, row: Tensor, column: Tensor, size: tuple[int, int]) -> Samples:

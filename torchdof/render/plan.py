@@ -134,11 +134,11 @@ class Plan:
     def all(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
         """Layers for every scene up to a radius: the plan of a compiled module, or with rays of an exported one.
 
-        Nothing tells where the borders of these scenes lie. So coarse layers, where that matters, are twice as many.
+        Nothing tells where the borders of these scenes lie. So coarse layers, where that matters, lie denser.
         """
         reach = float(blur_axis(torch.tensor(max_coc_px, dtype=torch.float64)))
         dense_from = float(blur_axis(torch.tensor(_COARSE_FROM_PX[0], dtype=torch.float64)))
-        last = reach - 0.3 * layer_cocs.spacing(reach, 0.5 * tolerance)
+        last = reach - 0.3 * layer_cocs.spacing(reach, layer_cocs.DENSE * tolerance)
         inner = [x for x in layer_cocs.spaced_nodes(-reach, reach, tolerance, dense_from) if abs(x) < last]
         return cls((-reach, *inner, reach), tolerance, rays, grows=False, kernels_per_px=_FEWER_KERNELS_PER_PX)
 

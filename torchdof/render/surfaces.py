@@ -111,15 +111,15 @@ class Frame:
     def layers(self, first: int, count: int, halo: int) -> tuple[Tensor, Tensor, Tensor]:
         """What layers that follow each other scatter, with so many pixels beyond the area.
 
-        It is their light ``m_k I``, ``[B, C, n, h, w]``, its weight ``m_k`` and the weight behind them ``M_k - m_k``,
-        ``[B, 1, n, h, w]``.
+        It is their light ``m_k I``, ``[B, n, C, h, w]``, its weight ``m_k`` and the weight behind them ``M_k - m_k``,
+        ``[B, n, 1, h, w]``.
         """
         surfaces = [Placed(*(self.cut(t, halo) for t in s if t is not None)) for s in self.surfaces]
         weights = [weights_at_or_behind(s.x, self.ramps[:, first : first + count + 1]) for s in surfaces]
         if self.occlusion:
             weights = [eased(weight) for weight in weights]
-        pairs = [(weight[:, None, :-1], weight[:, None, 1:]) for weight in weights]
-        surfaces = [Placed(*(t.unsqueeze(2) for t in s if t is not None)) for s in surfaces]
+        pairs = [(weight[:, :-1, None], weight[:, 1:, None]) for weight in weights]
+        surfaces = [Placed(*(t.unsqueeze(1) for t in s if t is not None)) for s in surfaces]
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
 
@@ -130,7 +130,7 @@ def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -
     that one it counts whole. Where the nearer one lies in a layer itself, or behind it, both count by their shares, for
     else a surface that spans several layers would be open at its edge.
 
-    Pairs are how much of each surface lies at or behind layers k, and behind them, ``[B, 1, n, h, w]``.
+    Pairs are how much of each surface lies at or behind layers k, and behind them, ``[B, n, 1, h, w]``.
     """
     sums: list[Tensor] = []
     nearer: Tensor | None = None
@@ -139,7 +139,7 @@ def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -
         if cover is not None:
             if nearer is not None:
                 goes_on = (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _GOES_ON).clamp(0.0, 1.0)
-                cover = cover + goes_on * (1.0 - (nearer / _HAIR).clamp(max=1.0))
+                cover = cover + goes_on * (1.0 - (nearer / _HAIR).clamp(0.0, 1.0))
             beyond, own = beyond * cover, own * cover
         terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms

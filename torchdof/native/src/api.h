@@ -78,11 +78,12 @@ TORCHDOF_API int32_t torchdof_finish(torchdof_job *job, const float *const *kern
 TORCHDOF_API void torchdof_free(torchdof_job *job);
 
 // A map of nearness (linear in 1 / depth, larger is nearer; what is not finite stays) whose edges are to be where the
-// image has them.
+// image has them; or of a coc, which is larger where it is farther.
 typedef struct {
   int32_t height, width, channels;
   const float *light;     // [channels, height, width]
   const float *nearness;  // [height, width]
+  int32_t of_coc;
   const float *steps;     // difference from which on neighbours are two surfaces, [height, width]; or null, then it is
   float step;             // this one everywhere
   int32_t automatic;      // 1: edges that prove exact are left alone
@@ -91,7 +92,8 @@ typedef struct {
   float *out;  // [height, width]
 } torchdof_map;
 
-TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map);
+// changed: 0 if the map is right as it is; then out is left as it was.
+TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed);
 
 // out[y, x] = sum of kernel[v, u] in[y - v, x - u]: what spreads a layer. For tests and benchmarks.
 TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half,
@@ -99,7 +101,7 @@ TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t wid
 
 // What a caller compares with its own idea of this file before it calls anything else: sizes of the two structures and,
 // in the upper half, a number that goes up with every other change of this file.
-#define TORCHDOF_REVISION 2
+#define TORCHDOF_REVISION 3
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

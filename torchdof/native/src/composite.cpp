@@ -14,16 +14,6 @@ constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind 
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int PART = 16;  // pixels a side of what is known to be empty in a coarser canvas
 
-inline bool any_positive(vec v) {
-#if defined(__AVX2__)
-  return __builtin_ia32_movmskps256(vec(v > vec{})) != 0;
-#else
-  typedef long long wide __attribute__((vector_size(LANES * 4)));
-  const wide bits = (wide)(v > vec{});
-  return (bits[0] | bits[1]) != 0;
-#endif
-}
-
 constexpr float EVEN = 1e-12f;  // square of what a weight of 1 may lack
 
 // Neighbouring layers of one resolution and, if it is a coarser one, one side of the focus.
@@ -190,6 +180,7 @@ class Composite {
     index_.columns = ceil_div(W_, CELL);
     index_.bits.assign((size_t)index_.rows * index_.columns * index_.words, 0);
     index_.single.assign((size_t)index_.rows * index_.columns, 0);
+    index_.mixed.assign(index_.single.size(), 0);
     for (int i = 0; i < s_.count; i++) index_.intervals.emplace_back(s_.area());
     constexpr int STEPS = 4096;
     std::vector<int> start(STEPS + 2);
@@ -233,56 +224,64 @@ class Composite {
           for (int column = bx * CELLS; column * CELL < x_end && column < (bx + 1) * CELLS; column++) {
             const size_t cell = (size_t)row * index_.columns + column;
             uint64_t *bits = &index_.bits[cell * index_.words];
-            const int x0 = column * CELL, n = std::min(CELL, W_ - x0);
+            const int x0 = column * CELL, n = std::min(CELL, W_ - x0), rows = std::min(CELL, H_ - row * CELL);
+            float own_cocs[CELL * CELL], own_weights[CELL * CELL];
             bool single = true;
             for (int i = 0; i < s_.count; i++) {
-              float places[CELL * CELL], low = NEVER, high = -NEVER;
-              bool there[CELL * CELL], any = false;
-              int count = 0;
-              for (int y = row * CELL; y < std::min(H_, (row + 1) * CELL); y++) {
-                if (!s_.row(i, y, x0, light.data(), coc, weight)) break;
-                if (i && !weight) single = false;
-                if (n == CELL) {
-                  vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = all(weight ? 0.0f : 1.0f);
-                  for (int x = 0; x < CELL; x += LANES, count += LANES) {
-                    const vec place = index_.place(load<vec>(coc + x));
-                    store(places + count, place);
-                    lows = least(lows, place);
-                    highs = most(highs, place);
-                    if (weight) {
-                      least_weight = least(least_weight, load<vec>(weight + x));
-                      most_weight = most(most_weight, load<vec>(weight + x));
-                    }
-                    for (int lane = 0; lane < LANES; lane++) there[count + lane] = !weight || weight[x + lane] != 0;
-                  }
-                  low = std::min(low, smallest(lows));
-                  high = std::max(high, largest(highs));
-                  if (i ? largest(most_weight) != 0 : smallest(least_weight) < 1) single = false;
-                  any |= largest(most_weight) != 0;
-                  continue;
+              // places, and those of what weighs something; a row that the frame cuts off goes on with its last pixel
+              float places[CELL * CELL], shown[CELL * CELL], cut_coc[CELL], cut_weight[CELL];
+              vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = {}, farther_weight = {};
+              bool there = true;
+              for (int y = 0; y < rows; y++) {
+                if (!(there = s_.row(i, row * CELL + y, x0, light.data(), coc, weight))) break;
+                for (int x = 0; n < CELL && x < CELL; x++) {
+                  cut_coc[x] = coc[std::min(x, n - 1)];
+                  if (weight) cut_weight[x] = weight[std::min(x, n - 1)];
                 }
-                for (int x = 0; x < n; x++, count++) {
-                  const float w = weight ? weight[x] : 1.0f;
-                  if (weight && (i ? w != 0 : w < 1)) single = false;
-                  any |= there[count] = w != 0;
-                  places[count] = index_.place(coc[x]);
-                  low = std::min(low, places[count]);
-                  high = std::max(high, places[count]);
+                if (n < CELL) coc = cut_coc, weight = weight ? cut_weight : nullptr;
+                for (int x = 0; x < CELL; x += LANES) {
+                  const vec its_coc = load<vec>(coc + x), place = index_.place(its_coc), w = weight ? load<vec>(weight + x) : all(1.0f);
+                  const auto weighs = w != vec{};
+                  store(places + y * CELL + x, place);
+                  store(shown + y * CELL + x, weighs ? place : all(NEVER));
+                  lows = least(lows, weighs ? place : all(NEVER));
+                  highs = most(highs, weighs ? place : all(-NEVER));
+                  least_weight = least(least_weight, w);
+                  most_weight = most(most_weight, w);
+                  float *const own_coc = own_cocs + y * CELL + x, *const own_weight = own_weights + y * CELL + x;
+                  if (i) farther_weight = most(farther_weight, its_coc < load<vec>(own_coc) ? load<vec>(own_weight) : w);
+                  if (!i) store(own_coc, its_coc), store(own_weight, w);
                 }
               }
-              if (!any) {
-                for (int j = 0; j < count; j++) index_.intervals[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = 0;
+              if (!there) continue;
+              single &= i ? !any_positive(most_weight) : smallest(least_weight) >= 1;
+              if (i) index_.mixed[cell] = largest(farther_weight) > HIDDEN_WEIGHT;
+              uint16_t *intervals = &index_.intervals[i][(size_t)row * CELL * W_ + x0];
+              const bool any = any_positive(most_weight);
+              const int first = any ? node_before(smallest(lows)) : 0, last = any ? node_before(largest(highs)) : 0;
+              if (first == last) {
+                for (int y = 0; y < rows; y++) std::fill(intervals + (size_t)y * W_, intervals + (size_t)y * W_ + n, (uint16_t)first);
+                if (any) mark(bits, smallest(lows), first), mark(bits, largest(highs), first);
                 continue;
               }
-              const int first = node_before(low), last = node_before(high);
-              for (int j = 0; j < count; j++) {
-                const int k = first == last ? first : node_before(places[j]);
-                index_.intervals[i][(size_t)(row * CELL + j / n) * W_ + x0 + j % n] = (uint16_t)k;
-                if (first != last && there[j]) mark(bits, places[j], k);
+              for (int y = 0; y < rows; y++) {
+                int32_t nodes[CELL];
+                for (int x = 0; x < CELL; x += LANES) {
+                  const vec place = load<vec>(places + y * CELL + x);
+                  ivec node = ivec{} + first;
+                  for (int k = first + 1; k <= last; k++) node -= place >= all(layers_[k].at);
+                  store(nodes + x, node);
+                }
+                for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
               }
-              if (first == last) {
-                mark(bits, low, first);
-                mark(bits, high, first);
+              for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // a layer occurs between the nodes beside its own
+                const vec before = all(k == first ? -NEVER : layers_[k - 1].at), after = all(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
+                ivec found = {};
+                for (int j = 0; j < rows * CELL; j += LANES) {
+                  const vec place = load<vec>(shown + j);
+                  found |= (place > before) & (place < after);
+                }
+                if (any_of(found)) bits[k / 64] |= 1ull << k % 64;
               }
             }
             index_.single[cell] = single && !s_.independent;
@@ -1025,11 +1024,10 @@ class Composite {
   }
 
   void lay_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
-    float least = 1.0f;
+    vec least_cover = all(1.0f);
     for (int e = 0; e < E_; e++)
-      for (int y = 0; y < rows; y++)
-        for (int x = 0; x < columns; x++) least = std::min(least, b.canvas[C_ + e][y * TILE + x]);
-    if (!(least < 1.0f - COVERED)) return;
+      for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = least(least_cover, load<vec>(b.canvas[C_ + e] + i));
+    if (!any_of(least_cover < all(1.0f - COVERED))) return;
     const int h = job_.behind_height, w = job_.behind_width;
     for (int y = 0; y < rows; y++) {
       const float at_y = (y0 + y - 0.5f * (H_ - 1)) / BEHIND_STEP + 0.5f * (h - 1);  // both have one centre

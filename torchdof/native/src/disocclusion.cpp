@@ -11,6 +11,7 @@ constexpr float FALL = 0.35f;      // weight of a level of the pyramid against t
 constexpr int CELL_LEVEL = 3;      // of the pyramid, in whose pixels it is told which may hide something
 constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones are looked at from cells of STEP pixels
 constexpr int STEP = 1 << FINE_LEVELS;
+constexpr int SAMPLES = 32;  // samples of the first level that are made together
 constexpr float SURE = 0.1f;      // weight of what a level shows from which on it has a whole vote
 constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight, or a farther one counts alone
 constexpr float LEAST_SEEN = 1e-4f;  // weight of what lies behind up to which nothing is seen
@@ -202,9 +203,10 @@ class Filling {
   void finest(int band) {
     const int H = job_.height, W = job_.width, planes = C_ + 2;
     const Level &level = pyramid_[0];
-    const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2), across = 2 * level.width + 1;
+    const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2);
+    const int across = 2 * ceil_div(level.width, SAMPLES) * SAMPLES + 1;  // rows are read in whole strips
     const size_t line = (size_t)planes * across;
-    std::vector<float> memory(3 * line), block((size_t)planes * BLOCK);
+    std::vector<float> memory(3 * line);
     int held[3] = {-1, -1, -1};
     auto row_of = [&](int y) {  // planes of a row, continued to both sides, from pixel `left` on
       y = std::clamp(y, 0, H - 1);
@@ -214,8 +216,7 @@ class Filling {
       for (int x0 = 0; x0 < W; x0 += BLOCK) {
         const int n = std::min(BLOCK, W - x0), which = y / BLOCK * s_.block_columns + x0 / BLOCK;
         const float limit = least_threshold(job_, y / BLOCK * BLOCK, x0);
-        pixels(y, x0, n, n == BLOCK, s_.has_block(which) || job_.block_peak[which] > limit, limit, block.data());
-        for (int k = 0; k < planes; k++) memcpy(row + (size_t)k * across + x0 - left, &block[(size_t)k * BLOCK], n * sizeof(float));
+        pixels(y, x0, n, s_.has_block(which) || job_.block_peak[which] > limit, limit, row + x0 - left, across);
       }
       for (int k = 0; k < planes; k++) {
         float *plane = row + (size_t)k * across;
@@ -231,14 +232,15 @@ class Filling {
     }
   }
 
-  // Light, coc and weight [channels + 2, BLOCK] of the surfaces that pixels of a row give to the pyramid: of two the
-  // farther one.
-  void pixels(int y, int x0, int n, bool inside, bool bright, float least_limit, float *out) const {
+  // Light, coc and weight, in planes that lie `pitch` apart, of the surfaces that n pixels of a row give to the pyramid: of two
+  // the farther one.
+  void pixels(int y, int x0, int n, bool bright, float least_limit, float *out, size_t pitch) const {
     const size_t area = s_.area(), row = (size_t)y * job_.width;
     const int C = C_, whole = y / BLOCK * s_.block_columns + x0 / BLOCK;
-    float *coc = out + C * BLOCK, *weight = coc + BLOCK;
+    const bool inside = n == BLOCK;
+    float *coc = out + C * pitch, *weight = coc + pitch;
     if (inside && !s_.has_block(whole)) {
-      for (int c = 0; c < C; c++) memcpy(out + c * BLOCK, s_.light + c * area + row + x0, BLOCK * sizeof(float));
+      for (int c = 0; c < C; c++) memcpy(out + c * pitch, s_.light + c * area + row + x0, BLOCK * sizeof(float));
       memcpy(coc, s_.coc + row + x0, BLOCK * sizeof(float));
       for (int i = 0; i < BLOCK; i++) weight[i] = 1.0f;
     } else if (inside && !s_.valid) {
@@ -251,7 +253,7 @@ class Filling {
         store(coc + x, mixed ? its : mine);
         store(weight + x, mixed ? s : load<vec>(seen + x));
         for (int c = 0; c < C; c++)
-          store(out + c * BLOCK + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x) : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
+          store(out + c * pitch + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x) : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
       }
     } else {
       for (int i = 0; i < n; i++) {
@@ -263,56 +265,55 @@ class Filling {
           const int within = y % BLOCK * BLOCK + x % BLOCK;
           const Block b = s_.block(which);
           const bool mixed = b.weight[within] > MIXED && b.coc[within] > coc[i];
-          for (int c = 0; c < C; c++) out[c * BLOCK + i] = (mixed ? b.other : b.own)[c * BLOCK_PIXELS + within];
+          for (int c = 0; c < C; c++) out[c * pitch + i] = (mixed ? b.other : b.own)[c * BLOCK_PIXELS + within];
           weight[i] = mixed ? b.weight[within] : b.seen[within];
           if (mixed) coc[i] = b.coc[within];
           if (s_.valid && !(s_.valid[at] > 0)) coc[i] = -NEVER;
         } else {
-          for (int c = 0; c < C; c++) out[c * BLOCK + i] = s_.light[c * area + at];
+          for (int c = 0; c < C; c++) out[c * pitch + i] = s_.light[c * area + at];
         }
       }
     }
     if (!bright) return;
     for (int i = 0; i < n; i++) {
       float most = out[i];
-      for (int c = 1; c < C; c++) most = std::max(most, out[c * BLOCK + i]);
+      for (int c = 1; c < C; c++) most = std::max(most, out[c * pitch + i]);
       if (!(most > least_limit)) continue;
       const float limit = threshold_at(job_, y, std::min(x0 + i, job_.width - 1));
       if (most > limit)  // what is hidden beside a highlight is none
-        for (int c = 0; c < C; c++) out[c * BLOCK + i] *= limit / most;
+        for (int c = 0; c < C; c++) out[c * pitch + i] *= limit / most;
     }
   }
 
   // Of the pixels of rows that are one in the first level, the mean of those that are farthest: of two, or, where the
   // image's size is odd, of two halves and the one between.
   void farthest_of_rows(const float *const *rows, size_t across, float *out) const {
-    constexpr int STRIP = 32;
     const int C = C_, H = job_.height, W = job_.width, ny = 2 + H % 2, nx = 2 + W % 2, width = pyramid_[0].width;
-    float counts[9][STRIP], most[STRIP], each[STRIP], total[STRIP];
-    for (int x0 = 0; x0 < width; x0 += STRIP) {
-      const int n = std::min(STRIP, width - x0);
+    float counts[9][SAMPLES], most[SAMPLES], each[SAMPLES], total[SAMPLES];
+    for (int x0 = 0; x0 < width; x0 += SAMPLES) {
+      const int n = std::min(SAMPLES, width - x0);
       auto child = [&](int j, int plane) { return rows[j / nx] + plane * across + 2 * x0 + j % nx; };
-      for (int x = 0; x < n; x++) most[x] = -NEVER;
+      for (int x = 0; x < SAMPLES; x++) most[x] = -NEVER;
       for (int j = 0; j < ny * nx; j++) {
         const float *coc = child(j, C);
-        for (int x = 0; x < n; x++) most[x] = std::max(most[x], coc[2 * x]);
+        for (int x = 0; x < SAMPLES; x++) most[x] = std::max(most[x], coc[2 * x]);
       }
-      for (int x = 0; x < n; x++) total[x] = 0;
+      for (int x = 0; x < SAMPLES; x++) total[x] = 0;
       for (int j = 0; j < ny * nx; j++) {
         const float *coc = child(j, C), *weight = child(j, C + 1);
         const float share = 0.25f * (ny == 3 && j / nx != 1 ? 0.5f : 1.0f) * (nx == 3 && j % nx != 1 ? 0.5f : 1.0f);
-        for (int x = 0; x < n; x++) {
+        for (int x = 0; x < SAMPLES; x++) {
           counts[j][x] = share * weight[2 * x] * (1.0f - is_behind(most[x] - coc[2 * x]));
           total[x] += counts[j][x];
         }
       }
-      for (int x = 0; x < n; x++) each[x] = 1.0f / std::max(total[x], 1e-9f);
+      for (int x = 0; x < SAMPLES; x++) each[x] = 1.0f / std::max(total[x], 1e-9f);
       float *to = out + (size_t)x0 * stride_;
       for (int k = 0; k <= C; k++) {
-        float sum[STRIP] = {};
+        float sum[SAMPLES] = {};
         for (int j = 0; j < ny * nx; j++) {
           const float *of = child(j, k);
-          for (int x = 0; x < n; x++) sum[x] += of[2 * x] * counts[j][x];
+          for (int x = 0; x < SAMPLES; x++) sum[x] += of[2 * x] * counts[j][x];
         }
         for (int x = 0; x < n; x++) to[x * stride_ + k] = each[x] * sum[x];
       }
@@ -450,40 +451,124 @@ class Filling {
       xs[i] = places(0, 1, W, look[i]->width, &Level::place_x, *look[i]);
     }
     job_.parallel(s_.block_rows, [&](int by, int) {
-      std::vector<float> shows(stride_);
-      std::vector<f8> samples((size_t)looks * count);
-      Seen seen[FINE_LEVELS + 1];
-      for (int i = 0; i < looks; i++) seen[i].sample = samples.data() + i * count;
-      for (int bx = 0; bx < s_.block_columns; bx++)
-        for (int y = by * BLOCK; y < std::min(H, (by + 1) * BLOCK); y++)
-          for (int x = bx * BLOCK; x < std::min(W, (bx + 1) * BLOCK); x++) {
-            const size_t cell = (size_t)(y / cell_) * cell_columns_ + x / cell_;
-            const int first = fine_[cell] ? 0 : fine;
-            if (!found_[cell] || first == looks) {
-              x = x / cell_ * cell_ + cell_ - 1;
-              continue;
+      Looks to{look, looks, ys.data(), xs.data()};
+      for (int y = by * BLOCK; y < std::min(H, (by + 1) * BLOCK); y += CELL)
+        for (int x = 0; x < W; x += CELL) {
+          bool found = false, finely = false;
+          for (int r = y / cell_; r < std::min((y + CELL) / cell_, cell_rows_); r++)
+            for (int c = x / cell_; c < std::min((x + CELL) / cell_, cell_columns_); c++) {
+              found |= found_[(size_t)r * cell_columns_ + c];
+              finely |= fine_[(size_t)r * cell_columns_ + c];
             }
-            const float here = s_.coc[(size_t)y * W + x];
-            if (!wanted(y, x)) continue;
-            bool any = false;
-            for (int i = first; i < looks; i++) {
-              seen[i].see<VECTORS>(*look[i], ys[i][y], xs[i][x], here);
-              any |= seen[i].any > 0;
-            }
-            if (!any) continue;
-            const float total = mix<VECTORS>(look + first, seen + first, looks - first, false, shows.data());
-            if (!(total > 0)) continue;
-            const Block b = s_.make_block(by * s_.block_columns + bx);
-            const int within = y % BLOCK * BLOCK + x % BLOCK;
-            // together with a surface that is hardly mixed in: the more of that, the less of what is hidden
-            const float mixed = b.weight[within], hidden = std::min(total / CERTAIN, 1.0f) * (HIDDEN_WEIGHT - mixed);
-            const float weight = hidden + (1.0f - hidden / HIDDEN_WEIGHT) * mixed, part = hidden / std::max(weight, 1e-12f);
-            auto blend = [&](float &other, float hidden_one) { other = part < 1 ? other + part * (hidden_one - other) : hidden_one; };
-            for (int c = 0; c < C; c++) blend(b.other[c * BLOCK_PIXELS + within], shows[c]);
-            blend(b.coc[within], shows[C]);
-            b.weight[within] = weight * (s_.valid ? s_.valid[(size_t)y * W + x] : 1.0f);
-          }
+          to.first = finely ? 0 : fine;
+          if (found && to.first < looks) C == 3 ? fill_cell<3>(y, x, to) : fill_cell<0>(y, x, to);
+        }
     });
+  }
+
+  // What the pixels of a cell look at: levels, and where the image's rows and columns lie in each.
+  struct Looks {
+    const Level *const *levels;
+    int count;
+    const std::vector<Place> *ys, *xs;
+    int first = 0;
+    // of each level, rows around the cell: for each of its columns the sample before it and the next one
+    std::vector<vec> samples;
+    std::vector<float> lines;  // the same as the level has them
+  };
+
+  // Gives the pixels of a cell what the levels show behind them. It is what `behind` and `mix` tell, of LANES pixels at once.
+  template <int CHANNELS>
+  void fill_cell(int y0, int x0, Looks &to) {
+    constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
+    const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width, which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
+    const int rows = std::min(CELL, job_.height - y0), columns = std::min(CELL, W - x0);
+    const size_t beside = (size_t)planes * VECTORS, below = 2 * beside, of_level = ROWS * below;
+    to.samples.resize(to.count * of_level + planes);
+    to.lines.resize(ROWS * planes * CELL);
+    vec *const shown = &to.samples[to.count * of_level];
+    int tops[FINE_LEVELS + 1];
+    for (int i = to.first; i < to.count; i++) {
+      const Level &level = *to.levels[i];
+      const Place *ys = &to.ys[i][y0], *xs = &to.xs[i][x0];
+      const int bottom = std::min(ys[rows - 1].before + 1, level.height - 1), left = xs->before;
+      const int last = std::min(xs[columns - 1].before + 1, level.width - 1) - left;
+      tops[i] = ys->before;
+      ivec samples[2][VECTORS];
+      for (int x = 0; x < CELL; x++) {
+        samples[0][x / LANES][x % LANES] = xs[std::min(x, columns - 1)].before - left;
+        samples[1][x / LANES][x % LANES] = std::min(xs[std::min(x, columns - 1)].before - left + 1, last);
+      }
+      float *line = to.lines.data();
+      for (int row = tops[i]; row <= bottom; row++, line += planes * CELL)
+        for (int x = 0; x <= last; x++)
+          for (int k = 0; k < planes; k++) line[k * CELL + x] = level.at(row, left + x)[k];
+      vec *out = &to.samples[i * of_level];
+      line = to.lines.data();
+      for (int row = tops[i]; row <= bottom; row++, line += planes * CELL)
+        for (int side = 0; side < 2; side++)
+          for (int k = 0; k < planes; k++)
+            for (int v = 0; v < VECTORS; v++) *out++ = pick(line + k * CELL, samples[side][v]);
+    }
+    for (int y = 0; y < rows; y++) {
+      const int within = (y0 + y) % BLOCK * BLOCK + x0 % BLOCK;
+      const float *here_of = s_.coc + (size_t)(y0 + y) * W + x0;
+      float cut[CELL] = {};
+      if (columns < CELL) here_of = (const float *)memcpy(cut, here_of, columns * sizeof(float));
+      for (int v = 0; v < VECTORS; v++) {
+        const vec here = load<vec>(here_of + v * LANES), size = most(here, -here);
+        ivec wanted = size > all(0.5f);
+        if (s_.has_block(which)) wanted &= load<vec>(s_.block(which).weight + within + v * LANES) < all(HIDDEN_WEIGHT);
+        if (!any_of(wanted)) continue;
+        vec total = {};
+        for (int k = 0; k <= C; k++) shown[k] = vec{};
+        for (int i = to.first; i < to.count; i++) {
+          const Level &level = *to.levels[i];
+          const Place row = to.ys[i][y0 + y], *xs = &to.xs[i][x0];
+          const vec *corners[4];
+          corners[0] = &to.samples[i * of_level + (row.before - tops[i]) * below + v];
+          corners[1] = corners[0] + beside;
+          corners[2] = corners[0] + (level.height > 1 ? below : 0);
+          corners[3] = corners[2] + beside;
+          vec right, any = {}, counts[4];
+          for (int x = 0; x < LANES; x++) right[x] = xs[std::min(v * LANES + x, columns - 1)].part;
+          const vec left = all(1.0f) - right, shares[4] = {left * (1.0f - row.part), right * (1.0f - row.part), left * row.part, right * row.part};
+          for (int k = 0; k < 4; k++) {
+            const vec farther = clamp01(corners[k][C * VECTORS] - here - all(BEHIND_PX - 0.5f));
+            any += counts[k] = shares[k] * corners[k][(C + 1) * VECTORS] * farther;
+          }
+          const vec looked = clamp01(size * (1.0f / level.least_px) - all(1.0f));
+          const ivec seen = (any > all(LEAST_SEEN)) & (looked > vec{});
+          if (!any_of(seen)) continue;
+          const vec voted = level.vote > 0 ? level.vote * least(any * (1.0f / SURE), all(1.0f)) : any;
+          const vec vote = seen ? looked * voted : vec{};
+          total += vote;
+          const vec part = vote / most(total, all(1e-9f)), each = all(1.0f) / most(any, all(LEAST_SEEN));
+          for (vec &count : counts) count *= each;
+          for (int k = 0; k <= C; k++) {
+            const size_t plane = (size_t)k * VECTORS;
+            const vec sample = corners[0][plane] * counts[0] + corners[1][plane] * counts[1] + corners[2][plane] * counts[2] + corners[3][plane] * counts[3];
+            shown[k] += (sample - shown[k]) * part;
+          }
+        }
+        wanted &= total > vec{};
+        if (!any_of(wanted)) continue;
+        // together with a surface that is hardly mixed in: the more of that, the less of what is hidden
+        const Block b = s_.make_block(which);
+        const size_t at = within + v * LANES;
+        const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * (all(HIDDEN_WEIGHT) - mixed);
+        const vec weight = hidden + (all(1.0f) - hidden * (1.0f / HIDDEN_WEIGHT)) * mixed, part = hidden / most(weight, all(1e-12f));
+        auto blend = [&](float *other, vec hidden_one) {
+          const vec old = load<vec>(other), blended = part < all(1.0f) ? old + part * (hidden_one - old) : hidden_one;
+          store(other, wanted ? blended : old);
+        };
+        for (int c = 0; c < C; c++) blend(b.other + c * BLOCK_PIXELS + at, shown[c]);
+        blend(b.coc + at, shown[C]);
+        vec valid = all(1.0f);
+        for (int x = 0; s_.valid && x < std::min(LANES, columns - v * LANES); x++) valid[x] = s_.valid[(size_t)(y0 + y) * W + x0 + v * LANES + x];
+        store(b.weight + at, wanted ? weight * valid : mixed);
+      }
+    }
   }
 
   Job &job_;

@@ -73,8 +73,8 @@ int32_t torchdof_finish(torchdof_job *job, const float *const *kernels, const in
 
 void torchdof_free(torchdof_job *job) { delete job; }
 
-int32_t torchdof_repair_edges(const torchdof_map *map) {
-  return torchdof::guarded([&] { torchdof::chosen().repair_edges(*map); });
+int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed) {
+  return torchdof::guarded([&] { *changed = torchdof::chosen().repair_edges(*map); });
 }
 
 void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half, float *out) {

@@ -73,7 +73,7 @@ class Downsampling {
  public:
   Downsampling(const Job &job, const LayerIndex &index, const Border &border, Downsampled &to)
       : job_(job), s_(job.surfaces), index_(index), border_(border), over_(job.scene.occlusion), to_(to), C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)),
-        gathered_(stride_), light_(C_) {}
+        gathered_(stride_), cell_sums_(2 * stride_ * (CELL / 2)), light_(C_) {}
 
   // Rows of blocks of BLOCK pixels.
   void band(int band) {
@@ -116,66 +116,96 @@ class Downsampling {
     const int s = to_.scale, y0 = row * s, x0 = column * s;
     const size_t cell = (size_t)(y0 / CELL) * index_.columns + x0 / CELL;
     const int k = s <= CELL && index_.single[cell] ? index_.only_interval(cell) : -1;
-    if (k < 0) {
-      for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
-      return count;
-    }
-    std::fill(to_.row(0, row) + column, to_.row(0, row) + column + count, (float)to_.stands_for[k]);
-    if (!to_.wanted[k]) {
+    if (k >= 0 && !to_.wanted[k]) {
+      std::fill(to_.row(0, row) + column, to_.row(0, row) + column + count, (float)to_.stands_for[k]);
       std::fill(to_.row(1, row) + column, to_.row(1, row) + column + count, 1.0f);
       return count;
     }
-    if (count * s < CELL) {  // at the frame's border
-      for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
-    } else if (C_ == 3) {
-      s == 2 ? cell_sums<2, 3>(row, column, k) : s == 4 ? cell_sums<4, 3>(row, column, k) : cell_sums<8, 3>(row, column, k);
-    } else {
-      s == 2 ? cell_sums<2, 0>(row, column, k) : s == 4 ? cell_sums<4, 0>(row, column, k) : cell_sums<8, 0>(row, column, k);
-    }
+    const bool whole = count * s == CELL && !index_.mixed[cell];
+    const bool summed = whole && (s == 2 ? cell_sums<2>(row, column, pieces) : s == 4 ? cell_sums<4>(row, column, pieces) : cell_sums<8>(row, column, pieces));
+    for (int i = 0; i < count && !summed; i++) block(row, column + i, true, pieces);
     return count;
   }
 
-  // Blocks in a row of a cell of one surface that lies between two nodes.
-  template <int S, int CHANNELS>
-  void cell_sums(int row, int column, int k) {
-    const int C = CHANNELS ? CHANNELS : C_, y0 = row * S, x0 = column * S;
-    const Layer &l = job_.layers[k];
-    constexpr int PARTS = CELL / LANES;
-    const float *coc;
-    const float *weight;
-    vec part[S][PARTS], sum[PARTS] = {};
-    auto put = [&](int plane, int to) {  // sums of S neighbours
-      float columns_of[CELL];
-      for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
-      float *out = to_.row(plane, to) + column;
-      for (int i = 0; i < CELL / S; i++) {
-        float total = 0;
-        for (int x = 0; x < S; x++) total += columns_of[i * S + x];
-        out[i] = total;
-      }
-    };
-    s_.row(0, y0, x0, light_.data(), coc, weight);
-    const size_t light_step = weight ? BLOCK : s_.width;
-    for (int y = 0; y < S; y++)
-      for (int p = 0; p < PARTS; p++) {
-        part[y][p] = behind(l, index_.place(load<vec>(coc + (size_t)y * s_.width + p * LANES)), over_);
-        sum[p] += part[y][p];
-      }
-    std::fill(to_.row(1, row) + column, to_.row(1, row) + column + CELL / S, 1.0f);
-    put(2, row);
-    for (int c = 0; c < C; c++) {
-      vec far[PARTS] = {};
-      for (int p = 0; p < PARTS; p++) {
-        sum[p] = vec{};
-        for (int y = 0; y < S; y++) {
-          const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
-          sum[p] += v;
-          far[p] += v * part[y][p];
+  // Blocks in a row of a cell whose surfaces, not mixed, lie between two nodes each; false if they do not.
+  template <int S>
+  bool cell_sums(int row, int column, Pieces &pieces) {
+    constexpr int PARTS = CELL / LANES, COUNT = CELL / S;
+    const int C = C_, y0 = row * S, x0 = column * S;
+    float *sums[2];  // of each surface, values as those of pieces, [stride, COUNT]
+    int nodes[2] = {-1, -1};
+    for (int i = 0; i < s_.count; i++) {
+      const float *coc, *weight;
+      if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
+      const uint16_t *intervals = &index_.intervals[i][(size_t)y0 * s_.width + x0], k = *intervals;
+      unsigned differs = 0;
+      for (int y = 0; y < S; y++)
+        for (int x = 0; x < CELL; x++) differs |= intervals[(size_t)y * s_.width + x] ^ k;
+      if (differs) return false;
+      if (!to_.needed(k)) continue;
+      nodes[i] = to_.stands_for[k];
+      sums[i] = cell_sums_.data() + (size_t)i * stride_ * COUNT;
+      auto put = [&](int value, const vec *sum) {  // sums of S neighbours
+        float columns_of[CELL], *to = sums[i] + value * COUNT;
+        for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
+        for (int j = 0; j < COUNT; j++) {
+          to[j] = 0;
+          for (int x = 0; x < S; x++) to[j] += columns_of[j * S + x];
         }
+      };
+      const size_t light_step = weight ? BLOCK : s_.width, coc_step = i ? BLOCK : s_.width;
+      vec whole[S][PARTS], far[S][PARTS], one[PARTS] = {}, two[PARTS] = {};
+      for (int y = 0; y < S; y++)
+        for (int p = 0; p < PARTS; p++) {
+          const vec place = index_.place(load<vec>(coc + y * coc_step + p * LANES));
+          one[p] += whole[y][p] = weight ? load<vec>(weight + y * BLOCK + p * LANES) : all(1.0f);
+          two[p] += far[y][p] = to_.wanted[k] ? whole[y][p] * behind(job_.layers[k], place, over_) : vec{};
+        }
+      put(0, one);
+      put(C + 1, two);
+      for (int c = 0; c < C; c++) {
+        for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
+        for (int y = 0; y < S && to_.wanted[k]; y++)
+          for (int p = 0; p < PARTS; p++) {
+            const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
+            one[p] += v * whole[y][p];
+            two[p] += v * far[y][p];
+          }
+        put(1 + c, one);
+        put(C + 2 + c, two);
       }
-      put(3 + c, row);
-      for (int p = 0; p < PARTS; p++) sum[p] = far[p];
-      put(3 + C + c, row);
+    }
+    for (int j = 0; j < COUNT; j++) {
+      int first = -1;
+      for (int i = 0; i < 2; i++) {
+        if (nodes[i] < 0 || sums[i][j] == 0) continue;
+        if (first < 0)
+          first = i;
+        else if (nodes[i] == nodes[first])
+          for (int v = 0; v < stride_; v++) sums[first][v * COUNT + j] += sums[i][v * COUNT + j];
+        else
+          add_piece(pieces, column + j, nodes[i], sums[i] + j, COUNT, 1.0f);
+      }
+      put_in_planes(row, column + j, first < 0 ? NOWHERE : (float)nodes[first], first < 0 ? nullptr : sums[first] + j, COUNT, 1.0f);
+    }
+    return true;
+  }
+
+  // Values of a piece, so far apart, times a factor: among the pieces, or in the planes.
+  void add_piece(Pieces &pieces, int column, int node, const float *values, int step, float factor) {
+    pieces.column.push_back(column);
+    pieces.node.push_back(node);
+    for (int v = 0; v < stride_; v++) pieces.values.push_back(values[v * step] * factor);
+  }
+  void put_in_planes(int row, int column, float node, const float *values, int step, float factor) {
+    to_.row(0, row)[column] = node;
+    if (!values) return;
+    const float *one = values, *two = values + (C_ + 1) * step;
+    to_.row(1, row)[column] = one[0] * factor;
+    to_.row(2, row)[column] = two[0] * factor;
+    for (int c = 0; c < C_; c++) {
+      to_.row(3 + c, row)[column] = one[(1 + c) * step] * factor;
+      to_.row(3 + C_ + c, row)[column] = two[(1 + c) * step] * factor;
     }
   }
 
@@ -183,26 +213,19 @@ class Downsampling {
   void block(int row, int column, bool inside, Pieces &pieces) {
     gathered_.count = 0;
     gather(row, column, inside);
-    int first = 0;
-    if (inside) {
-      to_.row(0, row)[column] = NOWHERE;
-      if (gathered_.count) {
-        const float *one = gathered_.values.data(), *two = one + C_ + 1;
-        to_.row(0, row)[column] = (float)gathered_.nodes[0];
-        to_.row(1, row)[column] = one[0] * each_;
-        to_.row(2, row)[column] = two[0] * each_;
-        for (int c = 0; c < C_; c++) {
-          to_.row(3 + c, row)[column] = one[1 + c] * each_;
-          to_.row(3 + C_ + c, row)[column] = two[1 + c] * each_;
-        }
-        first = 1;
-      }
-    }
-    for (int i = first; i < gathered_.count; i++) {
-      pieces.column.push_back(column);
-      pieces.node.push_back(gathered_.nodes[i]);
-      for (int v = 0; v < stride_; v++) pieces.values.push_back(gathered_.values[(size_t)i * stride_ + v] * each_);
-    }
+    const float *values = gathered_.values.data();
+    if (inside) put_in_planes(row, column, gathered_.count ? (float)gathered_.nodes[0] : NOWHERE, gathered_.count ? values : nullptr, 1, each_);
+    for (int i = inside ? 1 : 0; i < gathered_.count; i++) add_piece(pieces, column, gathered_.nodes[i], values + (size_t)i * stride_, 1, each_);
+  }
+
+  // Whether a block, continued beyond the frame, lies in cells with mixed pixels.
+  bool mixed(int y0, int x0) const {
+    auto cell = [&](int at, int size) { return std::clamp(at, 0, size - 1) / CELL; };
+    const int H = job_.height, W = job_.width, end = to_.scale - 1;
+    for (int row = cell(y0, H); row <= cell(y0 + end, H); row++)
+      for (int column = cell(x0, W); column <= cell(x0 + end, W); column++)
+        if (index_.mixed[(size_t)row * index_.columns + column]) return true;
+    return false;
   }
 
   // Weights of both surfaces of a block's pixels, in the layer before each and in the one behind it. The farther one of a
@@ -257,8 +280,7 @@ class Downsampling {
   void gather(int row, int column, bool inside) {
     const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width, C = C_;
     const float *coc, *weight;
-    const bool two = s_.count == 2 && s_.row(1, std::clamp(y0, 0, H - 1), std::clamp(x0, 0, W - 1), light_.data(), coc, weight) &&
-                     share_out(y0, x0, inside);
+    const bool two = s_.count == 2 && mixed(y0, x0) && share_out(y0, x0, inside);
     for (int i = 0; i < s_.count; i++) {
       if (inside) {
         if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
@@ -386,6 +408,7 @@ class Downsampling {
   float before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
   std::vector<Lacking> lacking_;
   Gathered gathered_;
+  std::vector<float> cell_sums_;
   std::vector<const float *> light_;
 };
 

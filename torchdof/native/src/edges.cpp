@@ -264,10 +264,7 @@ class Repair {
   explicit Repair(const torchdof_map &map)
       : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
 
-  void run() {
-    parallel(height_, [&](int y) {
-      memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
-    });
+  bool run() {
     allocate();
     noise_step_ = NOISES * noise();
     const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
@@ -284,7 +281,10 @@ class Repair {
     decide(sampled);
     calibrate(sampled);
     const bool is_soft = ramps_of(sampled) > SOFT;
-    if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return;
+    if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
+    parallel(height_, [&](int y) {
+      memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
+    });
     if (spares) groups = find_in(tiles(), 0, is_soft);
     list(groups, [&](const Edge &edge) { return !map_.automatic || (marks_[edge.i] & RAMP ? is_soft : wrong(edge) > DOUBTFUL); });
     judge(groups);
@@ -293,6 +293,7 @@ class Repair {
     const float lost_px = choose(groups);
     move(groups, sigma, lost_px);
     if (is_soft) lift_lamps(sigma, lost_px);
+    return true;
   }
 
  private:
@@ -1175,7 +1176,21 @@ class Repair {
 
 }  // namespace
 
-void repair_edges(const torchdof_map &map) { Repair(map).run(); }
+bool repair_edges(const torchdof_map &map) {
+  if (!map.of_coc) return Repair(map).run();
+  const Buffer<float> nearness((size_t)map.height * map.width);
+  auto negate = [&](const float *from, float *to) {
+    torchdof::parallel(map.threads, map.height, map.cancelled, [&](int y, int) {
+      for (size_t i = (size_t)y * map.width; i < (size_t)(y + 1) * map.width; i++) to[i] = -from[i];
+    });
+  };
+  negate(map.nearness, nearness.data());
+  torchdof_map negative = map;
+  negative.nearness = nearness.data();
+  const bool changed = Repair(negative).run();
+  if (changed) negate(map.out, map.out);
+  return changed;
+}
 
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -25,19 +25,36 @@ constexpr int LANES = 4;
 typedef float vec __attribute__((vector_size(LANES * 4)));
 typedef int32_t ivec __attribute__((vector_size(LANES * 4)));
 
-template <typename V>
-inline V load(const float *p) {
+template <typename V, typename T>
+inline V load(const T *p) {
   typedef V unaligned __attribute__((aligned(4)));
   return *(const unaligned *)p;
 }
-template <typename V>
-inline void store(float *p, V v) {
+template <typename V, typename T>
+inline void store(T *p, V v) {
   typedef V unaligned __attribute__((aligned(4)));
   *(unaligned *)p = v;
 }
 inline vec all(float v) { return v - vec{}; }
-inline vec most(vec a, vec b) { return a > b ? a : b; }
-inline vec least(vec a, vec b) { return a < b ? a : b; }
+// The larger and the smaller of two; b where one of them is no number.
+template <typename V>
+inline V most(V a, V b) {
+  return a > b ? a : b;
+}
+template <typename V>
+inline V least(V a, V b) {
+  return a < b ? a : b;
+}
+#if defined(__AVX2__)  // compilers do not always see that these are one instruction
+template <>
+inline vec most(vec a, vec b) {
+  return __builtin_ia32_maxps256(a, b);
+}
+template <>
+inline vec least(vec a, vec b) {
+  return __builtin_ia32_minps256(a, b);
+}
+#endif
 inline ivec convert(vec v) { return __builtin_convertvector(v, ivec); }
 inline vec convert(ivec v) { return __builtin_convertvector(v, vec); }
 inline vec clamp01(vec v) { return least(most(v, vec{}), all(1.0f)); }
@@ -47,6 +64,26 @@ inline float largest(vec v) {
   return m;
 }
 inline float smallest(vec v) { return -largest(-v); }
+// Of eight values those of the lanes' indices.
+inline vec pick(const float *values, ivec index) {
+#if defined(__AVX2__)
+  return (vec)__builtin_ia32_permvarsf256(load<vec>(values), index);
+#else
+  vec picked;
+  for (int i = 0; i < LANES; i++) picked[i] = values[index[i]];
+  return picked;
+#endif
+}
+inline bool any_of(ivec mask) {
+#if defined(__AVX2__)
+  return __builtin_ia32_movmskps256((vec)mask) != 0;
+#else
+  typedef long long wide __attribute__((vector_size(LANES * 4)));
+  const wide bits = (wide)mask;
+  return (bits[0] | bits[1]) != 0;
+#endif
+}
+inline bool any_positive(vec v) { return any_of(v > vec{}); }
 inline float clamp(float v, float low, float high) { return std::min(std::max(v, low), high); }
 inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
 inline int ceil_div(int a, int b) { return (a + b - 1) / b; }
@@ -106,7 +143,28 @@ class Surfaces {
   Block make_block(int i);
   // Surface i in a row, from column x on, n pixels within one block column: pointers to light of each channel, coc and
   // weight (null: 1, and for a second surface 0).
-  bool row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const;
+  bool row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const {
+    const size_t at = (size_t)y * width + x;
+    if (whole()) {
+      for (int c = 0; c < channels; c++) light_of[c] = lights[i] + c * area() + at;
+      coc_of = cocs[i] + at;
+      weight_of = weights[i] ? weights[i] + at : nullptr;
+      return true;
+    }
+    const int which = y / BLOCK * block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
+    if (!has_block(which)) {
+      if (i) return false;
+      for (int c = 0; c < channels; c++) light_of[c] = light + c * area() + at;
+      coc_of = coc + at;
+      weight_of = nullptr;
+      return true;
+    }
+    const Block b = block(which);
+    for (int c = 0; c < channels; c++) light_of[c] = (i ? b.other : b.own) + c * BLOCK_PIXELS + within;
+    coc_of = i ? b.coc + within : coc + at;
+    weight_of = (i ? b.weight : b.seen) + within;
+    return true;
+  }
 
  private:
   static constexpr int BLOCKS_AT_ONCE = 64;
@@ -144,14 +202,8 @@ struct Layer {
 constexpr double SQUARE_PX = 0.5, IN_FOCUS = 2e-4;
 template <typename V>
 inline V axis(V coc, float low, float high) {
-  const V zero = {}, lowest = zero + low, highest = zero + high, focus = zero + (float)IN_FOCUS;
-  const V size = coc < zero ? -coc : coc;
-  V x = coc * size / (size + (float)SQUARE_PX);
-  V middle = x > -focus ? x : -focus;
-  middle = middle < focus ? middle : focus;
-  x = x - middle;
-  x = x > lowest ? x : lowest;
-  return x < highest ? x : highest;
+  const V zero = {}, focus = zero + (float)IN_FOCUS, size = most(coc, -coc), x = coc * size / (size + (float)SQUARE_PX);
+  return least(most(x - least(most(x, -focus), focus), zero + low), zero + high);
 }
 inline float coc_at(double node) {
   const double beyond = (std::fabs(node) + IN_FOCUS) / 2;
@@ -163,15 +215,13 @@ constexpr float SLOPE = 1 / (1 - FOOT / 2);  // and how it goes on
 // A ramp from 0 to 1, exactly, whose foot is a parabola.
 template <typename V>
 inline V eased(V v) {
-  const V most = V{} + FOOT, foot = v < most ? v : most;
-  const V line = 1.0f - SLOPE * (1.0f - v), parabola = SLOPE / (2 * FOOT) * foot * foot;
-  return line > parabola ? line : parabola;
+  const V foot = least(v, V{} + FOOT);
+  return most(1.0f - SLOPE * (1.0f - v), SLOPE / (2 * FOOT) * foot * foot);
 }
 template <typename V>
 inline V ramp(V v, bool ease) {
-  const V zero = {}, one = zero + 1.0f;
-  v = v > zero ? v : zero;
-  v = v < one ? v : one;
+  const V zero = {};
+  v = least(most(v, zero), zero + 1.0f);
   return ease ? eased(v) : v;
 }
 // Of what lies at a place, the part of a layer and those behind it, and that of those behind it alone; eased under occlusion.
@@ -190,15 +240,12 @@ constexpr float GOES_ON = 0.1f;  // share of a pixel, beyond a hidden one's, fro
 // how much it does in a layer that has so much of the nearer one at or behind it.
 template <typename V>
 inline V going_on(V share) {
-  const V zero = {}, one = zero + 1.0f;
-  V known = (share - HIDDEN_WEIGHT) * (1.0f / GOES_ON);
-  known = known > zero ? known : zero;
-  return (one - share) * (known < one ? known : one);
+  const V zero = {}, known = (share - HIDDEN_WEIGHT) * (1.0f / GOES_ON);
+  return (1.0f - share) * least(most(known, zero), zero + 1.0f);
 }
 template <typename V>
 inline V where_it_shows(V going_on, V nearer) {
-  const V one = V{} + 1.0f, hidden = nearer * (1.0f / HAIR);
-  return going_on * (one - (hidden < one ? hidden : one));
+  return going_on * (1.0f - least(nearer * (1.0f / HAIR), V{} + 1.0f));
 }
 
 struct Job {
@@ -250,6 +297,7 @@ float threshold_at(const Job &job, int y, int x);
 // Light beyond the frame; border.cpp
 class Border {
  public:
+  static constexpr float OWN = 0.55f;  // part of the nearest pixel's light in what lies beyond; the rest is of means
   // Light of a surface at a place beyond the frame, given that of the nearest pixel.
   float light(int surface, int channel, int y, int x, float nearest) const {
     if (dark_) return 0;
@@ -267,7 +315,7 @@ class Border {
       share = shares_[side][(size_t)surface * height_ + at_y];
     }
     const float on = !across ? from_row : !far ? from_column : (from_row * far + from_column * across) / (far + across);
-    return 0.5f * (nearest * share + on);
+    return OWN * nearest * share + on;
   }
   // The same of n pixels above or below the frame.
   void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
@@ -289,7 +337,7 @@ class Border {
   std::vector<float> part_of_;
   bool dark_ = false;  // nothing comes from there
   std::vector<float> shares_[4];  // of each side, [surfaces, length]: of the light there, what is no highlight's
-  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; level l is that of 2^l pixels
+  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; but for the own pixel, and level l is that of 2^l pixels
 };
 Border border_of(const Job &job, int farthest);
 
@@ -314,6 +362,7 @@ struct LayerIndex {
   int words, rows, columns;   // words of bits of a cell; cells
   std::vector<uint64_t> bits;    // layers that occur in each cell, a bit each
   std::vector<uint8_t> single;   // cells that show the first surface alone, whole
+  std::vector<uint8_t> mixed;    // those with pixels, of two surfaces, whose farther one goes on behind the nearer
   std::vector<Buffer<uint16_t>> intervals;
 
   const uint64_t *cell(size_t i) const { return &bits[i * words]; }
@@ -483,8 +532,8 @@ inline uint32_t strip_inputs(int x, int half) {
 // kernel's half more on each side and begins there. Input row i matters where rows[i] has one of the bits of `columns`.
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
 
-// Depth edges; edges.cpp
-void repair_edges(const torchdof_map &map);
+// Depth edges; false if they are right as they are; edges.cpp
+bool repair_edges(const torchdof_map &map);
 
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);
 

@@ -70,11 +70,12 @@ void Job::find_threshold() {
   parallel(threshold_rows, [&](int row, int) {
     float brightest[COUNT];
     for (int column = 0; column < threshold_columns; column++) {
+      int xs[CELL_STEPS];
+      for (int j = 0; j < CELL_STEPS; j++) xs[j] = mirrored(column * THRESHOLD_CELL + j * STEP + STEP / 2 - threshold_left, width);
       for (int i = 0; i < CELL_STEPS; i++) {
         const int y = mirrored(row * THRESHOLD_CELL + i * STEP + STEP / 2 - threshold_top, height);
         for (int j = 0; j < CELL_STEPS; j++) {
-          const int x = mirrored(column * THRESHOLD_CELL + j * STEP + STEP / 2 - threshold_left, width);
-          const size_t at = (size_t)y * width + x;
+          const size_t at = (size_t)y * width + xs[j];
           float most = light[at];
           for (int c = 1; c < channels; c++) most = std::max(most, light[c * area + at]);
           brightest[i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : most;
@@ -99,22 +100,22 @@ void Job::extract_highlights() {
     for (int bx = 0; bx < surfaces.block_columns; bx++) {
       const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
       const float least_limit = least_threshold(*this, by * BLOCK, x0);
-      if (!surfaces.whole() && !surfaces.has_block(block) && !(block_peak[block] > least_limit)) continue;
+      if (!surfaces.whole()) {
+        vec peak = all(block_peak[block]);
+        const float *of_block = surfaces.blocks[block];  // light of both surfaces comes first
+        for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES) peak = most(peak, load<vec>(of_block + i));
+        if (!any_of(peak > all(least_limit))) continue;
+      }
       for (int y = by * BLOCK; y < std::min(height, (by + 1) * BLOCK); y++) {
         for (int i = 0; i < count; i++) {
           if (!surfaces.row(i, y, x0, light.data(), coc, weight)) continue;
-          float most[BLOCK];
-          for (int x = 0; x < n; x++) most[x] = light[0][x];
-          for (int c = 1; c < channels; c++)
-            for (int x = 0; x < n; x++) most[x] = std::max(most[x], light[c][x]);
-          bool any = false;
-          for (int x = 0; x < n; x++) any |= most[x] > least_limit;
-          if (!any) continue;
           for (int x = 0; x < n; x++) {
-            if (!(most[x] > least_limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > from_px)) continue;
+            float brightest = light[0][x];
+            for (int c = 1; c < channels; c++) brightest = std::max(brightest, light[c][x]);
+            if (!(brightest > least_limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > from_px)) continue;
             const float limit = threshold_at(*this, y, x0 + x);
-            if (!(most[x] > limit)) continue;
-            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, most[x], coc[x], limit});
+            if (!(brightest > limit)) continue;
+            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit});
           }
         }
       }
@@ -182,7 +183,7 @@ void Job::extract_highlights() {
 }
 
 // The surfaces that pixels show, own and other, in a row from column x on within one block column, with the part of a
-// pixel that each covers; what is hidden covers nothing.
+// pixel that each covers; what is hidden covers nothing. The body is told whether it is the own one.
 template <typename Body>
 static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
   const int own = surfaces.whole() ? 1 : 0;  // before a known background the other surface comes first
@@ -190,7 +191,7 @@ static void each_shown(const Surfaces &surfaces, int y, int x, const float **lig
   for (int i : {own, 1 - own}) {
     if (!surfaces.row(i, y, x, light, coc, weight)) continue;
     const float least = i == own ? 0.0f : HIDDEN_WEIGHT;
-    body(coc, [=](int j) { return weight ? std::max(weight[j] - least, 0.0f) : 1.0f; });
+    body(i == own, coc, [=](int j) { return weight ? std::max(weight[j] - least, 0.0f) : 1.0f; });
   }
 }
 
@@ -210,19 +211,33 @@ Visibility look_at(const Job &job) {
   v.cell_columns = ceil_div(W, CELL);
   v.cells.assign((size_t)v.cell_rows * v.cell_columns, 0);
   std::vector<uint8_t> floors((size_t)v.cell_rows * bins);
+  const Surfaces &surfaces = job.surfaces;
   job.parallel(v.cell_rows, [&](int row, int) {
     uint8_t *here = floors.data() + (size_t)row * bins;
+    uint64_t *cells = &v.cells[(size_t)row * v.cell_columns];
+    auto add = [&](int x, float coc) {
+      const float place = clamp(coc - low, 0.0f, high - low);
+      here[(int)place] = 1;
+      cells[x / CELL] |= 1ull << std::min((int)(place / v.class_width), CLASSES - 1);
+    };
     std::vector<const float *> light(job.channels);
-    for (int y = row * CELL; y < std::min(H, (row + 1) * CELL); y++)
-      for (int x = 0; x < W; x += BLOCK)
-        each_shown(job.surfaces, y, x, light.data(), [&](const float *coc, auto cover) {
-          for (int j = 0; j < std::min(BLOCK, W - x); j++) {
-            if (!(cover(j) > 0)) continue;
-            const float place = clamp(coc[j] - low, 0.0f, high - low);
-            here[(int)place] = 1;
-            v.cells[(size_t)row * v.cell_columns + (x + j) / CELL] |= 1ull << std::min((int)(place / v.class_width), CLASSES - 1);
-          }
+    for (int x = 0; x < W; x += BLOCK) {
+      const int block = row * CELL / BLOCK * surfaces.block_columns + x / BLOCK, n = std::min(BLOCK, W - x);
+      // the image's own surface within 1 px has no other bins and classes than its ends
+      const float ends[2] = {job.block_low[block], job.block_high[block]};
+      const bool flat = !surfaces.whole() && ends[1] - ends[0] < 1;
+      for (int j = 0; flat && j < n; j += CELL)
+        for (float coc : ends) add(x + j, coc);
+      if (flat && !surfaces.has_block(block)) continue;
+      for (int y = row * CELL; y < std::min(H, (row + 1) * CELL); y++)
+        each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, auto cover) {
+          if (own && flat) return;
+          float most = 0;
+          for (int j = 0; j < n; j++) most = std::max(most, cover(j));
+          for (int j = 0; most > 0 && j < n; j++)
+            if (cover(j) > 0) add(x + j, coc[j]);
         });
+    }
   });
   for (size_t i = 0; i < floors.size(); i++)
     if (floors[i]) present[i % bins] = present[i % bins + 1] = 1;
@@ -237,7 +252,7 @@ static void cover_row(const Job &job, int y, int first, int last, float place, c
     const int n = std::min(last + 1, (x / BLOCK + 1) * BLOCK) - x;
     float *to = covered + (x - first);
     for (int j = 0; j < n; j++) to[j] = 0;
-    each_shown(job.surfaces, y, x, light, [&](const float *coc, auto cover) {
+    each_shown(job.surfaces, y, x, light, [&](bool, const float *coc, auto cover) {
       for (int j = 0; j < n; j++) to[j] += std::max(1.0f - std::fabs(coc[j] - place), 0.0f) * cover(j);
     });
     x += n;

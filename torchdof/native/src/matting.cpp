@@ -43,22 +43,21 @@ struct Window {
 bool find_edges(const Job &job, int y0, int x0, Window &w) {
   const int H = job.height, W = job.width;
   const float *coc = job.surfaces.coc, *valid = job.surfaces.valid;
-  float low[SIDE * PITCH], high[SIDE * PITCH];  // of valid pixels
+  float lows[SIDE * PITCH], highs[SIDE * PITCH];  // of valid pixels
+  const float *low = valid ? lows : w.coc, *high = valid ? highs : w.coc;
   const bool inside = x0 >= MARGIN && x0 + BLOCK + MARGIN <= W;
   for (int i = 0; i < SIDE; i++) {
     const size_t row = (size_t)std::clamp(y0 - MARGIN + i, 0, H - 1) * W;
-    if (inside && !valid)
-      for (float *to : {w.coc, low, high}) memcpy(to + i * PITCH, coc + row + x0 - MARGIN, SIDE * sizeof(float));
+    if (inside && !valid) memcpy(w.coc + i * PITCH, coc + row + x0 - MARGIN, SIDE * sizeof(float));
     for (int j = inside && !valid ? SIDE : 0; j < SIDE; j++) {
       const size_t at = row + std::clamp(x0 - MARGIN + j, 0, W - 1);
-      w.coc[i * PITCH + j] = low[i * PITCH + j] = high[i * PITCH + j] = coc[at];
+      w.coc[i * PITCH + j] = coc[at];
       if (!valid) continue;
       w.valid[i * PITCH + j] = valid[at];
-      if (valid[at] > 0) continue;
-      low[i * PITCH + j] = NEVER;
-      high[i * PITCH + j] = -NEVER;
+      lows[i * PITCH + j] = valid[at] > 0 ? coc[at] : NEVER;
+      highs[i * PITCH + j] = valid[at] > 0 ? coc[at] : -NEVER;
     }
-    for (int j = SIDE; j < PITCH; j++) low[i * PITCH + j] = high[i * PITCH + j] = 0;
+    for (int j = SIDE; j < PITCH; j++) w.coc[i * PITCH + j] = lows[i * PITCH + j] = highs[i * PITCH + j] = 0;
   }
   bool any = false;
   for (int i = 0; i < EDGES; i++) {
@@ -71,15 +70,14 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
       most_of[j] = std::max(std::max(h[0], h[PITCH]), h[2 * PITCH]);
     }
     if (inside && !valid) {
-      float most_edge = 0;
       for (int j = 0; j < EDGES; j++) {
         const float gap = std::max(std::max(most_of[j], most_of[j + 1]), most_of[j + 2]) -
                           std::min(std::min(least_of[j], least_of[j + 1]), least_of[j + 2]);
         w.edge[i * PITCH + j] = clamp01(gap / EDGE_PX - 1.0f);
       }
-      if (i >= REACH && i < REACH + BLOCK)
-        for (int j = REACH; j < REACH + BLOCK; j++) most_edge = std::max(most_edge, w.edge[i * PITCH + j]);
-      any |= most_edge > 0;
+      vec most_edge = {};
+      for (int j = REACH; j < REACH + BLOCK; j += LANES) most_edge = most(most_edge, load<vec>(w.edge + i * PITCH + j));
+      any |= i >= REACH && i < REACH + BLOCK && any_positive(most_edge);
       continue;
     }
     for (int j = 0; j < EDGES; j++) {
@@ -302,29 +300,6 @@ Block Surfaces::make_block(int i) {
     for (int x = 0; x < columns; x++) made.seen[y * BLOCK + x] = valid ? valid[from + x] : 1.0f;
   }
   return made;
-}
-
-bool Surfaces::row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const {
-  const size_t at = (size_t)y * width + x;
-  if (whole()) {
-    for (int c = 0; c < channels; c++) light_of[c] = lights[i] + c * area() + at;
-    coc_of = cocs[i] + at;
-    weight_of = weights[i] ? weights[i] + at : nullptr;
-    return true;
-  }
-  const int which = y / BLOCK * block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
-  if (!has_block(which)) {
-    if (i) return false;
-    for (int c = 0; c < channels; c++) light_of[c] = light + c * area() + at;
-    coc_of = coc + at;
-    weight_of = nullptr;
-    return true;
-  }
-  const Block b = block(which);
-  for (int c = 0; c < channels; c++) light_of[c] = (i ? b.other : b.own) + c * BLOCK_PIXELS + within;
-  coc_of = i ? b.coc + within : coc + at;
-  weight_of = (i ? b.weight : b.seen) + within;
-  return true;
 }
 
 void Job::split_mixed() {

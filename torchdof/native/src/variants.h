@@ -23,7 +23,7 @@ class AnyJob {
 
 struct Variant {
   AnyJob *(*begin)(const torchdof_scene &scene);
-  void (*repair_edges)(const torchdof_map &map);
+  bool (*repair_edges)(const torchdof_map &map);
   void (*convolve)(const float *in, int height, int width, const float *kernel, int half, float *out);
 };
 
