@@ -15,6 +15,7 @@ from .structure import structure
 
 __all__ = ["slim"]
 
+_OF_WINDOWS = {"pads": 0, "dilations": 1, "strides": 1}  # what these are where they are not stated, along each axis
 _LARGEST_EQUAL = 64  # numbers of a constant that are written one by one though they are the same
 
 
@@ -356,7 +357,9 @@ def _drop_defaults(model: onnx_ir.Model) -> None:
         known = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
         for name, attribute in list(node.attributes.items()):
             default = known[name].default_value
-            if default.type and onnx.helper.get_attribute_value(default) == _plain(attribute):
+            is_default = default.type and onnx.helper.get_attribute_value(default) == _plain(attribute)
+            of_window = name in _OF_WINDOWS and set(attribute.as_ints()) == {_OF_WINDOWS[name]}
+            if is_default or of_window or (node.op_type, name) == ("Conv", "kernel_shape"):
                 del node.attributes[name]
 
 

@@ -18,7 +18,7 @@ SIMPLE: dict[str, Any] = {"occlusion": False, "tolerance": 0.2, "max_coc_px": 1.
 
 
 def test_file_is_small_and_every_case_agrees_to_1e_5(layered: Any) -> None:
-    assert layered.path.stat().st_size < 300_000
+    assert layered.path.stat().st_size < 200_000
     assert len(layered.verification.cases) >= 14
     assert 0 < layered.verification.max_error < 1e-5
 
@@ -118,6 +118,16 @@ def test_weights_lie_beside_their_convolutions(layered: Any) -> None:
                 sources = [weight] if weight.op_type != "Gather" else [made[name] for name in weight.input]
                 assert all(source.op_type in ("Constant", "ConstantOfShape") for source in sources)
                 assert len(node.input) == 2
+
+
+def test_nothing_is_copied_to_fill_a_convolution_and_ramps_are_one_operator(layered: Any) -> None:
+    before, ramps = set(), 0
+    for graph in graphs(onnx.load(layered.path).graph):
+        makers = {output: node.op_type for node in graph.node for output in node.output}
+        before |= {makers.get(node.input[0]) for node in graph.node if node.op_type == "Conv"}
+        ramps += sum(node.op_type == "HardSigmoid" for node in graph.node)
+    assert before == {"Concat", "Conv"}
+    assert ramps > 10
 
 
 @pytest.mark.parametrize(
