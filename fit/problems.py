@@ -95,7 +95,10 @@ class WindowWarning(FitWarning):
 
 
 class DistanceError(FitError):
-    """Distances are not increasing, not positive, or equal to the focus; `number` is the first bad one."""
+    """Distances are not increasing, not positive, or equal to the focus; `number` is the first bad one.
+
+    Or one is so large that nothing of the dot would be seen; `number` is then the dot's magnification.
+    """
 
 
 class FlatProfileError(FitError):

@@ -34,6 +34,9 @@ class Edge:
         covariance: of radius and softness `[2, 2]`.
         rms: of what the ideal dot does not explain, over the dot's peak.
         misfit: the same over the noise expected there.
+        steepness: by how much of its level the edge's upper half is brighter than its pixels' coverage, and the lower
+            darker. An S-curve spreads the levels of half-covered pixels apart; no blur does: it brings them together.
+        steepness_error: of that.
     """
 
     x: float
@@ -45,6 +48,8 @@ class Edge:
     covariance: Array
     rms: float
     misfit: float
+    steepness: float
+    steepness_error: float
 
 
 def with_softness(edge: Edge, softness: float) -> Edge:
@@ -138,6 +143,8 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
     bread = inverse(slope.T @ slope)
     bread = np.where(np.isfinite(bread), bread, 0.0)
     covariance = bread @ (slope.T @ together.T) @ bread * levels.size / max(levels.size - len(solution), 1)
+    coverage = draw_edge(rows, columns, dot.x + solution[0], dot.y + solution[1], solution[2], solution[3])
+    steepness, steepness_error = _steepness(residual / solution[4], coverage)
     return Edge(
         x=dot.x + float(solution[0]),
         y=dot.y + float(solution[1]),
@@ -148,7 +155,18 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         covariance=covariance[2:4, 2:4],
         rms=float(np.sqrt(variance)),
         misfit=float(np.sqrt(variance)) / expected if expected > 0 else np.inf,
+        steepness=steepness,
+        steepness_error=steepness_error,
     )
+
+
+def _steepness(residual: Array, coverage: Array) -> tuple[float, float]:
+    """Steepness of an edge and its error, from what a soft disc leaves of the levels of pixels so far covered."""
+    low, high = (coverage > 0.02) & (coverage < 0.4), (coverage > 0.6) & (coverage < 0.98)
+    if min(low.sum(), high.sum()) < 8:
+        return 0.0, np.inf
+    error = np.sqrt(sum(float(residual[side].var(ddof=1)) / side.sum() for side in (low, high)))
+    return float(residual[high].mean() - residual[low].mean()), float(error)
 
 
 def _variance(picture: Array, dot: Dot) -> Array:

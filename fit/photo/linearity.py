@@ -11,7 +11,7 @@ from ..problems import NotInFocusWarning, NotLinearWarning, warn
 from ..result import Array
 from .diagnostics import left_open, unexplained
 from .dot import Dot, mixed_differences, noise_inside, noise_of
-from .dot_model import Edge, draw_edge, soft_edge, with_softness
+from .dot_model import Edge, soft_edge, with_softness
 from .forward import Forward, Solution
 
 __all__ = [
@@ -36,7 +36,8 @@ _FOCUSED_PX = 0.5  # what it leaves on average: between a perfect lens and a dem
 _MATTERS = 0.02  # share of the kernel's size
 _MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
 _DRAWN = 1e-3  # of the level; less is left of pictures without noise, whose edges were drawn in another way
-_BENT, _BENT_CHI = 0.1, 30.0  # least share of a tone curve, and chi squared of two degrees of freedom
+_BENT, _BENT_CHI = 0.075, 30.0  # of a curve of 20 %, what the fit does not take up; chi squared of two parameters
+_STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same where the sharp dot's edge agrees
 _STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
 
@@ -52,13 +53,13 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stackl
         )
         warn(NotLinearWarning(text, file=file, number=ratio), stacklevel)
         return False
-    steepness, error = _steepness(still, dot, edge)
-    if steepness > max(_STEEP, _CERTAIN * error):
+    if edge.steepness > max(_STEEP, _CERTAIN * edge.steepness_error):
         text = (
-            f"the dot's edge is steeper than pixels can be, by {100 * steepness:.0f} % of its level: a tone curve (an "
-            "S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without them"
+            f"the dot's edge is steeper than pixels can be, by {100 * edge.steepness:.0f} % of its level: a tone curve "
+            "(an S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without "
+            "them"
         )
-        warn(NotLinearWarning(text, file=file, number=steepness), stacklevel)
+        warn(NotLinearWarning(text, file=file, number=edge.steepness), stacklevel)
         return False
     if edge.misfit < EXPLAINED:
         return True
@@ -105,31 +106,34 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
     return True
 
 
-def check_levels(pair: Forward, solution: Solution, level: float, file: str | None, stacklevel: int = 4) -> bool:
+def check_levels(pair: Forward, solution: Solution, edge: Edge, file: str | None, stacklevel: int = 4) -> bool:
     """Whether what a fit leaves has nothing to do with the level; warns where a tone curve would explain it.
 
     No kernel makes all places of one level brighter, and all of another darker. A tone curve does, also one so weak
-    that the residual hardly grows. What the fit's own parameters could have taken up is left out.
+    that the residual hardly grows. What the fit's own parameters could have taken up is left out. In a JPEG less shows
+    it; there the sharp dot's edge, a little steeper than pixels can be, is a second witness.
 
     Args:
         pair: the pictures.
         solution: what was found.
-        level: of the sharp dot.
+        edge: of the sharp dot.
         file: named in the warning.
         stacklevel: where the warning points.
     """
-    light = (solution.model.ravel()[pair.flat] - solution.background) / (solution.gain * level)
+    light = (solution.model.ravel()[pair.flat] - solution.background) / (solution.gain * edge.level)
     encoded = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None, None], "srgb", False, False)
     step = 1e-3  # of the encoded level
     steeper = (decode(encoded + step, "srgb", False, False) - decode(encoded - step, "srgb", False, False)) / (2 * step)
-    e, slope = encoded.flatten().numpy(), solution.gain * level * steeper.flatten().numpy()
+    e, slope = encoded.flatten().numpy(), solution.gain * edge.level * steeper.flatten().numpy()
     # brighter all over, and an S-curve's contrast
     curves = np.stack([slope * e * (1 - e), -slope * e * (1 - e) * (1 - 2 * e)], axis=1)
     found, spread = unexplained(pair, solution, curves)
     seen = left_open(pair, solution, curves)
     bend = np.linalg.lstsq(seen.T @ seen, found, rcond=None)[0]
     chi_squared = float(found @ np.linalg.pinv(spread) @ found)
-    if chi_squared < _BENT_CHI or float(np.linalg.norm(bend)) < _BENT:
+    steep = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)
+    agrees = edge.steepness > _STEEP_TOO and steep > 1 and chi_squared + steep**2 > _BENT_CHI_TOO
+    if float(np.linalg.norm(bend)) < _BENT or not (chi_squared > _BENT_CHI or agrees):
         return True
     text = (
         f"what the fit leaves goes with the level, as under a tone curve (an S-curve of {100 * abs(bend[1]):.0f} %, a "
@@ -173,18 +177,3 @@ def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | Non
     else:
         text += f"; if the printed dot's edge is sharp, the kernel is too small by {100 * share:.0f} %"
     warn(NotInFocusWarning(text, file=file, number=edge.softness), stacklevel)
-
-
-def _steepness(still: Array, dot: Dot, edge: Edge) -> tuple[float, float]:
-    """How much brighter the upper half of an edge is than its pixels' coverage, and the lower darker, and its error.
-
-    An S-curve spreads the levels of half-covered pixels apart. No blur does: it brings them together.
-    """
-    pixels = np.indices(still.shape, np.float64)
-    coverage = draw_edge(pixels[0], pixels[1], edge.x, edge.y, edge.radius, edge.softness)
-    residual = (still - dot.background) / edge.level - coverage
-    low, high = (coverage > 0.02) & (coverage < 0.4), (coverage > 0.6) & (coverage < 0.98)
-    if min(low.sum(), high.sum()) < 8:
-        return 0.0, np.inf
-    error = np.sqrt(sum(float(residual[side].var(ddof=1)) / side.sum() for side in (low, high)))
-    return float(residual[high].mean() - residual[low].mean()), float(error)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from torchdof.optics.aperture import Aperture
 from torchdof.validation import show
 
-from ..problems import FitError, SaturatedWarning, warn
+from ..problems import DistanceError, FitError, SaturatedWarning, warn
 from ..result import Array, BlurFit
 from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
@@ -36,6 +36,7 @@ Model = Literal["forward", "ratio"]
 SourceKind = Literal["auto", "image", "dot"]
 
 _SMALLEST_WINDOW = 15
+_SMALLEST_DOT_PX = 0.2
 _AS_GOOD = 2e-3
 _GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
 _FINE = 0.5  # share of fine noise from which on its level can be judged
@@ -175,7 +176,7 @@ def fit_pair(
     # a residual far above the noise was said already, whatever it goes with
     large = edge is not None and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
     if edge is not None and linear and large and judged.residual_over_noise < FAR_ABOVE:
-        check_levels(pair, freest, edge.level, files[1])
+        check_levels(pair, freest, edge, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)
@@ -249,6 +250,14 @@ def prepared_pair(
     if softness is not None and softness < edge.softness:
         source, edge = "dot", with_softness(edge, softness)
     linear = clipped > 0 or softness is not None or check_linearity(still, dot, edge, files[0])
+    if edge.radius * magnification < _SMALLEST_DOT_PX:
+        raise DistanceError(
+            f"by the distances the dot, {edge.radius:.1f} px in focus, would have a radius of "
+            f"{edge.radius * magnification:.2g} px here, and nothing of it be seen; is the distance misread, or in "
+            "another unit?",
+            file=files[1],
+            number=magnification,
+        )
     bright = noise_inside(still, dot)
     shot_noise = 0.0 if bright is None else max(bright[0] ** 2 - dot.noise**2, 0.0) / edge.level
     if clipped:

@@ -109,9 +109,37 @@ def test_a_lamp_whose_depth_was_averaged_away_gets_it_back() -> None:
     assert 0.4 < float((1 / repair_edges(image, given, "auto"))[lamps].mean()) < 0.6
 
 
-def test_the_brightness_of_the_image_changes_nothing(scene: Scene) -> None:
+@pytest.mark.parametrize("times", [2.0**-10, 2.0**20])
+def test_the_brightness_of_the_image_changes_nothing(scene: Scene, times: float) -> None:
     depth = degrade(scene.depth, "half-res")
-    torch.testing.assert_close(repair_edges(scene.image, depth), repair_edges(1024.0 * scene.image, depth))
+    torch.testing.assert_close(repair_edges(scene.image, depth), repair_edges(times * scene.image, depth))
+
+
+@pytest.mark.parametrize(
+    "turn", [lambda t: t.flip(-1), lambda t: t.flip(-2), lambda t: t.mT], ids=["left-right", "top-bottom", "diagonal"]
+)
+def test_a_turned_map_is_repaired_as_it_is_unturned(scene: Scene, turn: Callable[[Tensor], Tensor]) -> None:
+    depth = degrade(scene.depth, "near -1px")
+    mended = repair_edges(turn(scene.image).contiguous(), turn(depth).contiguous(), "auto")
+    torch.testing.assert_close(turn(1 / mended), 1 / repair_edges(scene.image, depth, "auto"), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("marked", [0.0, -3.0])
+def test_values_of_pixels_without_depth_stay_and_touch_nothing(scene: Scene, marked: float) -> None:
+    depth, holes = degrade(scene.depth, "near -1px"), torch.zeros_like(scene.depth, dtype=torch.bool)
+    holes[..., 40:60, :30] = True
+    mended, same = (repair_edges(scene.image, torch.where(holes, value, depth)) for value in (torch.nan, marked))
+    assert bool(mended.isnan()[holes].all()) and bool((same[holes] == marked).all())
+    assert torch.equal(mended[~holes], same[~holes])
+
+
+def test_a_hole_within_a_surface_changes_nothing_else(scene: Scene) -> None:
+    depth, holes = torch.full((1, 1, 128, 192), 4.0), torch.zeros(1, 1, 128, 192, dtype=torch.bool)
+    depth[..., 101:], holes[..., 40:60, 20:60] = 2.0, True
+    image = scene.image * torch.where(torch.arange(192) < 100, 0.3, 1.0)
+    whole = repair_edges(image, depth)
+    assert bool((whole != depth).any())
+    assert torch.equal(repair_edges(image, torch.where(holes, torch.nan, depth))[~holes], whole[~holes])
 
 
 def test_pixels_without_depth_stay_and_touch_nothing(scene: Scene) -> None:

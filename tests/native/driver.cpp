@@ -240,7 +240,7 @@ void check_edges(unsigned seed) {
   const auto repair = [&](int threads, std::vector<float> &out) {
     const int32_t never = 0;
     const torchdof_map map = {scene.height, scene.width, scene.channels, made.light[0].data(), nearness.data(),
-                              seed % 2, seed % 3 ? nullptr : steps.data(), 1.0f, int(seed) % 5 == 0, threads, &never, out.data()};
+                              int(seed) % 2, seed % 3 ? nullptr : steps.data(), 1.0f, int(seed) % 5 == 0, threads, &never, out.data()};
     int32_t changed = 0;
     if (torchdof_repair_edges(&map, &changed) != TORCHDOF_OK) fail("its edges cannot be repaired", int(seed));
     if (!changed) out = nearness;

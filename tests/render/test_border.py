@@ -11,16 +11,20 @@ from torchdof.render.border import continued
 
 def test_light_goes_on_as_the_nearest_pixel_and_means_along_the_border() -> None:
     light = torch.rand(2, 3, 20, 40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    out = continued(light, None, None, (0, 0, 0, 9), 9)
-    assert out.shape == (2, 3, 29, 40)
+    out = continued(light, None, None, (0, 0, 0, 16), 16)
+    assert out.shape == (2, 3, 36, 40)
     assert_close(out[..., :20, :], light)
-    for distance in (1, 2, 4, 8):
-        near, inside, wide = (
-            light[..., -1 - line, max(20 - reach, 0) : 20 + reach + 1].mean(-1)
-            for line, reach in ((0, 4 * distance), (distance, 4 * distance), (0, 64 * distance))
-        )
-        part = -1.1 if distance == 1 else 0.15
-        expected = 0.55 * light[..., -1, 20] + 0.35 * near + 0.1 * wide + part * (inside - near)
+
+    def mean(line: int, reach: int) -> Tensor:
+        return light[..., -1 - line, max(20 - reach, 0) : 20 + reach + 1].mean(-1)
+
+    near = light[..., -2:, 16:25].amin((-2, -1)), light[..., -2:, 16:25].amax((-2, -1))
+    for distance in (1, 2, 4, 8, 16):
+        inside = mean(min(distance, 19), 4 * distance)
+        expected = 0.5 * light[..., -1, 20] + 0.3 * mean(0, 4 * distance) + 0.2 * inside
+        if distance <= 4:  # light goes on as the last two lines do, as far as what is around allows
+            on = expected + 1.5 * (mean(0, 4) - mean(1, 4))
+            expected = on.minimum(near[1].maximum(expected)).maximum(near[0].minimum(expected))
         assert_close(out[..., 19 + distance, 20], expected)
     assert_close(out[..., 19 + 3, :], (out[..., 19 + 2, :] + out[..., 19 + 4, :]) / 2)
 

@@ -77,7 +77,8 @@ def resolve_holes(depth: Tensor, name: str, fill: Fill | None) -> tuple[Tensor, 
     if fill is None:
         raise ValueError(
             f"{name}: {holes} pixels ({100 * holes / depth.numel():.1f} %) have no depth (NaN, zero, negative or "
-            "marked unknown); say how to fill them: fill 'nearest' or 'far' (--fill-depth)"
+            "marked unknown); say how to fill them: fill 'nearest' or 'far' (--fill-depth); if zero is the far end of "
+            "relative depth, say that (--depth-kind relative)"
         )
     try:
         return fill_holes(depth, fill), holes

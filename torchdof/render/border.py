@@ -2,9 +2,10 @@
 
 Nothing tells what is out there, but the spectrum of images falls with the square of the frequency, and of such an image
 the expectation beyond a straight border is the harmonic continuation: the row at the border, smoothed along it the more
-the farther out, by a mean with long tails. Own light, a mean four times as wide to each side as the place is far, and a
-little of one far wider still come close to it. Images are smoother than that from one pixel to the next, and return to
-their mean farther out: the first pixel beyond goes on as the last two do, and what lies as far inside counts a little.
+the farther out. Half of the nearest pixel's light and half of a mean along the border, four times as wide to each side
+as the place is far, come close to it. Images are smoother than that from one pixel to the next, and return to their
+mean farther out: so light goes on as the last two lines do for a few pixels, as far as what is around allows, and part
+of the mean is taken from as far inside the frame.
 
 Reference:
     Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
@@ -18,12 +19,10 @@ from torch import Tensor
 __all__ = ["continued"]
 
 _WIDTH = 4  # the mean reaches so many times as far to each side as the place lies beyond the border
-_WIDER = 16  # times as far reaches the other one
-# fitted to blurred pictures of images that were cut out of larger ones; what is left of 1 is the own pixel's
-_MEAN = 0.35
-_WIDE_MEAN = 0.1
-_INSIDE = 0.15  # of the mean is taken from the line as far inside the frame as the place is beyond
-_GOES_ON = 1.1  # of the difference of the last two lines, for the first one beyond
+# fitted to blurred pictures of images that were cut out of larger ones
+_INSIDE = 0.2  # of light is that of the line as far inside the frame as the place is beyond
+_GOES_ON = 1.5  # times the difference of the last two lines is added to what is beyond,
+_TREND_LEVELS = 3  # for distances of 1, 2 and 4 px
 
 
 def continued(
@@ -88,27 +87,28 @@ def _beyond(lines: Tensor, weight: Tensor, reach: int) -> Tensor:
     levels, length = lines.shape[-2] - 1, lines.shape[-1]
     # means for distances that are powers of two; between them linear
     powers = [2**level for level in range(levels)]
-    half = torch.tensor([_WIDTH * d for d in powers] * 2 + [_WIDTH * _WIDER * d for d in powers], device=lines.device)
-    line = torch.tensor([0] * levels + [*range(1, levels + 1)] + [0] * levels, device=lines.device)[:, None]
+    half = torch.tensor([_WIDTH * d for d in powers] * 2, device=lines.device)[:, None]
+    line = torch.tensor([0] * levels + [*range(1, levels + 1)], device=lines.device)[:, None]
     at = torch.arange(length, device=lines.device)
-    start, stop = (at - half[:, None]).clamp_min(0), (at + (half[:, None] + 1)).clamp_max(length)  # [3 levels, n]
+    start, stop = (at - half).clamp_min(0), (at + (half + 1)).clamp_max(length)  # [2 levels, n]
     sums = functional.pad(torch.cat([lines * weight, weight], 1).double().cumsum(-1), (1, 0))  # of what comes before
     start, stop = ((line * (length + 1) + place).flatten() for place in (start, stop))
     window = sums.flatten(-2).index_select(-1, stop) - sums.flatten(-2).index_select(-1, start)
-    window = window.unflatten(-1, (3, levels, -1))  # [B, C + 1, 3, levels, n]
+    window = window.unflatten(-1, (2, levels, -1))  # [B, C + 1, 2, levels, n]
     total = window[:, -1:]
-    near, inside, wide = (window[:, :-1] / torch.where(total > 0, total, 1.0)).to(lines.dtype).unbind(2)
+    mean, inside = (window[:, :-1] / torch.where(total > 0, total, 1.0)).to(lines.dtype).unbind(2)
     known = (total[:, :, 1] / torch.where(total[:, :, 0] > 0, total[:, :, 0], 1.0)).clamp(max=1.0).to(lines.dtype)
-    inwards = known * (inside - near)
-    own = (1.0 - _MEAN - _WIDE_MEAN) * lines[:, :, :1]
-    mean = _MEAN * near + _WIDE_MEAN * wide
-    # the first pixel beyond stays within the range of these two lines, if anything is there
-    seen = [torch.where(weight > 0, lines, end)[:, :, :2] for end in (torch.inf, -torch.inf)]
-    least, most = seen[0].amin((-2, -1), keepdim=True), seen[1].amax((-2, -1), keepdim=True)
-    first = (own + mean - _GOES_ON * inwards)[:, :, :1]
-    first = torch.where(least <= most, torch.maximum(torch.minimum(first, most), least), first) - own
-    mean = torch.cat([first, (mean + _INSIDE * inwards)[:, :, 1:]], 2)
+    inwards = known * (inside - mean)
+    own = 0.5 * lines[:, :, :1]
+    beyond = own + 0.5 * mean + _INSIDE * inwards
+    # where it goes on, it stays within the range of what the last two lines show around it
+    shown, around = weight[:, :, :2] > 0, (2, 2 * _WIDTH + 1)
+    low, high = (torch.where(shown, sign * lines[:, :, :2], -torch.inf) for sign in (-1.0, 1.0))
+    low, high = (functional.max_pool2d(end, around, stride=1, padding=(0, _WIDTH)) for end in (low, high))
+    on = torch.minimum(beyond - _GOES_ON * inwards[:, :, :1], torch.maximum(beyond, high))
+    on = torch.maximum(on, torch.minimum(beyond, -low))
+    mean = torch.cat([on[:, :, :_TREND_LEVELS], beyond[:, :, _TREND_LEVELS:]], 2)
     distance = torch.arange(1, reach + 1, device=lines.device)
     octave = (distance[:, None] >= torch.tensor(powers[1:], device=lines.device)).sum(1)
     part = (distance / 2**octave - 1.0).to(lines.dtype)[:, None]
-    return own + torch.lerp(mean.index_select(2, octave), mean.index_select(2, octave + 1), part)
+    return torch.lerp(mean.index_select(2, octave), mean.index_select(2, octave + 1), part)

@@ -305,12 +305,16 @@ def test_a_tone_curve_behind_a_demosaiced_edge_shows_in_the_residual_or_the_nois
         fit_pair(*pair, "gaussian")
 
 
-@pytest.mark.parametrize("bayer", [False, True])
-def test_a_weak_tone_curve_in_a_jpeg_shows_in_what_goes_with_the_level(simulator, bayer):
-    # 4 % of the radius; the edge is not steep, and compression hides what the curve does to the noise
+@pytest.mark.parametrize(
+    ("family", "params", "bayer", "seed"),
+    [("disc", {"radius": 6.0}, True, 2), ("gaussian", {"sigma": 3.0}, False, 1)],
+)
+def test_a_weak_tone_curve_in_a_jpeg_shows_in_what_goes_with_the_level(simulator, family, params, bayer, seed):
+    # 4 % of the radius; the edge is not steep, and compression hides what the curve does to the noise. A Gaussian takes
+    # half of the curve up
     camera = simulator.Simulator(tone=0.2, level=0.8, size=91, jpeg=90, black=0.02, bayer=bayer)
     with pytest.warns(p.NotLinearWarning, match="goes with the level, as under a tone curve"):
-        fit_pair(*camera.pair("disc", {"radius": 6.0}, 2), "disc", fit_magnification=False)
+        fit_pair(*camera.pair(family, params, seed), family, fit_magnification=False)
 
 
 @pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # there is no noise to hide behind
@@ -449,3 +453,10 @@ def test_a_blur_that_the_noise_hides_is_never_a_number_in_silence(simulator):
 def test_summary_tells_the_parameters_and_the_residual(simulator):
     fit = fit_pair(*simulator.Simulator().pair("gaussian", {"sigma": 3.0}), "gaussian")
     assert "sigma = 3" in fit.summary() and "x the noise" in fit.summary()
+
+
+def test_a_distance_at_which_nothing_of_the_dot_would_be_seen_is_named(simulator):
+    # a metre read as centimetres; the normal equations of nothing had no factor, and that was the message
+    pair = simulator.Simulator(size=61, dot_radius=8.0).pair("disc", {"radius": 5.0})
+    with pytest.raises(p.DistanceError, match="0.064 px here, and nothing of it be seen; is the distance misread"):
+        fit_pair(*pair, "radial", magnification=0.008)

@@ -5,8 +5,9 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 
 Border border_of(const Job &job, int farthest) {
-  constexpr int WIDTH = 4, WIDER = 16;
-  constexpr float MEAN = 0.35f, WIDE_MEAN = 0.1f, INSIDE = 0.15f, GOES_ON = 1.1f;
+  constexpr int WIDTH = 4;  // the mean reaches so many times as far to each side as the place lies beyond the border
+  constexpr float INSIDE = 0.2f, GOES_ON = 1.5f;
+  constexpr int TREND_LEVELS = 3;
   const Surfaces &s = job.surfaces;
   Border border;
   border.height_ = job.height, border.width_ = job.width, border.channels_ = job.channels;
@@ -28,7 +29,7 @@ Border border_of(const Job &job, int farthest) {
     const bool upright = side >= Border::LEFT;
     const int length = border.length(side), C = job.channels, sums = C + 1, depth = upright ? job.width : job.height;
     std::vector<double> border_until((size_t)(length + 1) * sums), inside_until(border_until.size());
-    std::vector<float> own((size_t)C * length), least(C), most(C);
+    std::vector<float> own((size_t)C * length), least(own.size()), most(own.size()), trend(own.size());
     std::vector<const float *> light(C);
     // sums, along a line so far inside the frame, of what comes before: weighted light, and weight
     const auto summed = [&](int i, int inside, std::vector<double> &until) {
@@ -52,7 +53,10 @@ Border border_of(const Job &job, int farthest) {
         for (int c = 0; c < C; c++) {
           const float seen = there ? *light[c] * share : 0.0f;
           if (!inside) own[(size_t)c * length + at] = seen;
-          if (w > 0 && inside < 2) least[c] = std::min(least[c], seen), most[c] = std::max(most[c], seen);
+          if (w > 0 && inside < 2) {
+            float &low = least[(size_t)c * length + at], &high = most[(size_t)c * length + at];
+            low = std::min(low, seen), high = std::max(high, seen);
+          }
           after[c] = before[c] + seen * w;
         }
         after[C] = before[C] + w;
@@ -61,29 +65,27 @@ Border border_of(const Job &job, int farthest) {
     for (int i = 0; i < s.count; i++) {
       std::fill(least.begin(), least.end(), INFINITY), std::fill(most.begin(), most.end(), -INFINITY);
       summed(i, 0, border_until);
-      for (int level = border.levels_ - 1; level >= 0; level--) {  // the nearest last, by which the range is known
+      for (int level = 0; level < border.levels_; level++) {
         summed(i, 1 << level, inside_until);
-        const auto within = [&](const std::vector<double> &until, int at, int64_t half, int c) {
-          return until[(size_t)std::min<int64_t>(at + half + 1, length) * sums + c] - until[(size_t)std::max<int64_t>(at - half, 0) * sums + c];
-        };
-        const int64_t half = (int64_t)WIDTH << level;
+        const int half = (int)std::min<int64_t>((int64_t)WIDTH << level, length);
         for (int at = 0; at < length; at++) {
-          const double total = within(border_until, at, half, C), total_wide = within(border_until, at, WIDER * half, C);
-          const double total_inside = within(inside_until, at, half, C);
+          const int first = std::max(at - half, 0), end = std::min(at + half + 1, length);
+          const auto within = [&](const std::vector<double> &until, int c) { return until[(size_t)end * sums + c] - until[(size_t)first * sums + c]; };
+          const double total = within(border_until, C), total_inside = within(inside_until, C);
           const float known = total > 0 ? (float)std::min(total_inside / total, 1.0) : (float)std::min(total_inside, 1.0);
           for (int c = 0; c < C; c++) {
-            const float near = total > 0 ? (float)(within(border_until, at, half, c) / total) : 0.0f;
-            const float wide = total_wide > 0 ? (float)(within(border_until, at, WIDER * half, c) / total_wide) : 0.0f;
-            const float inside = total_inside > 0 ? (float)(within(inside_until, at, half, c) / total_inside) : 0.0f;
-            float mean = MEAN * near + WIDE_MEAN * wide;
-            const float inwards = (inside - near) * known, itself = Border::OWN * own[(size_t)c * length + at];
-            if (level)
-              mean += INSIDE * inwards;
-            else if (mean = itself + mean - GOES_ON * inwards; least[c] <= most[c])
-              mean = std::clamp(mean, least[c], most[c]) - itself;
-            else
-              mean -= itself;
-            border.means_[side][border.start(side, i, c, level) + at] = mean;
+            const float mean = total > 0 ? (float)(within(border_until, c) / total) : 0.0f;
+            const float inwards = ((total_inside > 0 ? (float)(within(inside_until, c) / total_inside) : 0.0f) - mean) * known;
+            const size_t line = (size_t)c * length, here = line + at;
+            const float itself = 0.5f * own[here], on = itself + 0.5f * mean + INSIDE * inwards;
+            float beyond = on;
+            if (level < TREND_LEVELS) {  // within the range of what the last two lines show around it
+              if (!level) trend[here] = -GOES_ON * inwards;
+              const size_t from = line + std::max(at - WIDTH, 0), to = line + std::min(at + WIDTH + 1, length);
+              const float low = *std::min_element(&least[from], least.data() + to), high = *std::max_element(&most[from], most.data() + to);
+              beyond = std::max(std::min(on + trend[here], std::max(on, high)), std::min(on, low));
+            }
+            border.means_[side][border.start(side, i, c, level) + at] = beyond - itself;
           }
         }
       }
@@ -102,7 +104,7 @@ void Border::continue_row(int surface, int channel, int y, int x, int n, float *
   const Side side = y < 0 ? TOP : BOTTOM;
   const float *nearer = means_[side].data() + start(side, surface, channel, level_of_[far]) + x, *farther = nearer + length(side);
   const float *share = shares_[side].data() + (size_t)surface * length(side) + x;
-  for (int i = 0; i < n; i++) row[i] = Border::OWN * row[i] * share[i] + nearer[i] + part * (farther[i] - nearer[i]);
+  for (int i = 0; i < n; i++) row[i] = 0.5f * row[i] * share[i] + nearer[i] + part * (farther[i] - nearer[i]);
 }
 
 }  // namespace TORCHDOF_SIMD

@@ -297,7 +297,6 @@ float threshold_at(const Job &job, int y, int x);
 // Light beyond the frame; border.cpp
 class Border {
  public:
-  static constexpr float OWN = 0.55f;  // part of the nearest pixel's light in what lies beyond; the rest is of means
   // Light of a surface at a place beyond the frame, given that of the nearest pixel.
   float light(int surface, int channel, int y, int x, float nearest) const {
     if (dark_) return 0;
@@ -315,7 +314,7 @@ class Border {
       share = shares_[side][(size_t)surface * height_ + at_y];
     }
     const float on = !across ? from_row : !far ? from_column : (from_row * far + from_column * across) / (far + across);
-    return OWN * nearest * share + on;
+    return 0.5f * nearest * share + on;
   }
   // The same of n pixels above or below the frame.
   void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
@@ -337,7 +336,7 @@ class Border {
   std::vector<float> part_of_;
   bool dark_ = false;  // nothing comes from there
   std::vector<float> shares_[4];  // of each side, [surfaces, length]: of the light there, what is no highlight's
-  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; but for the own pixel, and level l is that of 2^l pixels
+  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; what comes to half of the nearest pixel's light, 2^level pixels out
 };
 Border border_of(const Job &job, int farthest);
 
