@@ -17,7 +17,7 @@ from torchdof import DepthOfField
 from torchdof.depth.edges import DepthEdges
 from torchdof.io.atomic import whole_file
 
-from . import lists, ray_loop
+from . import lists, ray_splats
 from .graph import INPUTS, OUTPUT, Portable, trace
 from .interface import broadcast
 from .metadata import label
@@ -124,7 +124,7 @@ def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -
         )
     if converted is None:
         raise RuntimeError("torch.onnx.export gave no program")
-    for function in (*ray_loop.FUNCTIONS, *lists.FUNCTIONS):
+    for function in (*ray_splats.FUNCTIONS, *lists.FUNCTIONS):
         own = onnx_ir.serde.deserialize_function(function.to_function_proto())
         own.opset_imports[""] = opset
         converted.model.functions[own.identifier()] = own

@@ -1,7 +1,7 @@
 """Highlights of a graph: their light splatted ray by ray (:mod:`torchdof.render.highlights`), in a loop over parts.
 
 What a source needs by itself is traced. The loop over sources, whose number only a frame tells, is a function in ONNX
-(:mod:`.ray_loop`), which one operator calls in what is traced.
+(:mod:`.ray_splats`), which one operator calls in what is traced.
 """
 
 from collections.abc import Sequence

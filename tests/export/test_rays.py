@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable
-from torchdof.export import ray_loop
+from torchdof.export import ray_splats
 from torchdof.export.rays import kernels_of
 from torchdof.export.verification import TOLERANCE, local_range
 from torchdof.render.plan import Plan
@@ -47,7 +47,7 @@ def test_kernels_of_a_file_are_those_of_its_table(shape: str) -> None:
     plan = Plan.all(3.0, 1 / 255, rays=True)
     values, origins, halves, is_round, per_px, *_ = kernels_of(table, plan)
     middle = len(halves) // 2
-    values_at: Any = ray_loop.values_at
+    values_at: Any = ray_splats.values_at
     for coc_px in (-2.75, 0.5, 3.0):
         expected = table.kernels(torch.tensor([coc_px]), 1).float()[0, :, None]
         half = expected.shape[-1] // 2 + 2  # what lies beyond a kernel is 0
