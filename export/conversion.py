@@ -208,6 +208,10 @@ def _differences(self: Any, n: int = 1, dim: int = -1, prepend: Any = None, appe
     return opset20.Sub(opset20.Slice(self, bounds[1], bounds[3], axis), before)
 
 
+def _product_added(self: Any, tensor1: Any, tensor2: Any, value: float = 1.0) -> Any:
+    return opset20.Add(self, opset20.Mul(tensor1, tensor2))
+
+
 def _added(self: Any, dim: int, index: Any, source: Any, alpha: float = 1.0) -> Any:
     return opset20.ScatterElements(self, index, source, axis=dim, reduction="add")
 
@@ -226,6 +230,7 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.aten.hypot.default: _hypotenuse,
     torch.ops.aten.diff.default: _differences,
     torch.ops.aten.index_add.default: _added,
+    torch.ops.aten.addcmul.default: _product_added,
     torch.ops.aten.rsub.Scalar: _subtracted,
     torch.ops.aten.index_copy.default: _put,
 }

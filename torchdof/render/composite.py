@@ -23,6 +23,9 @@ Scatter = Callable[[Tensor, Tensor, int], Tensor]
 Picture = tuple[Tensor, Tensor]
 """Light ``[B, C, h, w]`` and what it is to be weighed with, of one channel or C."""
 
+Pictures = Sequence[Picture]
+Lights = Sequence[Tensor]  # named here, for a graph that is compiled reads annotations of inner functions
+
 _LEAST = 1e-6  # share of scattered weight below which nothing is known
 _KNOWN = 0.002  # share of scattered weight from which on a layer is known in full
 
@@ -50,7 +53,7 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
 
     # Beside light goes the share 1 - a that is left of what is behind, in sums of what is positive: behind bright light
     # the rounding of a difference would show. Where nothing is behind, a itself: what is divided by it in the end.
-    def normalised(lights: Sequence[Tensor], weight: Tensor, beyond: Tensor) -> list[Picture]:
+    def normalised(lights: Lights, weight: Tensor, beyond: Tensor) -> Pictures:
         lacking = (_KNOWN - weight - beyond).clamp_min(0.0)
         beyond = beyond + lacking * lacking * (0.5 / _KNOWN)
         known = weight + beyond
@@ -60,12 +63,12 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     def composited(front: Picture, behind: Picture) -> Picture:
         (light, share), (light_behind, share_behind) = front, behind
         left = share if backed else (1.0 - share).clamp_min(0.0)
-        share = left * share_behind if backed else share + left * share_behind
-        return light + left * light_behind, share
+        share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
+        return torch.addcmul(light, left, light_behind), share
 
     picture = _composite_layers(frame, blurs, scatter, composited, 1.0 if backed else 0.0, normalised)
     light, left = _parts(picture, colours)
-    out = mean(picture, colours) if frame.behind is None else light + left * frame.behind
+    out = mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
 
 
@@ -110,7 +113,7 @@ def _composite_layers(
     scatter: Scatter,
     composited: Callable[[Picture, Picture], Picture],
     empty: float = 0.0,
-    normalised: Callable[[Sequence[Tensor], Tensor, Tensor], list[Picture]] | None = None,
+    normalised: Callable[[Lights, Tensor, Tensor], Pictures] | None = None,
 ) -> Tensor:
     """All layers, far to near: light ``[B, C, h, w]`` and, after it, what it is to be weighed with.
 
@@ -168,7 +171,7 @@ def _composite_layers(
 
 def _scattered(
     frame: Frame, blurs: Sequence[Blur], scatter: Scatter, group: list[int], visibility: bool
-) -> tuple[Sequence[Tensor], Tensor] | tuple[Sequence[Tensor], Tensor, Tensor]:
+) -> tuple[Lights, Tensor] | tuple[Lights, Tensor, Tensor]:
     """Scattered layers of a group, near to far: light of each, weights and, with visibility, the weights behind.
 
     Light is ``[B, C, h, w]``; the weights of n layers are ``[B, n, h, w]``, or ``[B, n C, h, w]`` where each colour has

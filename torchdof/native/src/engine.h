@@ -314,7 +314,7 @@ class Border {
       share = shares_[side][(size_t)surface * height_ + at_y];
     }
     const float on = !across ? from_row : !far ? from_column : (from_row * far + from_column * across) / (far + across);
-    return 0.5f * nearest * share + on;
+    return 0.5f * (nearest * share + on);
   }
   // The same of n pixels above or below the frame.
   void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
@@ -336,7 +336,7 @@ class Border {
   std::vector<float> part_of_;
   bool dark_ = false;  // nothing comes from there
   std::vector<float> shares_[4];  // of each side, [surfaces, length]: of the light there, what is no highlight's
-  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; what comes to half of the nearest pixel's light, 2^level pixels out
+  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; level l is that of 2^l pixels
 };
 Border border_of(const Job &job, int farthest);
 
