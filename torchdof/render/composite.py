@@ -151,7 +151,7 @@ def _composite_layers(
         for group in groups:
             lights, *weights = _scattered(frame, blurs, scatter, group, normalised is not None)
             if normalised is None:
-                layers = list(zip(lights, *_each(weights[0], layers=len(group)), strict=True))
+                layers: Pictures = list(zip(lights, *_each(weights[0], layers=len(group)), strict=True))
             else:
                 layers = normalised(lights, *weights)
             front = _parts(part, colours)
