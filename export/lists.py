@@ -4,18 +4,18 @@ A part of a list is a window of a narrow map, so that it has the loop that tiles
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import onnxscript
-import torch
 from torch import Tensor
 
 from torchdof.pixels import graph_parts
 
-from .tiling import COLLECT, DOMAIN, WINDOW
+from .tiling import COLLECT, DOMAIN, operator, window
 
 if TYPE_CHECKING:  # what stands below is read, and not by Python's rules
+    from typing import Any
     from typing import Any as Floats
     from typing import Any as Ints
 
@@ -47,19 +47,11 @@ def _by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
     """What a function finds at pixels ``[P]``: ``[n, P]``."""
     count = pixels.shape[0]
     parts = (count + _PART - 1) // _PART
-    rows = _operator("parts_of", [pixels], pixels.dtype, (1, 1, _SIDE * parts, _SIDE))
-    window = _operator(WINDOW, [rows], rows.dtype, (1, 1, _SIDE, _SIDE), side=_SIDE, margin=0)
-    found = look(window.flatten())
+    rows = operator("parts_of", [pixels], (1, 1, _SIDE * parts, _SIDE))
+    found = look(window(rows, _SIDE, margin=0).flatten())
     tile = found.reshape(1, found.shape[0], _SIDE, _SIDE)
-    tiles = _operator(COLLECT, [tile], tile.dtype, (parts, *tile.shape[1:]))
-    return _operator("whole_of", [tiles, pixels], tiles.dtype, (found.shape[0], count))
-
-
-def _operator(
-    name: str, inputs: Sequence[Tensor], dtype: torch.dtype, shape: Sequence[int | torch.SymInt], **attributes: int
-) -> Tensor:
-    stated: dict[str, Any] = {**attributes}
-    return torch.onnx.ops.symbolic(f"{DOMAIN}::{name}", inputs, stated, dtype=dtype, shape=list(shape), version=1)
+    tiles = operator(COLLECT, [tile], (parts, *tile.shape[1:]))
+    return operator("whole_of", [pixels, tiles], (found.shape[0], count))
 
 
 @_script
@@ -72,7 +64,7 @@ def parts_of(pixels: Ints) -> Ints:
 
 
 @_script
-def whole_of(tiles: Floats, pixels: Ints) -> Floats:
+def whole_of(pixels: Ints, tiles: Floats) -> Floats:
     """What was found in parts ``[n, C, side, side]``, as lists ``[C, P]``."""
     lists = op.Transpose(tiles, perm=[1, 0, 2, 3])
     lists = op.Reshape(lists, op.Concat(op.Shape(lists, start=0, end=1), op.Constant(value_ints=[-1]), axis=0))

@@ -24,7 +24,19 @@ from torchdof.render.surfaces import Frame, Placed
 from .rays import Kernels, splat
 from .shifting import samples
 
-__all__ = ["CHOICE", "COLLECT", "DOMAIN", "WINDOW", "choose", "in_tiles", "seen", "side", "tile_by_tile"]
+__all__ = [
+    "CHOICE",
+    "COLLECT",
+    "DOMAIN",
+    "WINDOW",
+    "choose",
+    "in_tiles",
+    "operator",
+    "seen",
+    "side",
+    "tile_by_tile",
+    "window",
+]
 
 DOMAIN = "torchdof"
 """Of the operators that stand for structure in a flat graph; none is left in a file."""
@@ -44,7 +56,7 @@ def side(margin: int) -> int:
 
 def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
     """A result if it is needed, a bool ``[]``, else what is given: a branch of the graph."""
-    return _operator(CHOICE, [needed, result, given], result.shape)
+    return operator(CHOICE, [needed, result, given], result.shape)
 
 
 def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, Sequence[Blur]], Tensor]) -> Tensor:
@@ -60,8 +72,8 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
         The same of the frame, ``[B, C, H, W]``.
     """
     length, margin = side(frame.margin), frame.margin
-    surfaces = [Placed(*(_window(t, length, margin) for t in s if t is not None)) for s in frame.surfaces]
-    behind = None if frame.behind is None else _window(frame.behind, length, 0)
+    surfaces = [Placed(*(window(t, length, margin) for t in s if t is not None)) for s in frame.surfaces]
+    behind = None if frame.behind is None else window(frame.behind, length, 0)
     inner = (..., slice(margin, margin + length), slice(margin, margin + length))
     size = (length, length)
     piece = Frame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
@@ -72,7 +84,7 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     tile = where_needed(lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0, rendered, sharp)
     rows, columns = (n // length for n in frame.area)
     batch = frame.surfaces[0].light.shape[0]
-    pieces = _operator(COLLECT, [tile], (batch * rows * columns, int(rendered.shape[1]), length, length))
+    pieces = operator(COLLECT, [tile], (batch * rows * columns, int(rendered.shape[1]), length, length))
     return _joined(pieces, (batch, rows, columns))[..., : frame.size[0], : frame.size[1]]
 
 
@@ -99,11 +111,11 @@ def seen(
     halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(whole, size, strict=True)]
     ends = [left, whole[1] + more[1] - size[1] - left, top, whole[0] + more[0] - size[0] - top]
     looking = functional.pad(torch.cat([coc_px, mask.to(coc_px.dtype)], 1), ends, mode="replicate")
-    coc_px, mask = _window(looking, _SIDE, 0).split(1, 1)
+    coc_px, mask = window(looking, _SIDE, 0).split(1, 1)
     pieces = []
     for level in levels:
         ends = [1, 1 + more[1] // level.step, 1, 1 + more[0] // level.step]
-        values = _window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
+        values = window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
         pieces.append(level._replace(values=values))
     sizes = (_SIDE, _SIDE)
     lists = [samples(level.values, sizes, float(level.step), (halves[0], halves[1])) for level in pieces]
@@ -117,7 +129,7 @@ def seen(
     tile = where_needed(hides, found, torch.zeros_like(found))
     rows, columns = ((w + m) // _SIDE for w, m in zip(whole, more, strict=True))
     batch, channels = looking.shape[0], int(found.shape[1])
-    tiles = _operator(COLLECT, [tile], (batch * rows * columns, channels, _SIDE, _SIDE))
+    tiles = operator(COLLECT, [tile], (batch * rows * columns, channels, _SIDE, _SIDE))
     # narrowed, not sliced: so tracing knows the sizes of what is left
     maps = _joined(tiles, (batch, rows, columns)).narrow(-2, top, size[0]).narrow(-1, left, size[1])
     return maps[:, :-1], maps[:, -1:]
@@ -150,13 +162,14 @@ def _joined(tiles: Tensor, counts: tuple[int, int, int]) -> Tensor:
     return maps.reshape(batch, channels, rows * side, columns * side)
 
 
-def _window(values: Tensor, length: int, margin: int) -> Tensor:
+def window(values: Tensor, length: int, margin: int) -> Tensor:
     """What a tile of so many pixels of a map sees of it, with a margin."""
     across = length + 2 * margin
-    return _operator(WINDOW, [values], (1, int(values.shape[1]), across, across), side=length, margin=margin)
+    return operator(WINDOW, [values], (1, int(values.shape[1]), across, across), side=length, margin=margin)
 
 
-def _operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], **attributes: int) -> Tensor:
+def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], **attributes: int) -> Tensor:
+    """An operator of :data:`DOMAIN` in a graph; what it gives has the type of its last input."""
     stated: dict[str, Any] = {**attributes}
     return torch.onnx.ops.symbolic(
         f"{DOMAIN}::{name}", inputs, stated, dtype=inputs[-1].dtype, shape=list(shape), version=1

@@ -27,7 +27,7 @@ from torchdof.cli.arguments import (
     ToleranceText,
 )
 from torchdof.cli.printed import json_line
-from torchdof.cli.settings import load_aperture, load_table
+from torchdof.cli.settings import depth_edges_of, load_aperture, load_table
 from torchdof.export.conversion import OPSET, to_onnx
 from torchdof.export.metadata import describe, shown
 from torchdof.options import tolerance_of_text
@@ -121,7 +121,7 @@ def export(
             inputs=inputs,
             channels=channels,
             width=width,
-            depth_edges="as given" if depth_edges == "as-given" else depth_edges,
+            depth_edges=depth_edges_of(depth_edges),
             opset=opset,
             progress=status.update,
         )

@@ -62,7 +62,7 @@ from .arguments import (
 )
 from .frame import Frame, read_frame, render_frame
 from .printed import json_line
-from .settings import RenderSettings, load_aperture, load_table, pick_device
+from .settings import RenderSettings, depth_edges_of, load_aperture, load_table, pick_device
 from .warn_once import WarnOnce
 
 __all__ = ["parse_attention", "parse_fill", "parse_point", "parse_range", "render"]
@@ -246,7 +246,7 @@ def render(
         relative_kind=relative_kind,
         value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
         fill=None if fill_depth is None else parse_fill(fill_depth),
-        depth_edges="as given" if depth_edges == "as-given" else depth_edges,
+        depth_edges=depth_edges_of(depth_edges),
         table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)),
         tolerance=tolerance_of_text(tolerance),
         attention=None if attention is None else parse_attention(attention),

@@ -26,7 +26,7 @@ from ..optics.table_file import shipped
 from ..options import Method
 from ..validation import number, show
 
-__all__ = ["RenderSettings", "load_aperture", "load_table", "pick_device"]
+__all__ = ["RenderSettings", "depth_edges_of", "load_aperture", "load_table", "pick_device"]
 
 _OPTIONS = {
     "focal_length_mm": "--focal-length-mm",
@@ -237,6 +237,11 @@ def _by_option(names: Mapping[str, str]) -> Iterator[None]:
     except ValueError as error:
         pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
         raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
+
+
+def depth_edges_of(name: Literal["auto", "repair", "as-given"]) -> DepthEdges:
+    """What is done to depth edges, by the word of the option ``--depth-edges``."""
+    return "as given" if name == "as-given" else name
 
 
 def load_table(name: str, aperture: Aperture | None = None) -> BlurTable:
