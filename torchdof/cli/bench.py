@@ -46,9 +46,9 @@ from .arguments import (
     Vignetting,
 )
 from .frame import read_frame
+from .from_arguments import settings_of
 from .printed import json_line
-from .render import parse_fill, parse_point, parse_range
-from .settings import RenderSettings, load_aperture, load_table
+from .settings import RenderSettings
 
 __all__ = ["bench", "from_files"]
 
@@ -166,37 +166,13 @@ def bench(
     sharp, truth, each renderer with its error below it, four times enlarged.
     """
     existing_folder(out)
-    opening = load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)
-    of_lens = load_table(table, opening)
-    how = RenderSettings(
-        focus=None if focus_m is None else [(0, focus_m)],
-        focus_at=None if focus_at is None else parse_point(focus_at),
-        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
-        tilt_deg=tilt,
-        swing_deg=swing,
-        f_number=f_number,
-        focal_length_mm=focal_length_mm,
-        sensor_width_mm=sensor_width_mm,
-        fov_x_deg=fov_deg,
-        aperture_radius_m=aperture_radius_m,
-        depth_kind=depth_kind,
-        depth_scale=depth_scale,
-        depth_offset=depth_offset,
-        depth_unknown=depth_unknown,
-        depth_channel=depth_channel,
-        near_m=near_m,
-        far_m=far_m,
-        relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
-        fill=None if fill_depth is None else parse_fill(fill_depth),
-        table=of_lens,
-    )
+    how = settings_of(locals())
     if truth is not None:
         if image is not None or onnx or compiled or scan:
             raise ValueError(
                 "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
             )
-        if how != RenderSettings(table=of_lens) or opening is not None or table != "disc":
+        if how != RenderSettings(table=how.table) or how.table.aperture is not None or table != "disc":
             raise ValueError(
                 "the scenes of --truth have their own lens and depth; leave options of these and of blur out"
             )
@@ -215,9 +191,9 @@ def bench(
         return
     if views or degrade or peer:
         raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
-    if (onnx or compiled) and of_lens.depends_on_place:
+    if (onnx or compiled) and how.table.depends_on_place:
         raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
-    if image is None and how != RenderSettings(table=of_lens):
+    if image is None and how != RenderSettings(table=how.table):
         raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
     if out is not None and importlib.util.find_spec("matplotlib") is None:  # before the time is spent
         raise ModuleNotFoundError("no matplotlib", name="matplotlib")
@@ -227,7 +203,7 @@ def bench(
         raise FileNotFoundError(
             "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
         )
-    scene = dataclasses.replace(shipped(), table=of_lens) if image is None else from_files(image, depth, how)
+    scene = dataclasses.replace(shipped(), table=how.table) if image is None else from_files(image, depth, how)
     console = Console(stderr=True)
     runtimes: list[speed.Runtime] = []
     if onnx:

@@ -36,9 +36,8 @@ from .arguments import (
     ValueRange,
 )
 from .frame import read_metres
+from .from_arguments import settings_of
 from .printed import json_line
-from .render import parse_fill, parse_point, parse_range
-from .settings import RenderSettings
 from .warn_once import WarnOnce
 
 __all__ = ["inspect"]
@@ -91,29 +90,7 @@ def inspect(
 
     The lens is found as for torchdof render.
     """
-    settings = RenderSettings(
-        focus=None if focus_m is None else [(0, focus_m)],
-        focus_at=None if focus_at is None else parse_point(focus_at),
-        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
-        tilt_deg=tilt,
-        swing_deg=swing,
-        f_number=f_number,
-        focal_length_mm=focal_length_mm,
-        sensor_width_mm=sensor_width_mm,
-        fov_x_deg=fov_deg,
-        aperture_radius_m=aperture_radius_m,
-        depth_kind=depth_kind,
-        depth_scale=depth_scale,
-        depth_offset=depth_offset,
-        depth_unknown=depth_unknown,
-        depth_channel=depth_channel,
-        near_m=near_m,
-        far_m=far_m,
-        relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
-        fill=None if fill_depth is None else parse_fill(fill_depth),
-        strict=strict,
-    )
+    settings = settings_of(locals())
     target = Path(f"{image.stem}.inspect.png") if out is None else out
     if any(source is not None and source.resolve() == target.resolve() for source in (image, depth)):
         raise ValueError(f"{target}: is one of the inputs; write to another file")

@@ -20,11 +20,9 @@ from rich.progress import (
 )
 from torch import Tensor
 
-from ..depth.holes import Fill
 from ..depth.sanity import Mistake
 from ..depth.steady import SteadyFrames
-from ..io.sequence import FramePattern, parse_focus, parse_frames
-from ..options import tolerance_of_text
+from ..io.sequence import FramePattern, parse_frames
 from .arguments import (
     BLUR,
     DEPTH,
@@ -61,11 +59,12 @@ from .arguments import (
     Vignetting,
 )
 from .frame import Frame, read_frame, render_frame
+from .from_arguments import settings_of
 from .printed import json_line
-from .settings import RenderSettings, depth_edges_of, load_aperture, load_table, pick_device
+from .settings import RenderSettings
 from .warn_once import WarnOnce
 
-__all__ = ["parse_attention", "parse_fill", "parse_point", "parse_range", "render"]
+__all__ = ["render"]
 
 _EACH_ITS_OWN = Mistake(
     "range",
@@ -225,41 +224,7 @@ def render(
     that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
     like a wrong unit is said on standard error; with --strict it is refused. --json prints one JSON object a frame.
     """
-    settings = RenderSettings(
-        focus=None if focus_m is None else parse_focus(focus_m),
-        focus_at=None if focus_at is None else parse_point(focus_at),
-        focus_range=None if focus_range is None else parse_range(focus_range, "--focus-range", "1.5,2.2"),
-        tilt_deg=tilt,
-        swing_deg=swing,
-        f_number=f_number,
-        focal_length_mm=focal_length_mm,
-        sensor_width_mm=sensor_width_mm,
-        fov_x_deg=fov_deg,
-        aperture_radius_m=aperture_radius_m,
-        depth_kind=depth_kind,
-        depth_scale=depth_scale,
-        depth_offset=depth_offset,
-        depth_unknown=depth_unknown,
-        depth_channel=depth_channel,
-        near_m=near_m,
-        far_m=far_m,
-        relative_kind=relative_kind,
-        value_range=None if value_range is None else parse_range(value_range, "--value-range", "0,255"),
-        fill=None if fill_depth is None else parse_fill(fill_depth),
-        depth_edges=depth_edges_of(depth_edges),
-        table=load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)),
-        tolerance=tolerance_of_text(tolerance),
-        attention=None if attention is None else parse_attention(attention),
-        occlusion=not no_occlusion,
-        method=method,
-        device=pick_device(device),
-        transfer=transfer,
-        out_transfer=out_transfer,
-        sample=bits,
-        layer=layer,
-        show_focus=show_focus,
-        strict=strict,
-    )
+    settings = settings_of(locals())
     if FramePattern.matches(image):
         _render_sequence(image, depth, out, settings, frames, resume, steady, as_json)
         return
@@ -362,56 +327,3 @@ def _progress() -> Iterator[Progress]:
     progress = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True)
     with contextlib.nullcontext() if progress.disable else progress:
         yield progress
-
-
-def parse_point(text: str) -> tuple[float, float]:
-    """Reads a pixel ``X,Y``.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    try:
-        x, y = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"--focus-at expects a pixel X,Y such as 320,200, got {text!r}") from None
-    return x, y
-
-
-def parse_attention(text: str) -> tuple[float, float, float]:
-    """Reads a circle ``X,Y,RADIUS``.
-
-    Raises:
-        ValueError: If it is none.
-    """
-    try:
-        x, y, radius = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"--attention expects X,Y,RADIUS in pixels such as 320,200,80, got {text!r}") from None
-    return x, y, radius
-
-
-def parse_range(text: str, option: str, example: str) -> tuple[float, float]:
-    """Reads two numbers, as of an option's example.
-
-    Raises:
-        ValueError: If these are none.
-    """
-    try:
-        low, high = (float(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"{option} expects two numbers such as {example}, got {text!r}") from None
-    return low, high
-
-
-def parse_fill(text: str) -> Fill:
-    """Reads what holes are filled with: a word or metres.
-
-    Raises:
-        ValueError: If it is neither.
-    """
-    if text == "nearest" or text == "far":
-        return "nearest" if text == "nearest" else "far"
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"--fill-depth expects nearest, far or metres, got {text!r}") from None
