@@ -452,6 +452,31 @@ def test_ctrl_c_ends_a_long_rendering() -> None:
     assert answer_of(INTERRUPTED) == "in time"
 
 
+INTERRUPTED_TWICE = """
+import ctypes, os, signal, threading, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from torchdof import native
+cancelled, ended = ctypes.c_int32(0), []
+def engine():
+    while not cancelled.value:
+        time.sleep(0.01)
+    time.sleep(0.5)
+    ended.append(True)
+for seconds in (0.2, 0.4):
+    threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    native._interruptible(engine, cancelled)
+except KeyboardInterrupt:
+    print("after the engine" if ended else "while the engine runs")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a process of Windows cannot send itself Ctrl-C")
+def test_ctrl_c_is_raised_once_the_engine_has_stopped() -> None:
+    """What the engine reads and writes is freed when its caller returns."""
+    assert answer_of(INTERRUPTED_TWICE) == "after the engine"
+
+
 @pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 8, 10])
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 6), (16, 16), (19, 37)])
 def test_convolution_scatters_an_asymmetric_kernel(height: int, width: int, half: int) -> None:

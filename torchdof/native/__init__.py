@@ -295,9 +295,8 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
         ctypes.pointer(cancelled),
         out.data_ptr(),
     )
-    memory = (light, nearness, step, out)
 
-    def run(held: object = memory) -> None:  # as long as this runs, whatever interrupts the caller
+    def run() -> None:
         _check(_engine().torchdof_repair_edges(ctypes.byref(scene), ctypes.byref(changed)))
 
     _interruptible(run, cancelled)
@@ -324,6 +323,7 @@ def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32) -> None:
         return
     failure: list[BaseException] = []
     grad_enabled, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+    finished = threading.Event()
 
     def guarded() -> None:
         try:
@@ -331,15 +331,20 @@ def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32) -> None:
                 run()
         except BaseException as error:  # whatever it is, the main thread raises it
             failure.append(error)
+        finally:
+            finished.set()
 
-    worker = threading.Thread(target=guarded, name="torchdof")
-    worker.start()
-    try:
-        worker.join()
-    except BaseException:
-        cancelled.value = 1
-        worker.join()
-        raise
+    # Not Thread.join: interrupted, Python 3.11's takes a thread that still runs for ended, and a second one returns at
+    # once. Then the arrays are freed, or the process ends, under a running engine.
+    interruption: BaseException | None = None
+    threading.Thread(target=guarded, name="torchdof").start()
+    while not finished.is_set():
+        try:
+            finished.wait()
+        except BaseException as error:  # Ctrl-C, once or often
+            cancelled.value, interruption = 1, error
+    if interruption:
+        raise interruption
     if failure:
         raise failure[0]
 
