@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 
 import torch
 import torch._dynamo.config
@@ -9,13 +10,14 @@ from torch import Tensor, nn
 
 from torchdof import BlurTable, DepthOfField, blur_by_coc
 from torchdof.depth.edges import DepthEdges
+from torchdof.exporting import Graph, graph_context, where_needed
 from torchdof.optics.camera import Camera
-from torchdof.render.exporting import where_needed
 from torchdof.render.plan import Blur, Plan
 
-from .lists import in_parts
-from .rays import kernels_of
-from .tiling import in_tiles
+from .lists import by_parts
+from .operators import choose
+from .rays import kernels_of, splat
+from .tiling import seen, side, tile_by_tile
 
 __all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
 
@@ -148,6 +150,10 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
     # what torch would keep of each operator, to know one like it again, takes longer than it saves: sizes are symbols
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
-    kernels = kernels_of(table, portable.plan)
-    with torch.no_grad(), in_tiles(kernels), in_parts(), uncached:
-        return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)
+    splat_rays = functools.partial(splat, kernels=kernels_of(table, portable.plan))
+    token = graph_context.set(Graph(side, tile_by_tile, seen, splat_rays, choose, by_parts))
+    try:
+        with torch.no_grad(), uncached:
+            return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)
+    finally:
+        graph_context.reset(token)

@@ -3,16 +3,13 @@
 A part of a list is a window of a narrow map, so that it has the loop that tiles have (:mod:`.structure`).
 """
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import onnxscript
 from torch import Tensor
 
-from torchdof.pixels import graph_parts
-
-from .tiling import COLLECT, DOMAIN, operator, window
+from .operators import DOMAIN, collect, operator, window
 
 if TYPE_CHECKING:  # what stands below is read, and not by Python's rules
     from typing import Any
@@ -25,7 +22,7 @@ else:
 
     Floats, Ints = onnxscript.FLOAT[...], onnxscript.INT64[...]
 
-__all__ = ["FUNCTIONS", "in_parts"]
+__all__ = ["FUNCTIONS", "by_parts"]
 
 _SIDE = 32
 _PART = _SIDE * _SIDE
@@ -33,25 +30,14 @@ _PART = _SIDE * _SIDE
 _script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
 
 
-@contextlib.contextmanager
-def in_parts() -> Iterator[None]:
-    """Within this context graphs that are exported go over lists of pixels in a loop over their parts."""
-    token = graph_parts.set(_by_parts)
-    try:
-        yield
-    finally:
-        graph_parts.reset(token)
-
-
-def _by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
+def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
     """What a function finds at pixels ``[P]``: ``[n, P]``."""
     count = pixels.shape[0]
     parts = (count + _PART - 1) // _PART
     rows = operator("parts_of", [pixels], (1, 1, _SIDE * parts, _SIDE))
     found = look(window(rows, _SIDE, margin=0).flatten())
     tile = found.reshape(1, found.shape[0], _SIDE, _SIDE)
-    tiles = operator(COLLECT, [tile], (parts, *tile.shape[1:]))
-    return operator("whole_of", [pixels, tiles], (found.shape[0], count))
+    return operator("whole_of", [pixels, collect(tile, parts)], (found.shape[0], count))
 
 
 @_script

@@ -9,7 +9,7 @@ import onnxscript
 
 from torchdof.render.highlights import COARSE_CELL, NEARER_PX
 
-from .tiling import DOMAIN
+from .operators import DOMAIN
 
 if TYPE_CHECKING:  # what stands below is read, and not by Python's rules
     from typing import Any

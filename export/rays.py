@@ -16,6 +16,8 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.render.highlights import COARSE_CELL, Highlights
 from torchdof.render.plan import Plan
 
+from .operators import operator
+
 __all__ = ["Kernels", "kernels_of", "splat"]
 
 _NEVER = 1e6  # pixels of coc that none has
@@ -105,7 +107,7 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
     else:  # in no bin is there anything
         maps = [coc_px.new_zeros(1, 1), coc_px.new_zeros(1, 1), coc_px.new_zeros(0, 1, 1, 1)]
     inputs = [blank, *lists, *lens, *sizes, *maps, nearest]
-    splats = torch.onnx.ops.symbolic("torchdof::splat", inputs, dtype=blank.dtype, shape=list(blank.shape), version=1)
+    splats = operator("splat", inputs, blank.shape)
     return splats.transpose(0, 1).narrow(-2, margin, height).narrow(-1, margin, width)
 
 

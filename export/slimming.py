@@ -35,6 +35,7 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
         _Cuts(),
         _Averages(),
         _Fills(),
+        _Splits(),
         _Ramps(),
         passes.IdentityEliminationPass(),
         passes.CommonSubexpressionEliminationPass(),
@@ -212,7 +213,7 @@ class _Averages(onnx_ir.passes.InPlacePass):
 
 
 class _Fills(onnx_ir.passes.InPlacePass):
-    """Channels that only fill up a convolution: as a part of what is put together before it, and of the split after it.
+    """Channels that only fill up a convolution, as a part of what is put together before it.
 
     What they hold does not matter, for nothing takes them: they are some of the others once more.
     """
@@ -220,42 +221,51 @@ class _Fills(onnx_ir.passes.InPlacePass):
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
         """Replace in the graph."""
         graph = model.graph
-        for node in list(graph):
-            spare = _spare_channels(node) if node.op_type == "Pad" else 0
-            parts: Any = node.inputs[0].producer() if spare and node.inputs[0] is not None else None
-            if parts is not None and parts.op_type == "Concat" and parts.attributes["axis"].as_int() == 1:
-                filled, tape = list(parts.inputs), Tape()
-                for part in parts.inputs:
-                    while spare >= part.shape[1]:
-                        filled.append(part)
-                        spare -= part.shape[1]
-                if spare:
-                    name = f"{node.outputs[0].name}_fill"
-                    ends = {"start": 0, "stop": spare, "axis": 1}
-                    bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
-                    filled.append(tape.op("Slice", [parts.inputs[0], *bounds]))
-                whole = tape.op("Concat", filled, {"axis": 1})
-                whole.type, whole.shape = node.outputs[0].type, node.outputs[0].shape
-                graph.insert_before(node, list(tape.nodes))
-                node.outputs[0].replace_all_uses_with(whole)
-                graph.remove(node, safe=True)
-            cut: Any = node.inputs[0].producer() if node.op_type == "Split" and node.inputs[0] is not None else None
-            if cut is not None and cut.op_type == "Slice" and node.attributes["axis"].as_int() == 1:
-                split_input: Any = node.inputs[0]
-                whole, size, sizes = cut.inputs[0], split_input.shape, node.inputs[1]
-                numbers = None if sizes is None else onnx_ir.convenience.get_const_tensor(sizes)
-                alike = whole.shape is not None and [a == b for a, b in zip(whole.shape, size, strict=True)]
-                start = onnx_ir.convenience.get_const_tensor(cut.inputs[1])
-                if numbers is None or start is None or start.numpy().any() or alike != [True, False, True, True]:
-                    continue
-                more = [*numbers.numpy().tolist(), whole.shape[1] - size[1]]
-                sizes = _initializer(graph, np.array(more), f"{node.outputs[0].name}_sizes")
-                split = onnx_ir.node("Split", [whole, sizes], {"axis": 1}, num_outputs=len(more))
-                graph.insert_before(node, [split])
-                for old, new in zip(node.outputs, split.outputs, strict=False):
-                    new.type, new.shape = old.type, old.shape
-                    old.replace_all_uses_with(new)
-                graph.remove(node, safe=True)
+        for pad in list(graph):
+            spare = _spare_channels(pad)
+            parts: Any = pad.inputs[0].producer() if spare and pad.inputs[0] is not None else None
+            if parts is None or parts.op_type != "Concat" or parts.attributes["axis"].as_int() != 1:
+                continue
+            filled, tape = list(parts.inputs), Tape()
+            for part in parts.inputs:
+                repeats, spare = divmod(spare, part.shape[1])
+                filled += [part] * repeats
+            if spare:
+                name = f"{pad.outputs[0].name}_fill"
+                ends = {"start": 0, "stop": spare, "axis": 1}
+                bounds = [_initializer(graph, np.array([n]), f"{name}_{end}") for end, n in ends.items()]
+                filled.append(tape.op("Slice", [parts.inputs[0], *bounds]))
+            whole = tape.op("Concat", filled, {"axis": 1})
+            whole.type, whole.shape = pad.outputs[0].type, pad.outputs[0].shape
+            graph.insert_before(pad, list(tape.nodes))
+            pad.outputs[0].replace_all_uses_with(whole)
+            graph.remove(pad, safe=True)
+        return onnx_ir.passes.PassResult(model, modified=True)
+
+
+class _Splits(onnx_ir.passes.InPlacePass):
+    """A split of all channels but the last ones, as one of all, of which nothing takes the last part."""
+
+    def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
+        """Replace in the graph."""
+        graph = model.graph
+        for node in [n for n in graph if n.op_type == "Split" and n.attributes["axis"].as_int() == 1]:
+            cut: Any = None if node.inputs[0] is None else node.inputs[0].producer()
+            if cut is None or cut.op_type != "Slice" or cut.inputs[0].shape is None:
+                continue
+            whole, kept = cut.inputs[0], cut.outputs[0].shape
+            alike = [a == b for a, b in zip(whole.shape, kept, strict=True)]
+            first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in (cut.inputs[1], node.inputs[1]))
+            if first is None or sizes is None or first.numpy().any() or alike != [True, False, True, True]:
+                continue
+            parts = np.array([*sizes.numpy(), whole.shape[1] - kept[1]])
+            sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
+            split = onnx_ir.node("Split", [whole, sizes], {"axis": 1}, num_outputs=len(parts))
+            graph.insert_before(node, [split])
+            for old, new in zip(node.outputs, split.outputs, strict=False):
+                new.type, new.shape = old.type, old.shape
+                old.replace_all_uses_with(new)
+            graph.remove(node, safe=True)
         return onnx_ir.passes.PassResult(model, modified=True)
 
 
@@ -317,8 +327,8 @@ def _number(value: onnx_ir.Value | None) -> float | None:
 
 def _spare_channels(node: onnx_ir.Node) -> int:
     """How many channels a ``Pad`` adds behind those there are, if that is all that it does."""
-    pads = None if len(node.inputs) < 2 or node.inputs[1] is None else node.inputs[1].const_value
-    ends = [] if pads is None else pads.numpy().tolist()
+    pads = node.inputs[1] if node.op_type == "Pad" and len(node.inputs) > 1 else None
+    ends = [] if pads is None or pads.const_value is None else pads.const_value.numpy().tolist()
     return ends[5] if len(ends) == 8 and not any(ends[:5] + ends[6:]) else 0
 
 

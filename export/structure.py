@@ -1,4 +1,4 @@
-"""The structure of a graph, made of the operators that stand for it in what was traced (:mod:`.tiling`).
+"""The structure of a graph, made of the operators that stand for it in what was traced (:mod:`.operators`).
 
 What depends on a window becomes the body of a ``Loop`` over tiles. What only one side of a choice needs becomes that
 side's branch of an ``If``, so it is computed only when it is taken.
@@ -9,7 +9,7 @@ from typing import Any
 import onnx_ir
 from onnx_ir.tape import Tape
 
-from .tiling import CHOICE, COLLECT, DOMAIN, WINDOW
+from .operators import CHOICE, COLLECT, DOMAIN, WINDOW
 
 __all__ = ["structure"]
 

@@ -2,49 +2,23 @@
 
 A graph cannot choose its work before it runs. In a loop over tiles each step sees a small window, and the branches
 inside skip every layer that the window does not hold, and everything where it is in focus.
-
-What is traced is flat: an operator of our own cuts a window, another collects the tiles, a third chooses between two
-results. :mod:`torchdof.export.structure` makes a loop and branches of these.
 """
 
-import contextlib
-import functools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from torchdof.exporting import where_needed
 from torchdof.render.disocclusion import BEHIND_PX, Level, search
-from torchdof.render.exporting import Graph, graph_context, where_needed
 from torchdof.render.plan import Blur
 from torchdof.render.surfaces import Frame, Placed
 
-from .rays import Kernels, splat
+from .operators import collect, window
 from .shifting import samples
 
-__all__ = [
-    "CHOICE",
-    "COLLECT",
-    "DOMAIN",
-    "WINDOW",
-    "choose",
-    "in_tiles",
-    "operator",
-    "seen",
-    "side",
-    "tile_by_tile",
-    "window",
-]
-
-DOMAIN = "torchdof"
-"""Of the operators that stand for structure in a flat graph; none is left in a file."""
-
-CHOICE, WINDOW, COLLECT = "Choice", "Window", "Collect"
-"""``Choice(needed, result, given)``; ``Window(frame)``, one for each tile; ``Collect(tile)``, all of them.
-
-Windows of several maps, before one ``Collect``, are those of the same tile."""
+__all__ = ["seen", "side", "tile_by_tile"]
 
 _SIDE = 96  # the maps of one tile fit the processor's caches
 
@@ -52,11 +26,6 @@ _SIDE = 96  # the maps of one tile fit the processor's caches
 def side(margin: int) -> int:
     """Pixels of a tile along each axis, given those that the widest kernel reaches beyond it."""
     return next((n for n in (_SIDE, 128) if margin <= n // 2), 256)
-
-
-def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
-    """A result if it is needed, a bool ``[]``, else what is given: a branch of the graph."""
-    return operator(CHOICE, [needed, result, given], result.shape)
 
 
 def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, Sequence[Blur]], Tensor]) -> Tensor:
@@ -84,7 +53,7 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     tile = where_needed(lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0, rendered, sharp)
     rows, columns = (n // length for n in frame.area)
     batch = frame.surfaces[0].light.shape[0]
-    pieces = operator(COLLECT, [tile], (batch * rows * columns, int(rendered.shape[1]), length, length))
+    pieces = collect(tile, batch * rows * columns)
     return _joined(pieces, (batch, rows, columns))[..., : frame.size[0], : frame.size[1]]
 
 
@@ -128,8 +97,8 @@ def seen(
 
     tile = where_needed(hides, found, torch.zeros_like(found))
     rows, columns = ((w + m) // _SIDE for w, m in zip(whole, more, strict=True))
-    batch, channels = looking.shape[0], int(found.shape[1])
-    tiles = operator(COLLECT, [tile], (batch * rows * columns, channels, _SIDE, _SIDE))
+    batch = looking.shape[0]
+    tiles = collect(tile, batch * rows * columns)
     # narrowed, not sliced: so tracing knows the sizes of what is left
     maps = _joined(tiles, (batch, rows, columns)).narrow(-2, top, size[0]).narrow(-1, left, size[1])
     return maps[:, :-1], maps[:, -1:]
@@ -140,37 +109,9 @@ def _around(values: Tensor, ratio: float) -> Tensor:
     return values if ratio <= 1 else functional.pad(values, (1, 1, 1, 1), mode="replicate")
 
 
-@contextlib.contextmanager
-def in_tiles(kernels: Kernels) -> Iterator[None]:
-    """Within this context graphs that are exported render their frames tile by tile, and choose their work.
-
-    Their highlights have the given kernels.
-    """
-    splat_rays = functools.partial(splat, kernels=kernels)
-    token = graph_context.set(Graph(side, tile_by_tile, seen, splat_rays, choose))
-    try:
-        yield
-    finally:
-        graph_context.reset(token)
-
-
 def _joined(tiles: Tensor, counts: tuple[int, int, int]) -> Tensor:
     """Tiles ``[n, C, side, side]`` of so many items, rows and columns as maps."""
     channels, side = tiles.shape[1:3]
     batch, rows, columns = counts
     maps = tiles.reshape(batch, rows, columns, channels, side, side).permute(0, 3, 1, 4, 2, 5)
     return maps.reshape(batch, channels, rows * side, columns * side)
-
-
-def window(values: Tensor, length: int, margin: int) -> Tensor:
-    """What a tile of so many pixels of a map sees of it, with a margin."""
-    across = length + 2 * margin
-    return operator(WINDOW, [values], (1, int(values.shape[1]), across, across), side=length, margin=margin)
-
-
-def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], **attributes: int) -> Tensor:
-    """An operator of :data:`DOMAIN` in a graph; what it gives has the type of its last input."""
-    stated: dict[str, Any] = {**attributes}
-    return torch.onnx.ops.symbolic(
-        f"{DOMAIN}::{name}", inputs, stated, dtype=inputs[-1].dtype, shape=list(shape), version=1
-    )

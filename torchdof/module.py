@@ -12,12 +12,12 @@ from . import validation
 from .batch import flattened, leading_axes, numbers, restored
 from .depth.edges import STEP_PX, repair
 from .depth.size import at_size_of
+from .exporting import where_needed
 from .optics.blur_table import BlurTable
 from .optics.camera import CAMERA_NUMBERS, Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
 from .render import pipeline
 from .render.attention import Attention
-from .render.exporting import where_needed
 from .render.plan import Plan
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]

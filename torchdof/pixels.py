@@ -4,21 +4,17 @@ Depth edges, hidden surfaces and highlights concern few pixels; these are looked
 """
 
 from collections.abc import Callable
-from contextvars import ContextVar
 
 import torch
 from torch import Tensor
 
 from . import validation
+from .exporting import exported_graph
 
-__all__ = ["around", "by_parts", "corners", "graph_parts", "indices", "pick", "places", "put"]
+__all__ = ["around", "by_parts", "corners", "indices", "pick", "places", "put"]
 
 
 _PART = 40_000  # pixels that are looked at together
-
-graph_parts: ContextVar[Callable[[Callable[[Tensor], Tensor], Tensor], Tensor] | None]
-graph_parts = ContextVar("graph_parts", default=None)
-"""What :func:`by_parts` does in an exported graph; set by whoever exports one."""
 
 
 def indices(mask: Tensor) -> Tensor:
@@ -72,7 +68,9 @@ def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) 
 
 def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
     """What a function finds at pixels ``[P]``, so many at a time that what it needs stays small: ``[n, P]``."""
+    graph = exported_graph()
+    if graph is not None:
+        return graph.by_parts(look, pixels)
     if validation.is_traced():
-        in_graph = graph_parts.get()
-        return look(pixels) if in_graph is None else in_graph(look, pixels)
+        return look(pixels)
     return torch.cat([look(part) for part in pixels.split(_PART)], 1)

@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..exporting import where_needed
 from . import field
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
-from .exporting import where_needed
 from .plan import Blur
 from .scatter import fold
 from .surfaces import Frame

@@ -13,8 +13,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import pixels
+from ..exporting import exported_graph
 from .downsampling import downsampled
-from .exporting import exported_graph
 from .matting import NEVER_PX
 
 __all__ = [

@@ -20,10 +20,10 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import pixels
+from ..exporting import exported_graph, where_needed
 from ..optics.blur_table import BlurTable
 from ..validation import is_traced
 from .disocclusion import HIDDEN_WEIGHT
-from .exporting import exported_graph, where_needed
 from .field import Shares, placed, ray_shares
 from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import Surface

@@ -9,12 +9,12 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..exporting import exported_graph, where_needed
 from ..options import NAMED, Options
 from ..validation import is_traced
 from . import compiled, composite, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
-from .exporting import exported_graph, where_needed
 from .layer_weights import blur_axis
 from .matting import matte
 from .plan import Blur, Plan

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:  # these look at what is exported themselves
-    from .disocclusion import Seen
-    from .highlights import Highlights
-    from .plan import Blur
-    from .surfaces import Frame
+    from .render.disocclusion import Seen
+    from .render.highlights import Highlights
+    from .render.plan import Blur
+    from .render.surfaces import Frame
 
 __all__ = ["Graph", "exported_graph", "graph_context", "where_needed"]
 
@@ -28,6 +28,7 @@ class Graph(NamedTuple):
             rays; as :mod:`torchdof.render.highlights` splats them.
         choose: ``(needed, result, given)`` to the result where it is needed, else what is given. What only the result
             needs is computed only then.
+        by_parts: What a function finds at a list of pixels, as :func:`torchdof.pixels.by_parts` finds it.
     """
 
     align: Callable[[int], int]
@@ -35,6 +36,7 @@ class Graph(NamedTuple):
     seen: "Seen"
     splat: "Callable[[Highlights, Tensor, Sequence[tuple[Tensor, Tensor]]], Tensor]"
     choose: Callable[[Tensor, Tensor, Tensor], Tensor]
+    by_parts: Callable[[Callable[[Tensor], Tensor], Tensor], Tensor]
 
 
 graph_context: ContextVar[Graph | None] = ContextVar("graph_context", default=None)
