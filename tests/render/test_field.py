@@ -120,9 +120,9 @@ def lopsided(channels: int = 1) -> BlurTable:
     return BlurTable("disc", coc, params, unit="mm", sensor_width_mm=36.0, field=Field(coc, radius, box, light))
 
 
-@pytest.mark.parametrize(("y", "x"), [(0.0, 9.0), (-6.0, 8.0), (5.0, -5.0)])
-def test_a_spot_lies_outwards_of_its_place_and_is_turned_with_it(y: float, x: float) -> None:
-    table, width, coc_px = lopsided(), 360, 6.0
+@pytest.mark.parametrize(("y", "x", "coc_px"), [(0.0, 9.0, 6.0), (-6.0, 8.0, 6.0), (5.0, -5.0, 6.0), (-6.0, 8.0, 1.0)])
+def test_a_spot_lies_outwards_of_its_place_and_is_turned_with_it(y: float, x: float, coc_px: float) -> None:
+    table, width = lopsided(), 360
     per_mm = width / 36.0
     half_diagonal = 0.5 * math.hypot(width, 240) / per_mm
     shares = layer_shares(table, coc_px, 1, (240, width))
@@ -207,6 +207,24 @@ def test_no_seam_shows_between_blocks() -> None:
     at_border = (torch.arange(third.shape[-1]) + 2) % BLOCK[1] == 0
     seams, elsewhere = (float(third[..., part].square().mean()) for part in (at_border, ~at_border))
     assert 0.5 * math.sqrt(max(seams - elsewhere, 0.0)) < 1.5 / 255
+
+
+@pytest.mark.parametrize("table", [TABLE, lopsided()], ids=["cat's eyes", "a field"])
+def test_a_highlight_has_the_kernel_of_its_own_radius_and_place(table: BlurTable) -> None:
+    height, width, row, column, coc_px = 100, 160, 24, 131, 7.0
+    image = torch.full((1, 1, height, width), 0.1, dtype=torch.float64)
+    coc = torch.full_like(image, coc_px)
+    coc[..., :20] = 3.0  # of two layers, that there are rays
+    dark = blur_by_coc(image, coc, table=table, tolerance=0)
+    image[..., row, column] = 200.0
+    spot = (blur_by_coc(image, coc, table=table, tolerance=0) - dark)[0, 0] / 199.9
+    half_diagonal = 0.5 * math.hypot(height, width)
+    y, x = ((p + 0.5 - n / 2) / half_diagonal for p, n in ((row, height), (column, width)))
+    shares, own = layer_shares(table, coc_px, 1, (height, width)), own_kernels(table, number(coc_px)[None], width)
+    expected = placed(own, [(shares, number(1.0))], number(y)[None], number(x)[None])[0, 0]
+    half = len(expected) // 2
+    spot = spot[row - half : row + half + 1, column - half : column + half + 1]
+    assert float((spot - expected).abs().sum()) < 0.01  # of the light
 
 
 def test_where_the_viewer_looks_and_elsewhere_the_frame_keeps_its_tolerance() -> None:

@@ -69,6 +69,25 @@ def test_the_plan_of_every_scene_reaches_its_radius_on_both_sides() -> None:
     assert [-x for x in reversed(plan.nodes)] == list(plan.nodes) and 0.0 in plan.nodes
 
 
+def test_layers_of_every_scene_err_no_more_on_a_slope_than_those_of_the_scene_itself() -> None:
+    """They do not know which blurs its border has; so they lie denser."""
+    y, x = torch.linspace(0.0, 1.0, 160)[:, None], torch.linspace(0.0, 1.0, 240)
+    coc = (8.0 + 16.0 * (0.7 * x + 0.3 * y))[None, None]
+    image = torch.rand(1, 3, 40, 60, generator=torch.Generator().manual_seed(1))
+    image = torch.nn.functional.interpolate(image, coc.shape[-2:], mode="bicubic").clamp(0.0, 1.0)
+    exact = torchdof.blur_by_coc(image, coc, tolerance=0)
+    plans = Plan.all(24.0, 1 / 255), Plan.of_scene(coc, 1 / 255)
+    every, own = (float((torchdof.blur_by_coc(image, coc, plan=p) - exact).square().mean().sqrt()) for p in plans)
+    assert every < own < 0.75 / 255
+
+
+def test_layers_farther_than_any_frame_is_wide_are_refused() -> None:
+    assert Plan((-0.9e9, 0.9e9), 1 / 255).nodes
+    for node in (1.1e9, math.inf, math.nan):
+        with pytest.raises(ValueError, match="strictly increasing numbers below 1e9 px"):
+            Plan((0.0, node), 1 / 255)
+
+
 def test_layers_for_gradients_do_not_move_with_the_scene() -> None:
     first, second = (Plan.still(coc_map(-3.0, reach), 1 / 255) for reach in (5.1, 5.1001))
     assert first.nodes == second.nodes
