@@ -183,15 +183,15 @@ void Job::extract_highlights() {
 }
 
 // The surfaces that pixels show, own and other, in a row from column x on within one block column, with the part of a
-// pixel that each covers; what is hidden covers nothing. The body is told whether it is the own one.
+// pixel that each covers: the weight (null: 1) beyond a least one, for what is hidden covers nothing. The body is told whether
+// it is the own one.
 template <typename Body>
 static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
   const int own = surfaces.whole() ? 1 : 0;  // before a known background the other surface comes first
   const float *coc, *weight;
   for (int i : {own, 1 - own}) {
     if (!surfaces.row(i, y, x, light, coc, weight)) continue;
-    const float least = i == own ? 0.0f : HIDDEN_WEIGHT;
-    body(i == own, coc, [=](int j) { return weight ? std::max(weight[j] - least, 0.0f) : 1.0f; });
+    body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
   }
 }
 
@@ -230,12 +230,10 @@ Visibility look_at(const Job &job) {
         for (float coc : ends) add(x + j, coc);
       if (flat && !surfaces.has_block(block)) continue;
       for (int y = row * CELL; y < std::min(H, (row + 1) * CELL); y++)
-        each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, auto cover) {
+        each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, const float *weight, float least_weight) {
           if (own && flat) return;
-          float most = 0;
-          for (int j = 0; j < n; j++) most = std::max(most, cover(j));
-          for (int j = 0; most > 0 && j < n; j++)
-            if (cover(j) > 0) add(x + j, coc[j]);
+          for (int j = 0; j < n; j++)
+            if (!weight || weight[j] > least_weight) add(x + j, coc[j]);
         });
     }
   });
@@ -246,47 +244,81 @@ Visibility look_at(const Job &job) {
   return v;
 }
 
-// How much of the pixels first to last of a row the surfaces at a place cover.
-static void cover_row(const Job &job, int y, int first, int last, float place, const float **light, float *covered) {
-  for (int x = first; x <= last;) {
-    const int n = std::min(last + 1, (x / BLOCK + 1) * BLOCK) - x;
-    float *to = covered + (x - first);
-    for (int j = 0; j < n; j++) to[j] = 0;
-    each_shown(job.surfaces, y, x, light, [&](bool, const float *coc, auto cover) {
-      for (int j = 0; j < n; j++) to[j] += std::max(1.0f - std::fabs(coc[j] - place), 0.0f) * cover(j);
+namespace {
+
+// How much of the pixels of a row, in block columns from the first on, the surfaces at a place cover; whether any.
+bool cover_row(const Job &job, int y, int block_column, int block_columns, float place, const float **light, float *covered) {
+  vec most_cover = {};
+  for (int i = 0; i < block_columns; i++, covered += BLOCK) {
+    const int x = (block_column + i) * BLOCK, n = std::min(BLOCK, job.width - x);
+    for (int j = 0; j < BLOCK; j += LANES) store(covered + j, vec{});
+    each_shown(job.surfaces, y, x, light, [&](bool, const float *coc, const float *weight, float least_weight) {
+      float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
+      if (n < BLOCK) {
+        memcpy(its_coc, coc, n * sizeof(float));
+        coc = its_coc;
+        if (weight) memcpy(its_weight, weight, n * sizeof(float)), weight = its_weight;
+      }
+      for (int j = 0; j < BLOCK; j += LANES) {
+        const vec apart = load<vec>(coc + j) - all(place);
+        vec cover = most(all(1.0f) - most(apart, -apart), vec{});
+        if (weight) cover *= most(load<vec>(weight + j) - all(least_weight), vec{});
+        store(covered + j, load<vec>(covered + j) + cover);
+        most_cover = most(most_cover, cover);
+      }
     });
-    x += n;
   }
+  return any_positive(most_cover);
 }
 
-// Adds how much of the rays of a row that land n pixels from column x on is taken by surfaces at a place.
-static void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y, int x, int n, const float **light, float *blocked) {
-  constexpr int LONGEST = 256;
+// Adds how much of the rays that land in a patch, rows by columns pixels from y, x on, surfaces at a place take.
+void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y, int x, int rows, int columns, const float **light,
+                 float (*blocked)[PATCH]) {
+  constexpr int LONGEST = 256;  // columns of the image that are looked at together
   const int H = job.height, W = job.width;
   const float along = 1.0f - place / ray.coc;
-  const float at_y = clamp(ray.row + (y - ray.row) * along, 0.0f, H - 1.0f);
-  const int row = std::min((int)at_y, std::max(0, H - 2)), below = H > 1 ? row + 1 : row;
-  const float down = at_y - row;
-  auto column_of = [&](int i) { return clamp(ray.column + (x + i - ray.column) * along, 0.0f, W - 1.0f); };
-  float upper[LONGEST], lower[LONGEST];
-  for (int i = 0; i < n;) {  // as many rays as meet a bounded number of columns
-    const float start = column_of(i);
-    int stop = i + 1;
-    while (stop < n && std::fabs(column_of(stop) - start) < LONGEST - 3) stop++;
-    const float ends[2] = {start, column_of(stop - 1)};
-    const int first = (int)std::min(ends[0], ends[1]), last = std::min((int)std::max(ends[0], ends[1]) + 1, W - 1);
-    cover_row(job, row, first, last, place, light, upper);
-    cover_row(job, below, first, last, place, light, lower);
-    for (int k = 0; k <= last - first; k++) upper[k] += down * (lower[k] - upper[k]);
-    upper[last - first + 1] = upper[last - first];
-    for (; i < stop; i++) {
-      const float at_x = column_of(i);
-      const int column = (int)at_x;
-      const float across = at_x - column, a = upper[column - first], b = upper[column - first + 1];
-      blocked[i] += fades * (a + across * (b - a));
+  int column[PATCH];
+  float across[PATCH];
+  for (int i = 0; i < columns; i++) {
+    const float at_x = clamp(ray.column + (x + i - ray.column) * along, 0.0f, W - 1.0f);
+    column[i] = (int)at_x;
+    across[i] = at_x - column[i];
+  }
+  // of a row of the image what it takes of each column of rays; kept of one odd and one even row, for rays of neighbouring
+  // rows meet the same
+  float met[2][PATCH] = {};
+  int known[2] = {-1, -1};
+  bool meets[2];
+  auto take_row = [&](int row) {
+    if (known[row % 2] == row) return meets[row % 2];
+    known[row % 2] = row;
+    meets[row % 2] = false;
+    float covered[LONGEST], *to = met[row % 2];
+    for (int start = 0, stop; start < columns; start = stop) {
+      for (stop = start + 1; stop < columns && std::abs(column[stop] - column[start]) < LONGEST - 2 * BLOCK; stop++) {}
+      const int low = std::min(column[start], column[stop - 1]), high = std::min(std::max(column[start], column[stop - 1]) + 1, W - 1);
+      const int first = low / BLOCK;
+      meets[row % 2] |= cover_row(job, row, first, high / BLOCK - first + 1, place, light, covered);
+      for (int i = start; i < stop; i++) {
+        const float *value = covered + column[i] - first * BLOCK, *next = column[i] < W - 1 ? value + 1 : value;
+        to[i] = *value + across[i] * (*next - *value);
+      }
+    }
+    return meets[row % 2];
+  };
+  for (int i = 0; i < rows; i++) {
+    const float at_y = clamp(ray.row + (y + i - ray.row) * along, 0.0f, H - 1.0f);
+    const int row = std::min((int)at_y, std::max(0, H - 2)), below = H > 1 ? row + 1 : row;
+    const bool upper = take_row(row), lower = take_row(below);
+    if (!upper && !lower) continue;
+    for (int j = 0; j < PATCH; j += LANES) {
+      const vec a = load<vec>(met[row % 2] + j), b = load<vec>(met[below % 2] + j);
+      store(blocked[i] + j, load<vec>(blocked[i] + j) + fades * (a + (at_y - row) * (b - a)));
     }
   }
 }
+
+}  // namespace
 
 // What the field lets through of a ray's kernel.
 static Turned turned_of(const Job &job, const RayKernels &kernels, const Ray &ray, int colour) {
@@ -330,7 +362,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
   const float *const *kernels = ray_kernels.kernels;
   const int32_t *halves = ray_kernels.halves;
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
-  std::vector<int> nearer(v.bins.size());
+  std::vector<int> nearer;  // bins that may take of its light
   std::vector<const float *> surface_light(C);
   std::vector<Turned> turned;  // of each colour
   for (int r = 0; r < count; r++) {
@@ -350,33 +382,39 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
     // the part of the tile in which its rays land
     const int top = std::max(y0, ray.row - half), bottom = std::min(std::min(y0 + TILE, H), ray.row + half + 1);
     const int left = std::max(x0, ray.column - half), right = std::min(std::min(x0 + TILE, W), ray.column + half + 1);
+    // whether rays that land in a part of it may meet a surface of a bin
+    auto may_meet = [&](int k, int y, int x, int rows, int columns) {
+      // a ray that lands so many pixels away met the surface at this share of them
+      const float along = 1.0f - (v.low + k) / ray.coc;
+      const float ya = ray.row + (y - ray.row) * along, yb = ray.row + (y + rows - 1 - ray.row) * along;
+      const float xa = ray.column + (x - ray.column) * along, xb = ray.column + (x + columns - 1 - ray.column) * along;
+      auto cell = [](float at, int size) { return (int)clamp(at, 0.0f, size - 1.0f) / CELL; };
+      const int r0 = cell(std::floor(std::min(ya, yb)), H), r1 = cell(std::max(ya, yb) + 1, H);
+      const int c0 = cell(std::floor(std::min(xa, xb)), W), c1 = cell(std::max(xa, xb) + 1, W);
+      uint64_t classes = 0;
+      for (int i = r0; i <= r1; i++)
+        for (int j = c0; j <= c1; j++) classes |= v.cells[(size_t)i * v.cell_columns + j];
+      const int first = std::min((int)(std::max(0, k - 1) / v.class_width), CLASSES - 1);
+      const int last = std::min((int)((k + 1) / v.class_width), CLASSES - 1);
+      return (classes & ((2ull << last) - (1ull << first))) != 0;
+    };
+    nearer.clear();
+    if (job.scene.occlusion)
+      for (int k : v.bins) {
+        if (!(ray.coc - NEARER_PX > v.low + k)) break;
+        if (may_meet(k, top, left, bottom - top, right - left)) nearer.push_back(k);
+      }
     for (int py = top; py < bottom; py += PATCH)
       for (int px = left; px < right; px += PATCH) {
         const int ny = std::min(PATCH, bottom - py), nx = std::min(PATCH, right - px);
-        int m = 0;
-        if (job.scene.occlusion)
-          for (int k : v.bins) {
-            if (!(ray.coc - NEARER_PX > v.low + k)) break;
-            // a ray that lands so many pixels away met the surface at this share of them
-            const float along = 1.0f - (v.low + k) / ray.coc;
-            const float ya = ray.row + (py - ray.row) * along, yb = ray.row + (py + ny - 1 - ray.row) * along;
-            const float xa = ray.column + (px - ray.column) * along, xb = ray.column + (px + nx - 1 - ray.column) * along;
-            auto cell = [](float at, int size) { return (int)clamp(at, 0.0f, size - 1.0f) / CELL; };
-            const int r0 = cell(std::floor(std::min(ya, yb)), H), r1 = cell(std::max(ya, yb) + 1, H);
-            const int c0 = cell(std::floor(std::min(xa, xb)), W), c1 = cell(std::max(xa, xb) + 1, W);
-            uint64_t classes = 0;
-            for (int i = r0; i <= r1; i++)
-              for (int j = c0; j <= c1; j++) classes |= v.cells[(size_t)i * v.cell_columns + j];
-            const int first = std::min((int)(std::max(0, k - 1) / v.class_width), CLASSES - 1);
-            const int last = std::min((int)((k + 1) / v.class_width), CLASSES - 1);
-            if (classes & ((2ull << last) - (1ull << first))) nearer[m++] = k;
-          }
+        float blocked[PATCH][PATCH] = {};
+        for (int k : nearer) {
+          const float place = v.low + k;
+          if (may_meet(k, py, px, ny, nx))
+            add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), py, px, ny, nx, surface_light.data(), blocked);
+        }
         for (int y = py; y < py + ny; y++) {
-          float blocked[PATCH] = {}, taps[PATCH];
-          for (int i = 0; i < m; i++) {
-            const float place = v.low + nearer[i];
-            add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), y, px, nx, surface_light.data(), blocked);
-          }
+          float taps[PATCH];
           for (int c = 0; c < C; c++) {
             if (!c || E > 1) {
               std::fill(taps, taps + nx, 0.0f);
@@ -388,7 +426,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
                 if (taps[x] != 0) taps[x] *= gain * turned[e].share((float)(y - ray.row), (float)(px + x - ray.column));
             }
             float *to = tile + (size_t)c * TILE * TILE + (y - y0) * TILE + (px - x0);
-            for (int x = 0; x < nx; x++) to[x] += taps[x] * (1.0f - std::min(blocked[x], 1.0f)) * light[c];
+            for (int x = 0; x < nx; x++) to[x] += taps[x] * (1.0f - std::min(blocked[y - py][x], 1.0f)) * light[c];
           }
         }
       }
