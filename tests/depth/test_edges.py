@@ -115,13 +115,53 @@ def test_the_brightness_of_the_image_changes_nothing(scene: Scene, times: float)
     torch.testing.assert_close(repair_edges(scene.image, depth), repair_edges(times * scene.image, depth))
 
 
+TURNS: dict[str, Callable[[Tensor], Tensor]] = {
+    "left-right": lambda t: t.flip(-1),
+    "top-bottom": lambda t: t.flip(-2),
+    "diagonal": lambda t: t.mT,
+    "quarter": lambda t: t.rot90(1, (-2, -1)),
+}
+
+
+@pytest.mark.parametrize("turn", TURNS.values(), ids=TURNS)
+@pytest.mark.parametrize("kind", ["near -1px", "half-res"])
 @pytest.mark.parametrize(
-    "turn", [lambda t: t.flip(-1), lambda t: t.flip(-2), lambda t: t.mT], ids=["left-right", "top-bottom", "diagonal"]
+    ("engine", "times"),
+    [("torch", (1, 1)), pytest.param("native", (3, 3), marks=compiled)]
+    + [pytest.param("native", (7, 6), marks=compiled)],  # of a frame that large a sample is looked at alone
 )
-def test_a_turned_map_is_repaired_as_it_is_unturned(scene: Scene, turn: Callable[[Tensor], Tensor]) -> None:
-    depth = degrade(scene.depth, "near -1px")
-    mended = repair_edges(turn(scene.image).contiguous(), turn(depth).contiguous(), "auto")
-    torch.testing.assert_close(turn(1 / mended), 1 / repair_edges(scene.image, depth, "auto"), rtol=0, atol=1e-4)
+def test_a_turned_map_is_repaired_as_it_is_unturned(
+    scene: Scene,
+    kind: str,
+    turn: Callable[[Tensor], Tensor],
+    engine: str,
+    times: tuple[int, int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its sizes are odd; a sample that is not turned with it meets other damage and noise."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    monkeypatch.setattr(edges, "_SAMPLED", 128)  # else the plain engine looks at all of a small frame
+    image = scene.image.repeat(1, 1, *times)[..., :-1, :-3]
+    exact, damaged = (
+        scene.camera.coc_px(degrade(scene.depth, k), 192).repeat(1, 1, *times)[..., :-1, :-3] for k in ("exact", kind)
+    )
+    height, width = exact.shape[-2:]
+    coc = torch.where(torch.arange(width) + 2 * torch.arange(height)[:, None] < width, damaged, exact)
+    coc = coc + 0.01 * torch.randn(height, 1, generator=torch.Generator().manual_seed(0))
+    mended = edges.repair(image, -coc, edges.STEP_PX, True)
+    assert not torch.equal(mended, -coc)
+    turned = edges.repair(turn(image).contiguous(), turn(-coc).contiguous(), edges.STEP_PX, True)
+    torch.testing.assert_close(turned, turn(mended), rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
+def test_noise_from_row_to_row_counts_as_noise_from_column_to_column(
+    scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    for shape in ((1, 1, 128, 1), (1, 1, 1, 192)):
+        noise = (2.0 * torch.randn(shape, generator=torch.Generator().manual_seed(0))).expand(scene.depth.shape)
+        assert torch.equal(edges.repair(scene.image, noise.contiguous(), edges.STEP_PX, False), noise)
 
 
 @pytest.mark.parametrize("marked", [0.0, -3.0])
@@ -258,7 +298,7 @@ def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
 def test_engines_agree_on_frames_of_which_a_part_decides(scene: Scene, kind: str, is_exact: bool) -> None:
     image = scene.image.repeat(1, 1, 6, 5)
     nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, 6, 5)
-    assert nearness.numel() > 4 * edges._SAMPLED
+    assert sum(nearness.shape[-2:]) > 2 * edges._SAMPLED
     plain = edges._repair(image, nearness, torch.tensor(1.0), True)[0, 0]
     fast = native.repair_edges(image[0], nearness[0, 0], torch.tensor(1.0), True)
     assert torch.equal(fast, nearness[0, 0]) == torch.equal(plain, nearness[0, 0]) == is_exact

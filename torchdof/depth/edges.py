@@ -29,14 +29,16 @@ STEP_PX = 1.0
 
 _STEP = 0.1  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
 _NOISES = 12.0  # standard deviations of a map's noise that a step stands out at least
-_NOISE_SAMPLED = 2**15  # pixels of a frame among which noise is looked for
+_NOISE_SAMPLED = 2**15  # pixels of a frame among which noise is looked for, half along rows and half along columns
 _RINGS = 3  # pixels beside a step that may be on its wrong side
 _REACH = 5  # pixels around one that tell what the two surfaces look like
 _FALLOFF_PX = 2.5
 _ABRUPT = 0.3  # part of a step that lies between two neighbours
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a pixel as witness, by ring; beside an edge it may be wrong itself
 _RAMP_REACH = 6  # half the width of the widest ramp that is one, not a slope
-_TIE = 0.017  # part of a step by which directions must differ: off the multiples of 1/25 that means of steps are
+_FLAT = 0.017  # part of a step from which on one of its directions counts: off the multiples of 1/25 that means are
+_OCTANT = 0.41421  # tangent of 22.5 degrees: a direction closer to an axis lies along it
+_DIRECTIONS = 9
 _SHALLOW = 0.03  # slope, of what lies between the surfaces around, from which on it belongs to a ramp
 _LEVELS = 6  # places on a ramp that are calibrated apart
 _PLACES = 2 * _RINGS + _LEVELS
@@ -53,7 +55,7 @@ _EXACT = 0.025  # share of wrong pixels up to which a map's steps count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind from which on each of them is asked
 _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
 _RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
-_SAMPLED = 2**17  # pixels of a frame among which a map is calibrated
+_SAMPLED = 768  # rows and columns of a frame, together, in each of which every block calibrates a map
 _BLOCK = 32
 _NEVER = 1e30
 _LARGEST = 1e15  # nearness, and light, whose squares are numbers too: beyond it the one is none, the other no brighter
@@ -68,7 +70,7 @@ class _Edges(NamedTuple):
     is_ramp: Tensor  # the map passes from one to the other here
     ring: Tensor  # how many pixels from a step: 1 is beside it; one more than there are: none is near
     is_edge: Tensor
-    direction: Tensor  # towards the near surface: left, right, up or down
+    direction: Tensor  # towards the near surface: one of the eight neighbours, row by row, or none, the middle
 
 
 def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> Tensor:
@@ -176,10 +178,9 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     witness = given.new_tensor(_SURE)[edges.ring] * (valid & ~edges.is_ramp)
 
     # how far the map can be trusted, at each kind of place on an edge: from part of the frame
-    height, width = given.shape[-2:]
-    every = (height * width + _SAMPLED - 1) // _SAMPLED
-    rows, columns = (torch.arange(n, device=given.device) // _BLOCK for n in (height, width))
-    sampled = pixels.indices(edges.is_edge & ((rows[:, None] + 3 * columns) % every == 0))
+    spacing = (sum(given.shape[-2:]) + _SAMPLED - 1) // _SAMPLED
+    rows, columns = (_from_border(n, given.device) // _BLOCK % spacing == 0 for n in given.shape[-2:])
+    sampled = pixels.indices(edges.is_edge & rows[:, None] & columns)
     kind = _kind(given, edges)
     sampled_score = _judge(light, given, witness, edges, sampled)[0]
     prior = _calibrate(kind, sampled, sampled_score, given.shape[0])[kind]
@@ -227,16 +228,29 @@ def _(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     return torch.empty_like(nearness, memory_format=torch.contiguous_format)
 
 
+def _from_border(size: int, device: torch.device) -> Tensor:
+    """Distance to the nearest border: what is chosen by it is the same in a turned frame."""
+    places = torch.arange(size, device=device)
+    return torch.minimum(places, size - 1 - places)
+
+
 def _noise(nearness: Tensor, valid: Tensor) -> Tensor:
-    """Standard deviation of an item's noise, ``[B, 1, 1, 1]``: from how the middle pixel of all bends its row."""
-    height, width = nearness.shape[-2:]
-    every = (height * width + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
-    rows, valid_rows = (functional.pad(t[..., ::every, :], (0, 2)) for t in (nearness, valid))
-    known = valid_rows.narrow(-1, 0, width) & valid_rows.narrow(-1, 1, width) & valid_rows.narrow(-1, 2, width)
-    bends = torch.where(known, rows.diff().diff().abs(), torch.inf).flatten(1).sort(1).values
-    middle = (known.flatten(1).sum(1, keepdim=True) - 1).clamp_min(0) // 2
-    bend = bends.gather(1, middle)
-    return torch.where(bend < torch.inf, 0.6053 * bend, 0.0)[..., None, None]  # 1.4826 / sqrt(6), of a Gaussian
+    """Standard deviation of an item's noise, ``[B, 1, 1, 1]``.
+
+    From how the middle pixel of all bends its row, or its column if that is more.
+    """
+    every = (2 * nearness.shape[-2] * nearness.shape[-1] + _NOISE_SAMPLED - 1) // _NOISE_SAMPLED
+    middles = []
+    for values, known in ((nearness, valid), (nearness.transpose(-2, -1), valid.transpose(-2, -1))):
+        size = values.shape[-1]
+        lines = (_from_border(values.shape[-2], values.device) % every == 0).nonzero()[:, 0]
+        line, has = (functional.pad(t.index_select(-2, lines), (0, 2)) for t in (values, known))
+        has = has.narrow(-1, 0, size) & has.narrow(-1, 1, size) & has.narrow(-1, 2, size)
+        bends = torch.where(has, line.diff().diff().abs(), torch.inf).flatten(1).sort(1).values
+        middle = (has.flatten(1).sum(1, keepdim=True) - 1).clamp_min(0) // 2
+        middles.append(bends.gather(1, middle))
+    bend = torch.maximum(*(torch.where(middle < torch.inf, middle, 0.0) for middle in middles))
+    return 0.6053 * bend[..., None, None]  # 1.4826 / sqrt(6), of a Gaussian
 
 
 def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
@@ -270,8 +284,10 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
 
     mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
     right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
-    tie = _TIE * (near - far)
-    direction = torch.where(right.abs() > down.abs() + tie, (right > 0).long(), 2 + (down > tie).long())
+    flat = _FLAT * (near - far)
+    across = torch.where(right.abs() > torch.maximum(_OCTANT * down.abs(), flat), right.sign(), 0.0)
+    along = torch.where(down.abs() > torch.maximum(_OCTANT * right.abs(), flat), down.sign(), 0.0)
+    direction = (3.0 * along + across).long() + _DIRECTIONS // 2
     return _Edges(near, far, is_ramp, ring, is_edge, direction)
 
 
@@ -284,7 +300,7 @@ def _kind(nearness: Tensor, edges: _Edges) -> Tensor:
     side = (level > 0.5).long() * _RINGS + edges.ring.clamp(max=_RINGS) - 1
     place = torch.where(edges.is_ramp, 2 * _RINGS + (level * _LEVELS).long().clamp(0, _LEVELS - 1), side)
     item = torch.arange(nearness.shape[0], device=nearness.device).view(-1, 1, 1, 1)
-    return (item * _PLACES + place) * 4 + edges.direction
+    return (item * _PLACES + place) * _DIRECTIONS + edges.direction
 
 
 def _judge(
@@ -386,7 +402,7 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
     ramps = (torch.arange(_LEVELS, device=device, dtype=dtype) + 0.5) / _LEVELS
     assumed = torch.cat([steps, ramps]).repeat(items)
     kinds = pixels.pick(kind, sampled)[0]
-    places = kinds // 4  # all directions together first
+    places = kinds // _DIRECTIONS  # all directions together first
     weight = (0.5 * score.abs()).clamp(max=1.0)
 
     def fit(groups: Tensor, count: int, start: Tensor, assumed: Tensor) -> Tensor:
@@ -398,8 +414,9 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
         return share
 
     is_step = (torch.arange(_PLACES, device=device) < 2 * _RINGS).repeat(items)
-    together = fit(places, items * _PLACES, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(4)
-    shares = fit(kinds, items * _PLACES * 4, torch.full_like(together, 0.5), together).view(items, _PLACES, 4)
+    together = fit(places, items * _PLACES, torch.where(is_step, 0.5, assumed), assumed).repeat_interleave(_DIRECTIONS)
+    shares = fit(kinds, items * _PLACES * _DIRECTIONS, torch.full_like(together, 0.5), together)
+    shares = shares.view(items, _PLACES, _DIRECTIONS)
     # where the pixels beside a step are right those farther away are too
     far = [shares[:, :k].amin(1) for k in range(1, _RINGS + 1)]
     near = [shares[:, _RINGS : _RINGS + k].amax(1) for k in range(1, _RINGS + 1)]
@@ -412,9 +429,11 @@ def _blur_of(nearness: Tensor, valid: Tensor, edges: _Edges) -> tuple[Tensor, Te
     Both ``[B, 1, 1, 1]``. The length is the sum of gradients; ramps are as wide as they are longer in pixels than it.
     """
     gap = (edges.near - edges.far).clamp_min(1e-12)
-    beside = functional.pad(_changes(nearness, valid, -1), (0, 1))
-    below = functional.pad(_changes(nearness, valid, -2), (0, 0, 0, 1))
-    climb = torch.where(edges.is_edge, torch.hypot(beside, below) / gap, 0.0)
+    across, along = _changes(nearness, valid, -1), _changes(nearness, valid, -2)
+    beside = [functional.pad(across, ends) for ends in ((1, 0), (0, 1))]
+    below = [functional.pad(along, (0, 0, *ends)) for ends in ((1, 0), (0, 1))]
+    steepness = sum(torch.hypot(a, b) for a in beside for b in below)
+    climb = torch.where(edges.is_edge, 0.25 * steepness / gap, 0.0)
     length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     middle = edges.is_edge & (((nearness - edges.far) / gap - 0.5).abs() < 0.25)
     sigma = middle.sum((1, 2, 3), keepdim=True) / (_MIDDLE_HALF * length)

@@ -13,10 +13,10 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, KINDS = 4 * PLACES, ROUNDS = 10;
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
+constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 9, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, FLAT = 0.017f, OCTANT = 0.41421f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr float NOISES = 12.0f;
-constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 768, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
@@ -267,16 +267,18 @@ class Repair {
   bool run() {
     allocate();
     noise_step_ = NOISES * noise();
-    const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
-    const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
-    const auto is_sampled = [&](int y, int x) { return (y + 3 * x) % every == 0; };
+    const int spacing = (height_ + width_ + SAMPLED - 1) / SAMPLED;
+    const bool spares = map_.automatic && spacing > 2;  // blocks of a sample are apart, and a look at them alone may do
     std::vector<Group> groups, sampled;
     if (spares) {
-      sampled = find_in(squares(SAMPLE_BLOCK, is_sampled), REACH, false);
+      sampled = find_in(blocks(spacing), REACH, false);
     } else {
       sampled = groups = find_in(tiles(), 0, false);
     }
-    list(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_ / SAMPLE_BLOCK, edge.i % width_ / SAMPLE_BLOCK); });
+    list(sampled, [&](const Edge &edge) {
+      const int y = edge.i / width_, x = edge.i % width_;
+      return std::min(y, height_ - 1 - y) / SAMPLE_BLOCK % spacing == 0 && std::min(x, width_ - 1 - x) / SAMPLE_BLOCK % spacing == 0;
+    });
     judge(sampled);
     decide(sampled);
     calibrate(sampled);
@@ -310,20 +312,25 @@ class Repair {
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
-  // Standard deviation of the map's noise: from how the middle pixel of all bends its row.
+  // Standard deviation of the map's noise: from how the middle pixel of all bends its row, or its column if that is more.
   float noise() const {
-    const int every = (int)(((int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
-    std::vector<float> bends;
-    for (int y = 0; y < height_; y += every) {
-      const float *row = map_.nearness + (size_t)y * width_;
-      for (int x = 0; x < width_ - 2; x++)
-        if (std::fabs(row[x]) <= LARGEST && std::fabs(row[x + 1]) <= LARGEST && std::fabs(row[x + 2]) <= LARGEST)
-          bends.push_back(std::fabs((row[x + 2] - row[x + 1]) - (row[x + 1] - row[x])));
-    }
-    if (bends.empty()) return 0.0f;
-    const auto middle = bends.begin() + (bends.size() - 1) / 2;
-    std::nth_element(bends.begin(), middle, bends.end());
-    return 0.6053f * *middle;
+    const int every = (int)((2 * (int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
+    const auto middle_bend = [&](int lines, int size, int to_line, int stride) {
+      std::vector<float> bends;
+      for (int n = 0; n < lines; n++) {
+        if (std::min(n, lines - 1 - n) % every != 0) continue;
+        const float *line = map_.nearness + (ptrdiff_t)n * to_line;
+        for (int k = 0; k < size - 2; k++, line += stride) {
+          const float a = line[0], b = line[stride], c = line[2 * stride];
+          if (std::fabs(a) <= LARGEST && std::fabs(b) <= LARGEST && std::fabs(c) <= LARGEST) bends.push_back(std::fabs((c - b) - (b - a)));
+        }
+      }
+      if (bends.empty()) return 0.0f;
+      const auto middle = bends.begin() + (bends.size() - 1) / 2;
+      std::nth_element(bends.begin(), middle, bends.end());
+      return *middle;
+    };
+    return 0.6053f * std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
   }
 
   // Share of ramps among a sample's pixels.
@@ -348,17 +355,32 @@ class Repair {
     return found > EXACT * steps;
   }
 
-  // Parts of a grid of squares, cut to the frame.
-  template <typename Wanted>
-  std::vector<Group> squares(int side, const Wanted &wanted) const {
-    std::vector<Group> found;
-    for (int y = 0; y * side < height_; y++)
-      for (int x = 0; x * side < width_; x++)
-        if (wanted(y, x)) found.push_back({{y * side, x * side, std::min(side, height_ - y * side), std::min(side, width_ - x * side)}, {}});
-    return found;
-  }
+  // Parts of the frame, side by side.
   std::vector<Group> tiles() const {
-    return squares(AREA, [](int, int) { return true; });
+    std::vector<Group> parts;
+    for (int y = 0; y < height_; y += AREA)
+      for (int x = 0; x < width_; x += AREA) parts.push_back({{y, x, std::min(AREA, height_ - y), std::min(AREA, width_ - x)}, {}});
+    return parts;
+  }
+
+  // Parts for a sample: by their distance to the nearest border, so that it is the same of a turned frame.
+  std::vector<Group> blocks(int spacing) const {
+    struct Run {
+      int start, size;
+    };
+    const auto along = [&](int size) {
+      std::vector<Run> runs;
+      for (int start = 0; start < (size + 1) / 2; start += spacing * SAMPLE_BLOCK) {
+        const int near = std::min(SAMPLE_BLOCK, (size + 1) / 2 - start), far = std::min(SAMPLE_BLOCK, size / 2 - start);
+        runs.push_back({start, near});
+        if (far > 0) runs.push_back({size - start - far, far});
+      }
+      return runs;
+    };
+    std::vector<Group> parts;
+    for (const Run &y : along(height_))
+      for (const Run &x : along(width_)) parts.push_back({{y.start, x.start, y.size, x.size}, {}});
+    return parts;
   }
 
   // Marks chosen edges, and forgets the others.
@@ -604,15 +626,21 @@ class Repair {
         if (!(marks[k] & EDGE) || !group.part.has(y, x)) continue;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
         const bool is_ramp = marks[k] & RAMP;
-        const float beside = valid(value[1] - value[0]), under = valid(value[raw.pitch] - value[0]);
-        found.length += std::sqrt(beside * beside + under * under) / gap;
+        float steepness = 0;
+        for (const int u : {-1, 1})
+          for (const int v : {-raw.pitch, raw.pitch}) {
+            const float beside = valid(value[u] - value[0]), under = valid(value[v] - value[0]);
+            steepness += std::sqrt(beside * beside + under * under);
+          }
+        found.length += 0.25f * steepness / gap;
         found.lost += (marks[k] & NEAR ? 1.0f : 0.0f) - clamp01(level);
         found.middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
-        const int direction = std::fabs(right) > std::fabs(below) + TIE * gap ? right > 0 : 2 + (below > TIE * gap);
+        const int across = std::fabs(right) > std::max(OCTANT * std::fabs(below), FLAT * gap) ? (right > 0 ? 1 : -1) : 0;
+        const int along = std::fabs(below) > std::max(OCTANT * std::fabs(right), FLAT * gap) ? (below > 0 ? 1 : -1) : 0;
         const int ring = RINGS - marks[k] / UNSURE;
         const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
-        group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * 4 + direction)});
+        group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * DIRECTIONS + 3 * along + across + DIRECTIONS / 2)});
       }
     }
     return true;
@@ -831,7 +859,7 @@ class Repair {
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
         const float score = group.judged[k].score, level = (map_.nearness[edge.i] - edge.far) / std::max(edge.near - edge.far, 1e-12f);
-        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : edge.kind / 4 % RINGS != RINGS - 1) continue;
+        if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : edge.kind / DIRECTIONS % RINGS != RINGS - 1) continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         total += weight;
         if ((score > 0) == (level > 0.5f)) agreed += weight;
@@ -846,16 +874,16 @@ class Repair {
       assumed[p] = p < RINGS ? TRUSTED : p < 2 * RINGS ? 1.0f - TRUSTED : (p - 2 * RINGS + 0.5f) / LEVELS;
       start[p] = p < 2 * RINGS ? 0.5f : assumed[p];
     }
-    const std::vector<float> together = fit(groups, 4, start, assumed);
+    const std::vector<float> together = fit(groups, DIRECTIONS, start, assumed);
     std::vector<float> each(KINDS);
-    for (int k = 0; k < KINDS; k++) each[k] = together[k / 4];
+    for (int k = 0; k < KINDS; k++) each[k] = together[k / DIRECTIONS];
     shares_ = fit(groups, 1, std::vector<float>(KINDS, 0.5f), each);
     // where the pixels beside a step are right those farther away are too
     for (int r = 1; r < RINGS; r++)
-      for (int d = 0; d < 4; d++) {
-        float *far = &shares_[r * 4 + d], *near = &shares_[(RINGS + r) * 4 + d];
-        *far = std::min(*far, far[-4]);
-        *near = std::max(*near, near[-4]);
+      for (int d = 0; d < DIRECTIONS; d++) {
+        float *far = &shares_[r * DIRECTIONS + d], *near = &shares_[(RINGS + r) * DIRECTIONS + d];
+        *far = std::min(*far, far[-DIRECTIONS]);
+        *near = std::max(*near, near[-DIRECTIONS]);
       }
   }
 
