@@ -145,7 +145,7 @@ def photograph(folder: Path, lens: Lens) -> Spot:
         )
     (folder / "capture.toml").write_text(
         f'focus_m = {FOCUS_M}\nsharp = "{1000 * FOCUS_M:.0f}mm.png"\nfocal_length_mm = {focal:.4f}\n'
-        f'f_number = {F_NUMBER}\nsensor_width_mm = {SENSOR_MM}\nname = "{lens.name} at 0.20 m"\n'
+        f'transfer = "srgb"\nf_number = {F_NUMBER}\nsensor_width_mm = {SENSOR_MM}\nname = "{lens.name} at 0.20 m"\n'
         f'[[shot]]\nfile = "{1000 * PAPER_M:.0f}mm.png"\ndistance_m = {PAPER_M}\n',
         encoding="utf-8",
     )

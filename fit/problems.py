@@ -83,7 +83,7 @@ class SaturatedError(FitError):
 
 
 class SaturatedWarning(FitWarning):
-    """Clipped pixels were left out; `number` counts them."""
+    """Clipped pixels were left out, and `number` counts them; or blacks are cut off, in `number` of the paper."""
 
 
 class WindowError(FitError):
@@ -122,7 +122,7 @@ class NotInFocusWarning(FitWarning):
 
 
 class NotLinearWarning(FitWarning):
-    """The noise falls with the level, as sRGB encoding makes it; `number` is dark noise over bright noise."""
+    """The pictures are not in linear light, or nobody said whether they are; the message says what `number` is."""
 
 
 class ResidualWarning(FitWarning):

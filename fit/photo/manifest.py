@@ -17,7 +17,7 @@ from torchdof.io.metadata import camera_facts, original_width
 from torchdof.io.transfer import Transfer
 from torchdof.validation import show
 
-from ..problems import CameraWarning, DistanceError, FitError, ManifestError, NonFiniteError, warn
+from ..problems import CameraWarning, DistanceError, FitError, ManifestError, NonFiniteError, NotLinearWarning, warn
 from ..result import Array
 from .crop import Capture, Dots, cut_pairs, size_of
 from .mosaic import PATTERNS, demosaiced
@@ -110,7 +110,7 @@ def read_captures(
     sensor_width_mm = 36.0
     full_width_px = 6000        # optional: width of the whole frame, if the pictures were cropped before
     crop = [1200, 800, 900, 900]  # optional: left, top, width, height in px; what lies outside is not looked at
-    transfer = "srgb"           # optional: "srgb" or "linear"; by default integers are sRGB, floats are linear
+    transfer = "srgb"           # "srgb" or "linear"; left out, floats are linear, and integers sRGB with a warning
     dark = "dark.png"           # optional: lens cap on, same exposure
     exposure_s = 0.02           # optional: of the sharp picture
     dots = "one"                # or "centre", "each" for a grid of dots
@@ -139,6 +139,10 @@ def read_captures(
         DistanceError: distances are not increasing, not positive, or that of the focus.
         FitError: a picture's kind of trouble, with its file.
         OSError: a picture is missing or damaged.
+
+    Warns:
+        NotLinearWarning: pictures of integers whose transfer nobody stated: they are taken for sRGB.
+        CameraWarning: the manifest contradicts EXIF.
     """
     if not isinstance(folder, str | os.PathLike):
         raise ManifestError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}")
@@ -183,11 +187,13 @@ def read_captures(
         raise ManifestError(f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', {got}", file=where)
     still, exposed = first.light, _optional(fields, "exposure_s", where)
     columns: list[list[Capture]] = []
+    encoded = [sharp.name] if first.encoded else []
     for shot, distance, file in zip(shots, distances, files, strict=True):
         moved = _read(file, transfer, darkness, crop, pattern)
         if moved.light.shape != still.shape:
             raise ManifestError(f"{file.name} is {size_of(moved.light)}, {sharp.name} is {size_of(still)}", file=where)
         _check_same_camera(first.facts, moved.facts, sharp.name, str(file))
+        encoded += [file.name] if moved.encoded else []
         second = _optional(shot, "exposure_s", where)
         columns.append(
             cut_pairs(
@@ -203,6 +209,8 @@ def read_captures(
                 (first.colours, moved.colours) if wanted == "each" else None,
             )
         )
+    if transfer is None:
+        _check_stated(encoded, where)
     camera = {name: _optional(fields, name, where) for name in ("focal_length_mm", "f_number", "sensor_width_mm")}
     from_exif = [name for name, value in camera.items() if value is None and name in first.facts]
     _check_exif(camera, first.facts, where)
@@ -247,6 +255,9 @@ def read_pair(
     Raises:
         FitError: a picture's kind of trouble, with its file.
         OSError: a picture is missing or damaged.
+
+    Warns:
+        NotLinearWarning: a picture of integers, and `transfer` is None.
     """
     for name, file in (("sharp", sharp), ("blurred", blurred)):
         if not isinstance(file, str | os.PathLike):
@@ -255,6 +266,8 @@ def read_pair(
     still, moved, files = first.light, second.light, (str(sharp), str(blurred))
     if still.shape != moved.shape:
         raise FitError(f"the pictures must have one size, got {size_of(still)} and {size_of(moved)}", file=str(blurred))
+    if transfer is None:
+        _check_stated([Path(f).name for f, p in zip(files, (first, second), strict=True) if p.encoded], None)
     return cut_pairs(still, moved, distance_m, magnification, "one", files, first.white, None, first.middle)[0]
 
 
@@ -334,6 +347,7 @@ class _Photograph:
         light: `[H, W]`.
         colours: `[C, H, W]`, whose mean it is.
         white: the level at which it is clipped, or None.
+        encoded: whether it was stored in integers, and decoded as sRGB.
         width_px: of the whole picture.
         middle: (x, y) of the whole picture's centre in px of `light`.
         facts: what EXIF says about the camera.
@@ -343,6 +357,7 @@ class _Photograph:
     light: Array
     colours: Array
     white: float | None
+    encoded: bool
     width_px: int
     middle: tuple[float, float]
     facts: Mapping[str, float]
@@ -390,7 +405,8 @@ def _read(
         facts["sensor_width_mm"] *= width / height
     original = original_width(picture.metadata)
     taken = original if original is not None and original > width else None
-    return _Photograph(light, pixels, white, width, middle, facts, taken)
+    encoded = white is not None and picture.transfer == "srgb"
+    return _Photograph(light, pixels, white, encoded, width, middle, facts, taken)
 
 
 def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | None:
@@ -401,6 +417,18 @@ def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | 
     if not whole or value[2] < 1 or value[3] < 1:
         raise ManifestError(f"crop must be [left, top, width, height] in pixels, got {show(value)}", file=where)
     return value[0], value[1], value[2], value[3]
+
+
+def _check_stated(encoded: Sequence[str], where: str | None) -> None:
+    """Warn of pictures that are decoded as sRGB because nobody said how they are encoded."""
+    if encoded:
+        more = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
+        text = (
+            f"nobody said how {encoded[0]}{more} are encoded, and they are taken for sRGB. A camera's own tone curve "
+            "or sharpening makes the kernel up to 15 % too small and need not show: develop to linear light without "
+            "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
+        )
+        warn(NotLinearWarning(text, file=where, number=float(len(encoded))), stacklevel=4)
 
 
 def _check_same_camera(first: Mapping[str, float], second: Mapping[str, float], name: str, file: str) -> None:

@@ -27,7 +27,7 @@ from .opening import hides_a_polygon, solve_image, solve_opening, solve_polygon
 from .profile_fit import fit_profile
 from .radial import solve_radial, solve_round
 from .ratio import blur_strength
-from .saturation import used_pixels
+from .saturation import check_blacks, used_pixels
 from .source import IdealDot, PictureOfDot, point_source
 
 __all__ = ["fit_pair", "prepared_pair"]
@@ -241,9 +241,11 @@ def prepared_pair(
     """
     data_dot = find_dot(data, file=files[1])
     used = used_pixels(data, data_dot, white, files[1], "blurred")
+    check_blacks(data, data_dot, files[1], "blurred")
     if still is None:
         return Forward(point_source(data.shape, data_dot), data, used, data_dot, magnification), None, False
     dot = find_dot(still, file=files[0])
+    check_blacks(still, dot, files[0], "sharp")
     whole = used_pixels(still, dot, white, files[0], "sharp", refuse=False)
     clipped = int(np.sum(~whole))
     edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)

@@ -18,7 +18,7 @@ from torchdof.io.images import read_image
 from torchdof.io.metadata import camera_facts
 from torchdof.validation import number
 
-from ..problems import DotNotFoundError, FitError, ManifestError
+from ..problems import DotNotFoundError, FitError, ManifestError, NotLinearWarning, warn
 from ..result import Array
 from .crop import Capture
 from .manifest import Captures, Colours, inside
@@ -91,6 +91,9 @@ def read_photographs(
             one has no three colours where each is asked for.
         ValueError: the square's side is none.
         OSError: a picture is damaged.
+
+    Warns:
+        NotLinearWarning: photographs of integers, too few of them to tell a tone curve.
     """
     number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
     files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *foreign.SUFFIXES))
@@ -136,7 +139,11 @@ def read_photographs(
     if integers and len(pictures) >= _FEWEST:
         tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
-        advice.append(f"{len(pictures)} photographs do not tell whether they have a tone curve: take {_FEWEST} or more")
+        text = (
+            f"{len(pictures)} photographs do not tell whether they have a tone curve, which makes the kernel up to "
+            f"15 % too small: take {_FEWEST} or more"
+        )
+        warn(NotLinearWarning(text, file=str(folder), number=float(len(pictures))))
     bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
     if any(bend):
         pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]

@@ -1,4 +1,4 @@
-"""Which pixels of a picture are clipped: at a stated level, or on a plateau that noise would not leave flat."""
+"""What is clipped: pixels at a stated level, or on a plateau that noise would not leave flat; blacks cut off at 0."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from ..problems import FitError, SaturatedError, SaturatedWarning, warn
 from ..result import Array, Mask
 from .dot import Dot
 
-__all__ = ["plateau", "used_pixels"]
+__all__ = ["check_blacks", "plateau", "used_pixels"]
 
 _MOST = 0.6  # share of the dot's pixels beyond which what is left does not fix a fit
+_CUT = 0.1  # share of the paper on the lowest level, from which on what is cut off lifts it by a twentieth of the noise
 
 
 def plateau(picture: Array, dot: Dot) -> float | None:
@@ -29,6 +30,32 @@ def plateau(picture: Array, dot: Dot) -> float | None:
         return None  # the tail of the noise, in the few levels of a file
     spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
     return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
+
+
+def check_blacks(picture: Array, dot: Dot, file: str | None, name: str) -> None:
+    """Warn where the dark paper's noise is cut off below: it is then brighter than it was, and faint light is not.
+
+    Paper without noise, and paper that keeps within a few levels of a file, lies on its lowest level by right.
+
+    Args:
+        picture: `[H, W]`.
+        dot: in it.
+        file: named in the warning.
+        name: of the picture, for the warning.
+    """
+    rows, columns = np.indices(picture.shape)
+    paper = picture[np.hypot(columns - dot.x, rows - dot.y) > dot.reach + 1]
+    levels, counts = np.unique(paper, return_counts=True)
+    if levels.size < 2 or counts[0] < _CUT * paper.size:
+        return
+    if not dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak):
+        return
+    share = float(counts[0] / paper.size)
+    text = (
+        f"{100 * share:.0f} % of the {name} picture's paper lies on its lowest level, {levels[0]:.3g}: blacks are cut "
+        "off there, and the kernel comes out up to 1 % too small; develop so that black lies above its noise"
+    )
+    warn(SaturatedWarning(text, file=file, number=share), stacklevel=5)
 
 
 def used_pixels(

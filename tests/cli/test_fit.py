@@ -2,6 +2,7 @@
 
 import functools
 import json
+import shutil
 from pathlib import Path
 from types import ModuleType
 
@@ -48,7 +49,18 @@ def test_json_holds_the_fits(folder: Path, tmp_path: Path) -> None:
     facts = json.loads(result.stdout)
     assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
     assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
-    assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"]) and isinstance(facts["warnings"], list)
+    assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"]) and facts["warnings"] == []
+
+
+def test_pictures_whose_transfer_nobody_stated_are_said(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path / "lens")
+    manifest = tmp_path / "lens" / "capture.toml"
+    manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
+    result = run(tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc")
+    assert result.exit_code == 0, result.output
+    assert "warning: " in result.output and "nobody said how 0500mm.png and 3 more are encoded" in result.output
+    result = run(tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json")
+    assert "nobody said how 0500mm.png" in json.loads(result.stdout)["warnings"][0]
 
 
 def test_a_polygon_becomes_a_table_with_its_blades(simulator: ModuleType, tmp_path: Path) -> None:

@@ -90,7 +90,7 @@ def captures_of_measuring(folder: Path, simulator: ModuleType) -> None:
     def kernel(distance_m: float) -> tuple[str, dict[str, float]]:
         return "disc", {"radius": float(camera.coc_px(torch.full((1, 1, 1, 1), distance_m), width).abs())}
 
-    dot = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0)
+    dot = simulator.Simulator(level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
     simulator.write_captures(
         lens, dot, said["focus_m"], [shot["distance_m"] for shot in said["shot"]], kernel, width, height=240
     )

@@ -230,7 +230,7 @@ def write_captures(
         pixels = torch.from_numpy(np.repeat(picture[None, None], 3, 1)).float()
         write_image(folder / name, Picture(pixels), transfer="srgb", sample="16")
         shots.append(f'[[shot]]\nfile = "{name}"\ndistance_m = {distance}\n' if i else f'sharp = "{name}"')
-    text = [f"focus_m = {focus_m}", shots[0], camera_fields, *shots[1:]]
+    text = [f"focus_m = {focus_m}", shots[0], 'transfer = "srgb"', camera_fields, *shots[1:]]
     (folder / "capture.toml").write_text("\n".join(text))
     return folder
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -161,10 +163,12 @@ def fit(
         return
     if captures is not None and captures.is_dir() and not (captures / MANIFEST).is_file():
         wanted: Literal["mean", "each"] = "each" if colours == "each" else "mean"
-        photographs = read_photographs(captures, square_mm=square_mm, colours=wanted, root=root)
+        with _heard() as doubts:
+            photographs = read_photographs(captures, square_mm=square_mm, colours=wanted, root=root)
         _tell(photographs, console)
         command = f"torchdof fit {captures.name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(photographs.captures, family, accuracy_db, command, None, console)
+        messages = [*doubts, *messages]
         _summary(photographs.captures, result, messages, console)
         _write(result.table, out, console)
         _draw_sheet(photographs, result, out.with_suffix(".png"), console)
@@ -172,12 +176,13 @@ def fit(
             facts = _facts(photographs.captures, result, messages)
             typer.echo(json_line({"out": str(out), **facts, "advice": list(photographs.advice)}))
         return
-    capture_sets = read_captures(
-        str(captures),
-        dots=None if dots == "manifest" else dots,
-        colours=None if colours == "manifest" else colours,
-        root=root,
-    )
+    with _heard() as doubts:
+        capture_sets = read_captures(
+            str(captures),
+            dots=None if dots == "manifest" else dots,
+            colours=None if colours == "manifest" else colours,
+            root=root,
+        )
     first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
     across = capture_sets[0].notes["dots"] == "field"
     fitted = []
@@ -187,6 +192,7 @@ def fit(
             console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
+        messages = [*doubts, *messages]
         first = first or result
         fitted.append((capture_set, result))
         _summary(capture_set, result, messages, console)
@@ -279,10 +285,9 @@ def _draw_sheet(photographs: Photographs, result: TableFit, target: Path, consol
 def _fit_with_progress(
     captures: Captures, family: str, accuracy_db: float, command: str, scale_of: TableFit | None, console: Console
 ) -> tuple[TableFit, list[str]]:
-    """Fits one set of captures behind a progress bar; returns the fit and the warnings, each once."""
+    """Fits one set of captures behind a progress bar; returns the fit and the warnings."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with warnings.catch_warnings(record=True) as caught, Progress(*columns, console=console, transient=True) as bar:
-        warnings.simplefilter("always", FitWarning)
+    with _heard() as doubts, Progress(*columns, console=console, transient=True) as bar:
         job = bar.add_task("fitting", total=None)
         result = fit_captures(
             captures,
@@ -292,8 +297,17 @@ def _fit_with_progress(
             command=command,
             scale_of=scale_of,
         )
-    # "auto" fits a picture several times; what it says twice is said once
-    return result, list(dict.fromkeys(str(w.message) for w in caught))
+    return result, doubts
+
+
+@contextmanager
+def _heard() -> Iterator[list[str]]:
+    """Collects warnings, which are in the list once the block has ended; what is said twice is in it once."""
+    messages = list[str]()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", FitWarning)
+        yield messages
+    messages += dict.fromkeys(str(w.message) for w in caught)
 
 
 def _summary(captures: Captures, result: TableFit, messages: list[str], console: Console) -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from torchdof.fit import Capture, Captures, fit_pair, read_captures, read_pair
 from torchdof.fit import problems as p
-from torchdof.io.images import Picture, write_image
+from torchdof.io.images import Picture, read_image, write_image
 
 
 def softness(distance):
@@ -48,8 +48,23 @@ def test_the_dark_frame_is_subtracted(folder):
 
 
 def test_transfer_is_what_the_manifest_says(folder):
-    change(folder, "focus_m = 0.5", 'focus_m = 0.5\ntransfer = "linear"')
+    change(folder, 'transfer = "srgb"', 'transfer = "linear"')
     assert read_captures(folder)[0].pairs[0].sharp.max() == pytest.approx(0.87, abs=0.03)
+
+
+def test_encoded_pictures_whose_transfer_nobody_stated_are_never_taken_in_silence(folder):
+    change(folder, 'transfer = "srgb"', "")
+    with pytest.warns(p.NotLinearWarning, match="how 0500mm.png and 2 more are encoded") as caught:
+        (captures,) = read_captures(folder)
+    assert caught[0].message.number == 3 and caught[0].message.file.endswith("capture.toml")
+    assert captures.notes["transfer"] == "by file type"
+    files = folder / "0500mm.png", folder / "1000mm.png"
+    with pytest.warns(p.NotLinearWarning, match=r"transfer = 'linear', or 'srgb'"):
+        read_pair(*files, magnification=0.5)
+    for name in ("0400mm", "0500mm", "1000mm"):
+        write_image(folder / f"{name}.exr", read_image(folder / f"{name}.png"))
+        change(folder, f"{name}.png", f"{name}.exr")
+    assert len(read_captures(folder)[0]) == 2  # floats are linear light
 
 
 def test_a_grid_gives_the_centre_dot_or_each(simulator, tmp_path):
@@ -79,7 +94,7 @@ def test_dots_closer_than_their_blur_are_refused(simulator, tmp_path):
 
 
 def test_a_pair_of_files_is_read(folder):
-    pair = read_pair(folder / "0500mm.png", folder / "1000mm.png", magnification=0.5)
+    pair = read_pair(folder / "0500mm.png", folder / "1000mm.png", magnification=0.5, transfer="srgb")
     assert pair.sharp.shape == pair.blurred.shape and pair.files[0].endswith("0500mm.png")
 
 
@@ -92,7 +107,7 @@ def test_a_pair_of_files_is_read(folder):
         ("distance_m = 0.4", 'distance_m = "near"', p.ManifestError, "must be a positive number, got 'near'"),
         ("focus_m = 0.5", "focus_m = nan", p.ManifestError, "focus_m must be a positive number"),
         ("focus_m = 0.5", "focus_m = 0.5\nfocal = 50", p.ManifestError, "'focal' is not a field; known are focus_m"),
-        ("focus_m = 0.5", 'focus_m = 0.5\ntransfer = "gamma"', p.ManifestError, "'linear' or 'srgb', got 'gamma'"),
+        ('transfer = "srgb"', 'transfer = "gamma"', p.ManifestError, "'linear' or 'srgb', got 'gamma'"),
         (
             "focus_m = 0.5",
             'focus_m = 0.5\ndots = "two"',

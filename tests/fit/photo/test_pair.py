@@ -232,7 +232,7 @@ def test_encoded_pictures_warn(simulator, snr, sigma):
         warnings.simplefilter("always")
         fit_pair(*pair, "gaussian")
     assert any(isinstance(w.message, p.NotLinearWarning | p.ResidualWarning) for w in caught)
-    assert all("linear" in str(w.message) for w in caught)
+    assert all("linear" in str(w.message) or "blacks are cut off" in str(w.message) for w in caught)
 
 
 def test_clipping_warns_and_does_not_bias(simulator):
@@ -250,6 +250,22 @@ def test_a_stated_white_is_used(simulator):
     with pytest.warns(p.SaturatedWarning):
         fit = fit_pair(sharp, blurred, "gaussian", white=0.9)
     assert off(fit, "sigma", 4.0) < 0.01
+
+
+def test_blacks_that_are_cut_off_are_said(simulator):
+    pair = simulator.Simulator(snr_db=45, dot_radius=9.0).pair("disc", {"radius": 6.0})
+    with pytest.warns(p.SaturatedWarning, match="picture's paper lies on its lowest level, 0") as caught:
+        fit_pair(*(np.maximum(picture, 0) for picture in pair), "disc", files=("a.png", "b.png"))
+    assert [w.message.file for w in caught] == ["b.png", "a.png"]
+    assert [w.message.number for w in caught] == pytest.approx([0.5, 0.5], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    "harm", [{"black": 0.01}, {"snr_db": None}, {"bits": 6, "snr_db": 50}, {"bits": 8, "black": 0.012}]
+)
+def test_blacks_that_are_not_cut_off_are_not_said(simulator, harm):
+    pair = simulator.Simulator(**{"snr_db": 46, "dot_radius": 9.0, "level": 0.8, **harm}).pair("disc", {"radius": 6.0})
+    fit_pair(*(np.maximum(picture, 0) for picture in pair), "disc")
 
 
 def test_a_dot_that_is_mostly_clipped_is_refused(simulator):
