@@ -261,7 +261,14 @@ def test_blacks_that_are_cut_off_are_said(simulator):
 
 
 @pytest.mark.parametrize(
-    "harm", [{"black": 0.01}, {"snr_db": None}, {"bits": 6, "snr_db": 50}, {"bits": 8, "black": 0.012}]
+    "harm",
+    [
+        {"black": 0.01},
+        {"snr_db": None},
+        {"bits": 6, "snr_db": None},
+        {"bits": 6, "snr_db": 50},
+        {"bits": 8, "black": 0.012},
+    ],
 )
 def test_blacks_that_are_not_cut_off_are_not_said(simulator, harm):
     pair = simulator.Simulator(**{"snr_db": 46, "dot_radius": 9.0, "level": 0.8, **harm}).pair("disc", {"radius": 6.0})
