@@ -453,6 +453,7 @@ def test_a_family_that_is_too_simple_warns(simulator):
         ({"blurred": np.zeros((81, 81))}, p.FitError, "same shape"),
         ({"family": "airy"}, p.FitError, "family must be 'auto' or one of"),
         ({"model": "guess"}, p.FitError, "model must be"),
+        ({"model": np.array([], dtype=np.float32)}, p.FitError, "model must be"),
         ({"source": "guess"}, p.FitError, "source"),
         ({"magnification": -1.0}, p.FitError, "magnification must be positive"),
         ({"white": -1.0}, p.FitError, "white is -1"),
