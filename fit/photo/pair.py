@@ -197,14 +197,14 @@ def _check_options(
     """Refuse options of :func:`fit_pair` that make no sense, by name."""
     if not isinstance(family, str) or family not in (*SHAPES, "auto"):
         raise FitError(f"family must be 'auto' or one of {', '.join(SHAPES)}, got {show(family)}")
-    if model == "ratio" and family in OPENINGS:
-        raise FitError(f"model='ratio' fits a profile over r, which {family!r} has not; use model='forward'")
     if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
         raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
     texts = isinstance(model, str) and isinstance(source, str)
     if not texts or model not in get_args(Model) or source not in get_args(SourceKind):
         got = f"got {show(model)}, {show(source)}"
         raise FitError(f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; {got}")
+    if model == "ratio" and family in OPENINGS:
+        raise FitError(f"model='ratio' fits a profile over r, which {family!r} has not; use model='forward'")
     try:
         # beyond this the dot of one picture is not seen in the other
         a_number("magnification", magnification, 1e-3, 1e3)

@@ -261,7 +261,14 @@ def test_blacks_that_are_cut_off_are_said(simulator):
 
 
 @pytest.mark.parametrize(
-    "harm", [{"black": 0.01}, {"snr_db": None}, {"bits": 6, "snr_db": 50}, {"bits": 8, "black": 0.012}]
+    "harm",
+    [
+        {"black": 0.01},
+        {"snr_db": None},
+        {"bits": 6, "snr_db": None},
+        {"bits": 6, "snr_db": 50},
+        {"bits": 8, "black": 0.012},
+    ],
 )
 def test_blacks_that_are_not_cut_off_are_not_said(simulator, harm):
     pair = simulator.Simulator(**{"snr_db": 46, "dot_radius": 9.0, "level": 0.8, **harm}).pair("disc", {"radius": 6.0})
@@ -446,6 +453,7 @@ def test_a_family_that_is_too_simple_warns(simulator):
         ({"blurred": np.zeros((81, 81))}, p.FitError, "same shape"),
         ({"family": "airy"}, p.FitError, "family must be 'auto' or one of"),
         ({"model": "guess"}, p.FitError, "model must be"),
+        ({"model": np.array([], dtype=np.float32)}, p.FitError, "model must be"),
         ({"source": "guess"}, p.FitError, "source"),
         ({"magnification": -1.0}, p.FitError, "magnification must be positive"),
         ({"white": -1.0}, p.FitError, "white is -1"),
