@@ -37,6 +37,23 @@ int mirrored(int at, int size) {
   return std::min(at, 2 * size - 1 - at);
 }
 
+// The rank-th largest of so many vectors of values, 0 if it is below that: bit by bit, for bits of positive numbers are in
+// their order.
+float ranked(int rank, const float *values, int vectors) {
+  int32_t bits = 0;
+  for (int bit = 30; bit >= 0; bit--) {
+    const int32_t more = bits | 1 << bit;
+    ivec reached = {};
+    for (int i = 0; i < vectors; i++) reached -= (ivec)load<vec>(values + i * LANES) >= more;
+    int count = 0;
+    for (int i = 0; i < LANES; i++) count += reached[i];
+    if (count >= rank) bits = more;
+  }
+  float value;
+  memcpy(&value, &bits, sizeof(value));
+  return value;
+}
+
 }  // namespace
 
 float threshold_at(const Job &job, int y, int x) {
@@ -61,14 +78,15 @@ float least_threshold(const Job &job, int y0, int x0) {
 }
 
 void Job::find_threshold() {
-  constexpr int COUNT = CELL_STEPS * CELL_STEPS;
+  constexpr int COUNT = CELL_STEPS * CELL_STEPS, VECTORS = (COUNT + LANES - 1) / LANES;
   threshold_rows = cells_of(height, threshold_top);
   threshold_columns = cells_of(width, threshold_left);
   threshold.resize((size_t)threshold_rows * threshold_columns);
   const float *light = surfaces.light, *valid = surfaces.valid;
   const size_t area = surfaces.area();
   parallel(threshold_rows, [&](int row, int) {
-    float brightest[COUNT];
+    float brightest[VECTORS * LANES];
+    std::fill(brightest + COUNT, std::end(brightest), -1.0f);
     for (int column = 0; column < threshold_columns; column++) {
       int xs[CELL_STEPS];
       for (int j = 0; j < CELL_STEPS; j++) xs[j] = mirrored(column * THRESHOLD_CELL + j * STEP + STEP / 2 - threshold_left, width);
@@ -81,9 +99,8 @@ void Job::find_threshold() {
           brightest[i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : most;
         }
       }
-      std::nth_element(brightest, brightest + COUNT / 5 - 1, brightest + COUNT, std::greater<float>());
       const float largest = 3.4028234663852886e38f;
-      threshold[(size_t)row * threshold_columns + column] = FACTOR * clamp(brightest[COUNT / 5 - 1], 0.0f, largest / FACTOR);
+      threshold[(size_t)row * threshold_columns + column] = FACTOR * std::min(ranked(COUNT / 5, brightest, VECTORS), largest / FACTOR);
     }
   });
 }
@@ -407,26 +424,36 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
     for (int py = top; py < bottom; py += PATCH)
       for (int px = left; px < right; px += PATCH) {
         const int ny = std::min(PATCH, bottom - py), nx = std::min(PATCH, right - px);
-        float blocked[PATCH][PATCH] = {};
-        for (int k : nearer) {
-          const float place = v.low + k;
-          if (may_meet(k, py, px, ny, nx))
-            add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), py, px, ny, nx, surface_light.data(), blocked);
-        }
-        for (int y = py; y < py + ny; y++) {
-          float taps[PATCH];
-          for (int c = 0; c < C; c++) {
-            if (!c || E > 1) {
-              std::fill(taps, taps + nx, 0.0f);
-              add_taps(ray.radius, 1.0f - ray.part, c, y, px, nx, taps);
-              add_taps(ray.radius + 1, ray.part, c, y, px, nx, taps);
-              const int e = E > 1 ? c : 0;
-              const float gain = gains.empty() ? 0.0f : gains[(size_t)rays[r] * E + e];
+        float taps[PATCH][PATCH], blocked[PATCH][PATCH] = {};
+        bool any = false, asked = false, all_blocked = false;
+        for (int c = 0; c < C && !all_blocked; c++) {
+          if (!c || E > 1) {
+            const int e = E > 1 ? c : 0;
+            const float gain = gains.empty() ? 0.0f : gains[(size_t)rays[r] * E + e];
+            any = false;
+            for (int i = 0; i < ny; i++) {
+              std::fill(taps[i], taps[i] + PATCH, 0.0f);
+              add_taps(ray.radius, 1.0f - ray.part, c, py + i, px, nx, taps[i]);
+              add_taps(ray.radius + 1, ray.part, c, py + i, px, nx, taps[i]);
               for (int x = 0; x < nx && gain > 0; x++)
-                if (taps[x] != 0) taps[x] *= gain * turned[e].share((float)(y - ray.row), (float)(px + x - ray.column));
+                if (taps[i][x] != 0) taps[i][x] *= gain * turned[e].share((float)(py + i - ray.row), (float)(px + x - ray.column));
+              for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(taps[i] + x));
             }
-            float *to = tile + (size_t)c * TILE * TILE + (y - y0) * TILE + (px - x0);
-            for (int x = 0; x < nx; x++) to[x] += taps[x] * (1.0f - std::min(blocked[y - py][x], 1.0f)) * light[c];
+          }
+          if (!any) continue;
+          for (size_t i = 0; i < nearer.size() && !asked && !all_blocked; i++) {
+            const float place = v.low + nearer[i];
+            if (!may_meet(nearer[i], py, px, ny, nx)) continue;
+            add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), py, px, ny, nx, surface_light.data(), blocked);
+            vec least_blocked = all(1.0f);
+            for (int y = 0; y < ny; y++)
+              for (int x = 0; x < PATCH; x += LANES) least_blocked = least(least_blocked, load<vec>(blocked[y] + x));
+            all_blocked = !any_of(least_blocked < all(1.0f));
+          }
+          asked = true;
+          for (int i = 0; i < ny && !all_blocked; i++) {
+            float *to = tile + (size_t)c * TILE * TILE + (py + i - y0) * TILE + (px - x0);
+            for (int x = 0; x < nx; x++) to[x] += taps[i][x] * (1.0f - std::min(blocked[i][x], 1.0f)) * light[c];
           }
         }
       }
