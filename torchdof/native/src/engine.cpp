@@ -29,22 +29,29 @@ Job::Job(const torchdof_scene &scene)
   }
 }
 
-// Least and largest of a block of values, where they are beyond those known.
-static void ends_of(const float *values, int pitch, int rows, int columns, float &low, float &high) {
-  vec lows = all(low), highs = all(high);
-  for (int y = 0; y < rows; y++, values += pitch) {
-    int x = 0;
-    for (; x + LANES <= columns; x += LANES) {
-      lows = least(load<vec>(values + x), lows);
-      highs = most(load<vec>(values + x), highs);
+// Least and largest value of each block of a band, whose rows are read one after the other, as they lie in memory.
+static void ends_of(const float *values, int width, int rows, float *low, float *high) {
+  const int blocks = ceil_div(width, BLOCK);
+  std::vector<float> lows((size_t)blocks * LANES, INFINITY), highs(lows.size(), -INFINITY);
+  for (int y = 0; y < rows; y++, values += width)
+    for (int i = 0; i < blocks; i++) {
+      const float *of_block = values + i * BLOCK;
+      float *const its_lows = &lows[i * LANES], *const its_highs = &highs[i * LANES];
+      if ((i + 1) * BLOCK <= width)
+        for (int x = 0; x < BLOCK; x += LANES) {
+          store(its_lows, least(load<vec>(of_block + x), load<vec>(its_lows)));
+          store(its_highs, most(load<vec>(of_block + x), load<vec>(its_highs)));
+        }
+      else
+        for (int x = 0; x < width - i * BLOCK; x++) {
+          *its_lows = std::min(*its_lows, of_block[x]);
+          *its_highs = std::max(*its_highs, of_block[x]);
+        }
     }
-    for (; x < columns; x++) {
-      low = std::min(low, values[x]);
-      high = std::max(high, values[x]);
-    }
+  for (int i = 0; i < blocks; i++) {
+    low[i] = smallest(load<vec>(&lows[i * LANES]));
+    high[i] = largest(load<vec>(&highs[i * LANES]));
   }
-  low = std::min(low, smallest(lows));
-  high = std::max(high, largest(highs));
 }
 
 // What is given, without what is not finite, and within reach of the layers.
@@ -99,28 +106,22 @@ void Job::take_scene() {
     surfaces.coc = clean_coc.data();
   }
   block_peak = Buffer<float>(surfaces.blocks.size());
-  auto find_coc_ends = [&](int by, int bx) {
-    const int y0 = by * BLOCK, x0 = bx * BLOCK, block = by * surfaces.block_columns + bx;
-    float least = NEVER, most = -NEVER;
-    ends_of(surfaces.coc + (size_t)y0 * width + x0, width, std::min(BLOCK, height - y0), std::min(BLOCK, width - x0), least, most);
-    block_low[block] = least;
-    block_high[block] = most;
-    if (least < low || most > high) beyond[by] = 1;
+  auto find_coc_ends = [&](int by) {
+    float *const lows = &block_low[by * surfaces.block_columns], *const highs = &block_high[by * surfaces.block_columns];
+    ends_of(surfaces.coc + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), lows, highs);
+    for (int i = 0; i < surfaces.block_columns; i++)
+      if (lows[i] < low || highs[i] > high) beyond[by] = 1;
   };
   std::vector<float> leasts((size_t)channels * surfaces.block_rows, INFINITY), mosts(leasts.size(), -INFINITY);
   parallel(surfaces.block_rows, [&](int by, int) {
-    for (int bx = 0; bx < surfaces.block_columns; bx++) {
-      find_coc_ends(by, bx);
-      const int y0 = by * BLOCK, x0 = bx * BLOCK, rows = std::min(BLOCK, height - y0), columns = std::min(BLOCK, width - x0);
-      float &peak = block_peak[by * surfaces.block_columns + bx];
-      peak = -INFINITY;
-      for (int c = 0; c < channels; c++) {
-        float least = INFINITY, most = -INFINITY;
-        ends_of(surfaces.light + c * area + (size_t)y0 * width + x0, width, rows, columns, least, most);
-        peak = std::max(peak, most);
-        leasts[by * channels + c] = std::min(leasts[by * channels + c], least);
-        mosts[by * channels + c] = std::max(mosts[by * channels + c], most);
-      }
+    find_coc_ends(by);
+    float *const peaks = &block_peak[by * surfaces.block_columns];
+    std::vector<float> lows(surfaces.block_columns), highs(surfaces.block_columns);
+    for (int c = 0; c < channels; c++) {
+      ends_of(surfaces.light + c * area + (size_t)by * BLOCK * width, width, std::min(BLOCK, height - by * BLOCK), lows.data(), highs.data());
+      for (int i = 0; i < surfaces.block_columns; i++) peaks[i] = c ? std::max(peaks[i], highs[i]) : highs[i];
+      leasts[by * channels + c] = *std::min_element(lows.begin(), lows.end());
+      mosts[by * channels + c] = *std::max_element(highs.begin(), highs.end());
     }
   });
   light_least.assign(channels, INFINITY);
@@ -140,9 +141,7 @@ void Job::take_scene() {
     });
     clean_coc = std::move(within);
     surfaces.coc = clean_coc.data();
-    parallel(surfaces.block_rows, [&](int by, int) {
-      for (int bx = 0; bx < surfaces.block_columns; bx++) find_coc_ends(by, bx);
-    });
+    parallel(surfaces.block_rows, [&](int by, int) { find_coc_ends(by); });
   }
   if (surfaces.valid)
     for (int i = 0; i < (int)surfaces.blocks.size(); i++) {
