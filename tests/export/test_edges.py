@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchdof import Camera, blur_by_coc
+from torchdof.depth import edges
 from torchdof.depth.edges import DepthEdges
 from torchdof.export import describe
 from torchdof.export.verification import TOLERANCE, local_range, session
@@ -21,22 +22,26 @@ KINDS = ("half-res", "near -1px", "exact")
 
 @pytest.fixture(scope="module")
 def tensors() -> tuple[Tensor, Tensor]:
-    """Posts before a wall in focus, and their coc down to -2 px: soft, a pixel too thin, and exact."""
+    """Posts and lamps before a wall in focus, and their coc down to -2 px: soft, a pixel too thin, and exact."""
     planes = [
         Plane(6.0, waves(1, mean=(0.5, 0.4, 0.3))),
         Plane(1.2, waves(3, mean=(0.35, 0.1, 0.1)), posts(67.0, 9.0, -0.4, 11.0)),
     ]
     scene = plane_scene(planes, Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.02, focus_m=6.0), (90, 141), 4)
-    near = [1.0 / degrade(scene.depth, kind) for kind in KINDS]
+    image, depth = scene.image.float().clone(), scene.depth.clone()
+    for row in range(10, 90, 16):
+        lamp = (..., slice(row, row + 3), slice(57 + row // 3, 60 + row // 3))
+        image[lamp], depth[lamp] = 50.0, 1.2
+    near = [1.0 / degrade(depth, kind) for kind in KINDS]
     coc = [-2.0 * (n - 1.0 / 6.0) / (1.0 / 1.2 - 1.0 / 6.0) for n in near]
-    return scene.image.float().repeat(len(KINDS), 1, 1, 1), torch.cat(coc).float()
+    return image.repeat(len(KINDS), 1, 1, 1), torch.cat(coc).float()
 
 
-def rendered(image: Tensor, coc: Tensor, edges: DepthEdges) -> Tensor:
+def rendered(image: Tensor, coc: Tensor, treatment: DepthEdges) -> Tensor:
     """By the plain engine, with the layers of the file."""
     plan = Plan.all(2.0, 1 / 255, rays=True)
     with torch.no_grad():
-        return blur_by_coc(image, coc, plan=plan, max_coc_px=2.0, occlusion=False, check=False, depth_edges=edges)
+        return blur_by_coc(image, coc, plan=plan, max_coc_px=2.0, occlusion=False, check=False, depth_edges=treatment)
 
 
 def error(got: np.ndarray, expected: Tensor, image: Tensor) -> float:
@@ -49,8 +54,23 @@ def test_a_file_repairs_what_the_module_repairs(
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     path, _ = exported_by_command
     image, coc = tensors
-    expected, given = (rendered(image, coc, edges) for edges in ("auto", "as given"))
+    expected, given = (rendered(image, coc, treatment) for treatment in ("auto", "as given"))
     assert [bool(d > 0.05) for d in (expected - given).abs().amax((1, 2, 3))] == [True, True, False]
+    got = session(path).run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    assert error(got, expected, image) <= TOLERANCE
+
+
+def test_a_file_learns_from_the_part_of_a_frame_that_the_module_learns_from(
+    exported_by_command: tuple[Path, str], tensors: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+    path, _ = exported_by_command
+    image, (_, thin, exact) = tensors[0][:1].repeat(1, 1, 3, 4), tensors[1].repeat(1, 1, 3, 4)
+    assert sum(image.shape[-2:]) > edges._SAMPLED
+    is_right = torch.arange(image.shape[-1]) > torch.arange(image.shape[-2])[:, None]
+    coc = torch.where(is_right, thin, exact)[None]
+    expected = rendered(image, coc, "auto")
+    assert float((expected - rendered(image, coc, "as given")).abs().max()) > 0.05
     got = session(path).run(None, {"image": image.numpy(), "coc_px": coc.numpy()})[0]
     assert error(got, expected, image) <= TOLERANCE
 

@@ -53,7 +53,7 @@ _LEAN = 2.0  # by how much likelier the far surface must be, as a logarithm: for
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
 _EXACT = 0.025  # share of wrong pixels up to which a map's steps count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind from which on each of them is asked
-_SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft
+_SOFT = 1.5  # width of its ramps from which on a map counts as soft; what compression leaves beside steps is less
 _RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
 _SAMPLED = 768  # rows and columns of a frame, together, in each of which every block calibrates a map
 _BLOCK = 32
@@ -185,7 +185,9 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     sampled_score = _judge(light, given, witness, edges, sampled)[0]
     prior = _calibrate(kind, sampled, sampled_score, given.shape[0])[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
-    is_soft = _mean_of(edges.is_ramp.float(), edges.is_edge, sampled) > _SOFT
+    climb = _climb(given, valid, edges)
+    ramps, length = (_mean_of(part, edges.is_edge, sampled) for part in (edges.is_ramp.float(), climb))
+    is_soft = ramps > _SOFT * length
     if auto:
         is_related = _is_related(given, edges, sampled, sampled_score)
         is_soft = is_soft & is_related
@@ -203,7 +205,8 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     shows_near = shows_near > 0
 
     # and what is so thin that a ramp swallowed part of its depth
-    sigma, length = _blur_of(given, valid, edges)
+    length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    sigma = _blur_of(given, edges, length)
     label = torch.where(edges.is_edge, is_near, 2.0 * given > _highest(given, 6) - _highest(-given, 6))
     label = pixels.put(label.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
     level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
@@ -423,21 +426,20 @@ def _calibrate(kind: Tensor, sampled: Tensor, score: Tensor, items: int) -> Tens
     return torch.cat([torch.stack(far + near, 1), shares[:, 2 * _RINGS :]], 1).flatten()
 
 
-def _blur_of(nearness: Tensor, valid: Tensor, edges: _Edges) -> tuple[Tensor, Tensor]:
-    """Standard deviation in pixels of the blur that made ramps of an item's steps, and the steps' length in pixels.
-
-    Both ``[B, 1, 1, 1]``. The length is the sum of gradients; ramps are as wide as they are longer in pixels than it.
-    """
-    gap = (edges.near - edges.far).clamp_min(1e-12)
+def _climb(nearness: Tensor, valid: Tensor, edges: _Edges) -> Tensor:
+    """Part of a step that edge pixels climb, ``[B, 1, H, W]``: summed, it is the length of the steps in pixels."""
     across, along = _changes(nearness, valid, -1), _changes(nearness, valid, -2)
     beside = [functional.pad(across, ends) for ends in ((1, 0), (0, 1))]
     below = [functional.pad(along, (0, 0, *ends)) for ends in ((1, 0), (0, 1))]
-    steepness = sum(torch.hypot(a, b) for a in beside for b in below)
-    climb = torch.where(edges.is_edge, 0.25 * steepness / gap, 0.0)
-    length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
-    middle = edges.is_edge & (((nearness - edges.far) / gap - 0.5).abs() < 0.25)
-    sigma = middle.sum((1, 2, 3), keepdim=True) / (_MIDDLE_HALF * length)
-    return sigma.clamp(0.2, 3.0), length
+    steepness = 0.25 * sum(torch.hypot(a, b) for a in beside for b in below)
+    return torch.where(edges.is_edge, steepness / (edges.near - edges.far).clamp_min(1e-12), 0.0)
+
+
+def _blur_of(nearness: Tensor, edges: _Edges, length: Tensor) -> Tensor:
+    """Standard deviation in pixels, ``[B, 1, 1, 1]``, of the blur that made ramps of an item's steps of this length."""
+    level = (nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12)
+    middle = edges.is_edge & ((level - 0.5).abs() < 0.25)
+    return (middle.sum((1, 2, 3), keepdim=True) / (_MIDDLE_HALF * length)).clamp(0.2, 3.0)
 
 
 def _unmix(

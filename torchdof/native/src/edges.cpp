@@ -14,7 +14,7 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 9, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, FLAT = 0.017f, OCTANT = 0.41421f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, FLAT = 0.017f, OCTANT = 0.41421f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 1.5f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr float NOISES = 12.0f;
 constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 768, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8;
@@ -282,7 +282,7 @@ class Repair {
     judge(sampled);
     decide(sampled);
     calibrate(sampled);
-    const bool is_soft = ramps_of(sampled) > SOFT;
+    const bool is_soft = width_of_ramps(sampled) > SOFT;
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
     parallel(height_, [&](int y) {
       memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
@@ -333,14 +333,27 @@ class Repair {
     return 0.6053f * std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
   }
 
-  // Share of ramps among a sample's pixels.
-  double ramps_of(const std::vector<Group> &sampled) const {
-    double ramps = 0, all = 0;
-    for (const Group &group : sampled) {
-      all += (double)group.edges.size();
-      for (const Edge &edge : group.edges) ramps += marks_[edge.i] & RAMP ? 1 : 0;
-    }
-    return ramps / std::max(all, 1.0);
+  // Pixels on ramps of a sample for each of its steps' length.
+  double width_of_ramps(const std::vector<Group> &sampled) const {
+    double ramps = 0, length = 0;
+    for (const Group &group : sampled)
+      each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
+        const float *value = map_.nearness + edge.i;
+        ramps += marks_[edge.i] & RAMP ? 1 : 0;
+        length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, edge.near - edge.far);
+      });
+    return ramps / std::max(length, 1e-12);
+  }
+
+  // Part of a step that a pixel climbs, by the places of its neighbours: summed, the length of the step in pixels.
+  static float climb(const float *value, int left, int right, int above, int below, float gap) {
+    float steepness = 0;
+    for (const int u : {left, right})
+      for (const int v : {above, below}) {
+        const float across = valid(value[u] - value[0]), along = valid(value[v] - value[0]);
+        steepness += std::sqrt(across * across + along * along);
+      }
+    return 0.25f * steepness / std::max(gap, 1e-12f);
   }
 
   // Whether more of a sample's pixels at steps are wrong than exact maps have.
@@ -626,13 +639,7 @@ class Repair {
         if (!(marks[k] & EDGE) || !group.part.has(y, x)) continue;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
         const bool is_ramp = marks[k] & RAMP;
-        float steepness = 0;
-        for (const int u : {-1, 1})
-          for (const int v : {-raw.pitch, raw.pitch}) {
-            const float beside = valid(value[u] - value[0]), under = valid(value[v] - value[0]);
-            steepness += std::sqrt(beside * beside + under * under);
-          }
-        found.length += 0.25f * steepness / gap;
+        found.length += climb(value, -1, 1, -raw.pitch, raw.pitch, gap);
         found.lost += (marks[k] & NEAR ? 1.0f : 0.0f) - clamp01(level);
         found.middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
