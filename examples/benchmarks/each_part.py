@@ -3,8 +3,9 @@
 Usage: python examples/benchmarks/each_part.py [SCENES] [--made 8]
 
 ``SCENES`` is a folder of scenes with known truth, as ``torchdof bench --truth`` takes it. Beside them stand as many
-scenes as ``--made`` says, of textured planes, that are made by their number: nothing was chosen by looking at them. The
-plain engine renders, at a tolerance of 1/255; whole frames are compared.
+scenes as ``--made`` says, of textured planes, and as many of strands about as thin as a pixel, that are made by their
+number: nothing was chosen by looking at them. The plain engine renders, at a tolerance of 1/255; whole frames are
+compared.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from torchdof import depth_of_field
 from torchdof.reference import metrics
-from torchdof.reference.scenes import Plane, Scene, camera_of, plane_scene, posts, read_scenes, waves
+from torchdof.reference.scenes import Plane, Scene, camera_of, plane_scene, posts, read_scenes, strands, waves
 from torchdof.render import highlights, surfaces
 from torchdof.render.matting import Matted
 from torchdof.render.plan import Plan
@@ -48,6 +49,26 @@ def made_scene(seed: int) -> Scene:
     furthest_off = max(abs(1 / focus_m - 1 / plane.depth_m) for plane in planes)
     camera = camera_of(400.0, SIZE[1], widest_px / (400.0 * furthest_off), focus_m)
     return plane_scene(planes, camera, SIZE, SAMPLES, f"made/{seed}")
+
+
+def strand_scene(seed: int) -> Scene:
+    """Wires of any direction or, on every second one, hair before lamps; the focus is on these or on the wall."""
+    draw = random.Random(seed)
+    lines: list[tuple[float, float, float, float]] = []
+    widths_px: list[float] = []
+    for _ in range(24 if seed % 2 else 9):
+        angle = draw.uniform(1.2, 1.9) if seed % 2 else draw.uniform(0.0, math.pi)
+        x, y = draw.uniform(0.0, SIZE[1]), draw.uniform(0.1, 0.9) * SIZE[0]
+        dx, dy = 400.0 * math.cos(angle), 400.0 * math.sin(angle)
+        lines.append((x - dx, y - dy, x + dx, y + dy))
+        widths_px.append(draw.uniform(0.3, 0.8 if seed % 2 else 1.5))
+    light = waves(seed + 100, [draw.uniform(0.02, 1.0)] * 3, contrast=0.5)
+    wall = waves(seed, shortest_px=draw.uniform(5.0, 10.0))
+    planes = [Plane(draw.uniform(3.0, 6.0), _lamps(seed, wall) if seed % 2 else wall)]
+    planes.append(Plane(draw.uniform(0.8, 1.6), light, strands(lines, widths_px)))
+    furthest_off = abs(1 / planes[0].depth_m - 1 / planes[1].depth_m)
+    camera = camera_of(400.0, SIZE[1], draw.uniform(5.0, 12.0) / (400.0 * furthest_off), draw.choice(planes).depth_m)
+    return plane_scene(planes, camera, SIZE, SAMPLES, f"strands/{seed}")
 
 
 def _lamps(seed: int, behind: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
@@ -137,7 +158,8 @@ def psnr(scene: Scene) -> float:
 
 def table(scenes: Sequence[Scene]) -> None:
     """Prints means over each scene's settings and over all that were read; below, what they are more without a part."""
-    groups: dict[str, list[Scene]] = {"all read": [scene for scene in scenes if not scene.name.startswith("made/")]}
+    read = [scene for scene in scenes if not scene.name.startswith(("made/", "strands/"))]
+    groups: dict[str, list[Scene]] = {"all read": read}
     for scene in scenes:
         groups.setdefault(scene.name.split("/")[0], []).append(scene)
     groups = {name: group for name, group in groups.items() if group}
@@ -156,11 +178,13 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("scenes", type=Path, nargs="?", help="folder of scenes, as torchdof bench --truth takes it")
-    parser.add_argument("--made", type=int, default=8, help="how many scenes are made; by default %(default)s")
+    parser.add_argument(
+        "--made", type=int, default=8, help="how many scenes of each kind are made; by default %(default)s"
+    )
     arguments = parser.parse_args()
     os.environ["TORCHDOF_ENGINE"] = "torch"  # the one whose functions are exchanged
     scenes = [] if arguments.scenes is None else list(read_scenes(arguments.scenes))
-    scenes += [made_scene(seed) for seed in range(arguments.made)]
+    scenes += [make(seed) for make in (made_scene, strand_scene) for seed in range(arguments.made)]
     if not scenes:
         parser.error("there is nothing to measure: name a folder of scenes, or make some")
     table(scenes)

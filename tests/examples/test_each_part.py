@@ -1,5 +1,6 @@
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -30,9 +31,10 @@ def test_a_part_is_switched_off_only_as_long_as_is_asked_for(part: str) -> None:
     assert [getattr(owner, name) for owner, name, _ in each_part.PARTS[part]] == before
 
 
-def test_a_made_scene_has_several_surfaces_of_which_one_is_in_focus(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("make", [each_part.made_scene, each_part.strand_scene])
+def test_a_made_scene_has_several_surfaces_of_which_one_is_in_focus(monkeypatch: pytest.MonkeyPatch, make: Any) -> None:
     monkeypatch.setattr(each_part, "SIZE", (16, 40))
     monkeypatch.setattr(each_part, "SAMPLES", 4)
-    blurs = each_part.made_scene(1).coc_px.unique()
+    blurs = make(1).coc_px.unique()
     assert len(blurs) > 1 and float(blurs.abs().min()) < 1e-3
-    assert torch.equal(each_part.made_scene(1).truth, each_part.made_scene(1).truth)
+    assert torch.equal(make(1).truth, make(1).truth)

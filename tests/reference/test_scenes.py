@@ -7,7 +7,7 @@ import torch
 
 from torchdof.optics.camera import Camera
 from torchdof.reference import metrics
-from torchdof.reference.scenes import Plane, camera_of, plane_scene, posts, read_scenes, waves
+from torchdof.reference.scenes import Plane, camera_of, plane_scene, posts, read_scenes, strands, waves
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
 CAMERA = camera_of(200.0, 96, aperture_radius_m=0.02, focus_m=1.0)
@@ -88,3 +88,14 @@ def test_camera_of_a_frame_and_of_its_crop_blur_alike() -> None:
     whole, crop = (camera_of(500.0, w, 0.01, 1.0).coc_px(depth, w) for w in (640, 64))
     torch.testing.assert_close(whole, crop, rtol=1e-6, atol=0)
     assert isinstance(camera_of(500.0, 64, 0.01, 1.0), Camera)
+
+
+def test_a_strand_covers_as_much_as_its_width_and_depth_misses_parts_of_it() -> None:
+    width_px, angle = 0.5, 0.4
+    away = 100.0 * math.cos(angle), 100.0 * math.sin(angle)
+    wire = strands([(30.0 - away[0], 20.0 - away[1], 30.0 + away[0], 20.0 + away[1])], [width_px])
+    planes = [Plane(4.0, lambda x, y: torch.zeros(1, *x.shape)), Plane(1.0, lambda x, y: torch.ones(1, *x.shape), wire)]
+    scene = plane_scene(planes, CAMERA, (40, 60), samples=512)
+    columns = scene.image[0, 0].sum(0)  # of a slanted strand the cut is longer than its width
+    torch.testing.assert_close(columns, torch.full((60,), width_px / math.cos(angle)), rtol=0.02, atol=0)
+    assert 10 < int((scene.depth[0, 0] == 1.0).any(0).sum()) < 50
