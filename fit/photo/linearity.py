@@ -9,6 +9,7 @@ from torchdof.io.transfer import decode, encode
 
 from ..problems import NotInFocusWarning, NotLinearWarning, warn
 from ..result import Array
+from .description import kernel_lists
 from .diagnostics import left_open, unexplained
 from .dot import Dot, mixed_differences, noise_inside, noise_of
 from .dot_model import Edge, soft_edge, with_softness
@@ -38,6 +39,9 @@ _MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
 _DRAWN = 1e-3  # of the level; less is left of pictures without noise, whose edges were drawn in another way
 _BENT, _BENT_CHI = 0.075, 30.0  # of a curve of 20 %, what the fit does not take up; chi squared of two parameters
 _STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same where the sharp dot's edge agrees
+_CURVED, _CURVED_CHI = 0.03, 11.0  # half of what a curve of 20 % leaves at the expected size; once in 2000 by chance
+_RESIZED = 0.015  # another magnification than that by so much is not a weak tone curve, which makes it 1.002 to 1.006
+_CLEARER = 4.0  # chi squared by which a curve explains more than another magnification of the dot
 _STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
 
@@ -108,42 +112,71 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
     return True
 
 
-def check_levels(pair: Forward, solution: Solution, edge: Edge, file: str | None, stacklevel: int = 4) -> bool:
+def check_levels(
+    pair: Forward, solution: Solution, held: Solution, edge: Edge, file: str | None, stacklevel: int = 4
+) -> bool:
     """Whether what a fit leaves has nothing to do with the level; warns where a tone curve would explain it.
 
     No kernel makes all places of one level brighter, and all of another darker. A tone curve does, also one so weak
     that the residual hardly grows. What the fit's own parameters could have taken up is left out. In a JPEG less shows
-    it; there the sharp dot's edge, a little steeper than pixels can be, is a second witness.
+    it; there the sharp dot's edge, a little steeper than pixels can be, is a second witness. And a fitted
+    magnification takes up most of it: so what the dot leaves at its expected size is looked at, too. Where a curve
+    explains more of that than another size does, it is said.
 
     Args:
         pair: the pictures.
         solution: what was found.
+        held: the same with the magnification that was expected; `solution` again where that was not fitted, or fitted
+            because it was asked for.
         edge: of the sharp dot.
         file: named in the warning.
         stacklevel: where the warning points.
     """
-    light = np.clip(_light(solution, edge.level).ravel()[pair.flat], 0.0, 1.0)
-    encoded = encode(torch.from_numpy(light)[None, None, None], "srgb", False, False)
-    step = 1e-3  # of the encoded level
-    steeper = (decode(encoded + step, "srgb", False, False) - decode(encoded - step, "srgb", False, False)) / (2 * step)
-    e, slope = encoded.flatten().numpy(), solution.gain * edge.level * steeper.flatten().numpy()
-    # brighter all over, and an S-curve's contrast
-    curves = np.stack([slope * e * (1 - e), -slope * e * (1 - e) * (1 - 2 * e)], axis=1)
+    curves = _curves(pair, solution, edge.level)
     found, spread = unexplained(pair, solution, curves)
     seen = left_open(pair, solution, curves)
     bend = np.linalg.lstsq(seen.T @ seen, found, rcond=None)[0]
     chi_squared = float(found @ np.linalg.pinv(spread) @ found)
     steep = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)
     agrees = edge.steepness > _STEEP_TOO and steep > 1 and chi_squared + steep**2 > _BENT_CHI_TOO
-    if float(np.linalg.norm(bend)) < _BENT or not (chi_squared > _BENT_CHI or agrees):
+    resized = abs(solution.moves["magnification"] / held.moves["magnification"] - 1) > _RESIZED
+    bent = float(np.linalg.norm(bend)) > _BENT and (chi_squared > _BENT_CHI or agrees)
+    if not bent and (resized or not _curved(pair, held, edge.level, steep)):
         return True
     text = (
-        f"what the fit leaves goes with the level, as under a tone curve (an S-curve of {100 * abs(bend[1]):.0f} %, a "
-        "picture style): then the kernel is 5 % too small and more; develop without it. Colours that are blurred "
-        f"unlike each other leave as much (colours = 'each'), and a blur that is not of family {solution.family!r}"
+        "what the fit leaves goes with the level, "
+        + ("" if bent else "were the dot as large as expected, ")
+        + "as under a tone curve (an S-curve, a picture style): then the kernel is 5 % too small and more; develop "
+        "without it. Colours that are blurred unlike each other leave as much (colours = 'each'), and a blur that is "
+        f"not of family {solution.family!r}"
     )
     warn(NotLinearWarning(text, file=file, number=float(bend[1])), stacklevel)
     return False
+
+
+def _curved(pair: Forward, held: Solution, level: float, steep: float) -> bool:
+    """Whether an S-curve explains what the expected magnification leaves, and better than another one does.
+
+    The sharp dot's edge, so many standard errors steeper than pixels can be, speaks for the curve, too.
+    """
+    kernel = pair.kernels(held.family, kernel_lists(held))
+    larger = held.gain * pair.move_columns({**held.params, **held.moves}, ("magnification",), kernel)[0]
+    basis = np.stack([_curves(pair, held, level)[:, 1], larger], axis=1)
+    found, spread = unexplained(pair, held, basis)
+    contrast, size = np.sign(found) * found**2 / np.maximum(np.diag(spread), np.finfo(float).tiny)
+    strength = found[0] / np.sum(left_open(pair, held, basis)[:, 0] ** 2)
+    clearer = contrast + steep * abs(steep) - abs(size) > _CLEARER
+    return bool(strength > _CURVED and contrast > _CURVED_CHI and clearer)
+
+
+def _curves(pair: Forward, solution: Solution, level: float) -> Array:
+    """What a weak tone curve adds to a fit's pixels `[pixels used, 2]`: brighter all over, an S-curve's contrast."""
+    light = np.clip(_light(solution, level).ravel()[pair.flat], 0.0, 1.0)
+    encoded = encode(torch.from_numpy(light)[None, None, None], "srgb", False, False)
+    step = 1e-3  # of the encoded level
+    steeper = (decode(encoded + step, "srgb", False, False) - decode(encoded - step, "srgb", False, False)) / (2 * step)
+    e, slope = encoded.flatten().numpy(), solution.gain * level * steeper.flatten().numpy()
+    return np.stack([slope * e * (1 - e), -slope * e * (1 - e) * (1 - 2 * e)], axis=1)
 
 
 def _light(solution: Solution, level: float) -> Array:

@@ -149,21 +149,22 @@ def fit_pair(
     pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
     why, psnr = "", dict[str, float]()
     if family in ("auto", "radial", *OPENINGS) and aperture is None:
-        solution = freest = _solve_radial(pair, held, knots, reach)
+        expected, solution = _solve_radial(pair, held, knots, reach)
+        freest = solution
         if family == "auto":
             solution, why, psnr = _choose(pair, freest, accuracy_db)
             found = solve_opening(pair, freest)
             if found is not None and not _alike((pair, solution), found[:2], accuracy_db):
                 pair, solution, why = found
-                freest = solution
+                freest = expected = solution
             elif found is None and hides_a_polygon(pair, freest):
                 why += "; a hexagon would not have been told from it in this noise"
         elif family != "radial":
             pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
-            freest = solution
+            freest = expected = solution
     else:
         pair.opening = aperture
-        solution = freest = pair.solve(family)
+        solution = freest = expected = pair.solve(family)
         if held is None and _improves(pair, solution, free := _with_magnification(pair).solve(family)):
             pair.fit_moves, solution, freest = ALL_MOVES, free, free
     fit = describe(pair, solution, why)
@@ -173,10 +174,12 @@ def fit_pair(
     # what demosaicing leaves at an edge is louder than what it leaves of the noise
     if edge is not None and linear and pair.fine_share > _FINE:
         linear = check_noise(pair, solution, edge.level, files[1])
-    # a residual far above the noise was said already, whatever it goes with
+    # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed, and
+    # what that leaves goes with the level, too
+    most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
     large = edge is not None and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
-    if edge is not None and linear and large and judged.residual_over_noise < FAR_ABOVE:
-        check_levels(pair, freest, edge, files[1])
+    if edge is not None and linear and large and judged.residual_over_noise < most:
+        check_levels(pair, freest, expected, edge, files[1])
     if edge is not None:
         check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)
@@ -305,15 +308,20 @@ def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
     return (held.squares - free.squares) / floor * independent_share(pair.noise_correlation) > _SIGNIFICANT
 
 
-def _solve_radial(pair: Forward, held: bool | None, knots: int | None, reach: float | None) -> Solution:
-    """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`."""
-    solution = solve_round(pair, knots, reach)
+def _solve_radial(
+    pair: Forward, held: bool | None, knots: int | None, reach: float | None
+) -> tuple[Solution, Solution]:
+    """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`.
+
+    The first is that with the expected magnification.
+    """
+    expected = solution = solve_round(pair, knots, reach)
     if held is None:
         free = solve_radial(_with_magnification(pair), solution, float(solution.params["radius"]), knots)
         if _improves(pair, solution, free):
             pair.fit_moves, solution = ALL_MOVES, free
     pair.held_magnification = solution.moves["magnification"]
-    return solution
+    return expected, solution
 
 
 def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:

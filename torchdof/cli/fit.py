@@ -313,11 +313,11 @@ def _heard() -> Iterator[list[str]]:
 def _summary(captures: Captures, result: TableFit, messages: list[str], console: Console) -> None:
     """Prints a table of the fits at all distances, why the family was chosen, and the warnings."""
     shown = Table(
-        title=f"{captures.name or 'captures'}: {result.table.family}, focus {captures.focus_m:g} m",
+        title=f"{captures.name or 'captures'}: {result.fits[0].family}, focus {captures.focus_m:g} m",
         title_justify="left",
     )
     names = [n for n in result.fits[0].params if n != "values"]
-    for column in ("distance m", "coc px", "measured", *names, "residual %", "x noise", "magnification"):
+    for column in ("distance m", "coc px", "measured", *names, "residual %", "x noise", "magnified"):
         shown.add_column(column, justify="right")
     for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True):
         values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
@@ -368,7 +368,7 @@ def _facts(captures: Captures, result: TableFit, messages: list[str]) -> dict[st
         }
         for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True)
     ]
-    chosen = {"name": captures.name, "family": result.table.family, "why": result.why, "scale": result.scale}
+    chosen = {"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale}
     colours = [
         {
             "name": colour.name,

@@ -1,6 +1,7 @@
 """The forward model on simulated captures: what it recovers, what it says about itself, and what it refuses."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -323,7 +324,7 @@ def test_a_tone_curve_is_named_and_not_taken_for_a_lack_of_focus(simulator, seed
 
 def test_a_tone_curve_behind_a_demosaiced_edge_shows_in_the_residual_or_the_noise(simulator):
     # its edge is soft, so that nothing is steeper than pixels can be
-    pair = simulator.Simulator(tone=0.5, level=0.8, bayer=True, size=91).pair("gaussian", {"sigma": 3.0}, 1)
+    pair = simulator.Simulator(tone=0.5, level=0.8, black=0.03, bayer=True, size=91).pair("gaussian", {"sigma": 3.0}, 1)
     with pytest.warns((p.NotLinearWarning, p.ResidualWarning), match="linear|tone curve"):
         fit_pair(*pair, "gaussian")
 
@@ -338,6 +339,16 @@ def test_a_weak_tone_curve_in_a_jpeg_shows_in_what_goes_with_the_level(simulator
     camera = simulator.Simulator(tone=0.2, level=0.8, size=91, jpeg=90, black=0.02, bayer=bayer)
     with pytest.warns(p.NotLinearWarning, match="goes with the level, as under a tone curve"):
         fit_pair(*camera.pair(family, params, seed), family, fit_magnification=False)
+
+
+@pytest.mark.parametrize(("family", "params"), [("ring", {"sigma": 3.0, "r_c": 4.0}), ("gaussian", {"sigma": 3.0})])
+def test_a_weak_tone_curve_does_not_pass_for_a_dot_of_another_size(simulator, family, params):
+    jpeg = simulator.Simulator(level=0.8, size=91, jpeg=90, black=0.02)
+    with pytest.warns(p.NotLinearWarning, match="goes with the level, were the dot as large as expected"):
+        fit_pair(*replace(jpeg, tone=0.2).pair(family, params, 101), family)
+    # a lens that breathes is no tone curve
+    fit = fit_pair(*replace(jpeg, magnification=1.02).pair(family, params, 101), family)
+    assert fit.magnification == pytest.approx(1.02, abs=0.005)
 
 
 @pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # there is no noise to hide behind
