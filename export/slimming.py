@@ -255,12 +255,13 @@ class _Splits(onnx_ir.passes.InPlacePass):
                 continue
             whole, kept = cut.inputs[0], cut.outputs[0].shape
             alike = [a == b for a, b in zip(whole.shape, kept, strict=True)]
-            first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in (cut.inputs[1], node.inputs[1]))
+            bounds: list[Any] = [cut.inputs[1], node.inputs[1]]
+            first, sizes = (onnx_ir.convenience.get_const_tensor(value) for value in bounds)
             if first is None or sizes is None or first.numpy().any() or alike != [True, False, True, True]:
                 continue
             parts = np.array([*sizes.numpy(), whole.shape[1] - kept[1]])
-            sizes = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
-            split = onnx_ir.node("Split", [whole, sizes], {"axis": 1}, num_outputs=len(parts))
+            of_all = _initializer(graph, parts, f"{node.outputs[0].name}_sizes")
+            split = onnx_ir.node("Split", [whole, of_all], {"axis": 1}, num_outputs=len(parts))
             graph.insert_before(node, [split])
             for old, new in zip(node.outputs, split.outputs, strict=False):
                 new.type, new.shape = old.type, old.shape

@@ -160,7 +160,7 @@ def _curved(pair: Forward, held: Solution, level: float, steep: float) -> bool:
     The sharp dot's edge, so many standard errors steeper than pixels can be, speaks for the curve, too.
     """
     kernel = pair.kernels(held.family, kernel_lists(held))
-    larger = held.gain * pair.move_columns({**held.params, **held.moves}, ("magnification",), kernel)[0]
+    larger = held.gain * pair.move_columns(held.moves, ("magnification",), kernel)[0]
     basis = np.stack([_curves(pair, held, level)[:, 1], larger], axis=1)
     found, spread = unexplained(pair, held, basis)
     contrast, size = np.sign(found) * found**2 / np.maximum(np.diag(spread), np.finfo(float).tiny)

@@ -37,7 +37,7 @@ np.save(sys.argv[3], out)
 def test_1080p_is_rendered_right_with_less_than_0_7_gb(layered: Any, tmp_path: Path) -> None:
     """In a process as those who deploy have it: onnxruntime and numpy, no PyTorch."""
     assert layered.dof.max_coc_px == 16.0
-    feed = exported.feed(exported.session(str(layered.path), threads=1), SIZE, "blurred background")
+    feed: dict[str, Any] = exported.feed(exported.session(str(layered.path), threads=1), SIZE, "blurred background")
     np.savez(tmp_path / "feed.npz", **feed)
     call = [sys.executable, "-c", RENDER, str(layered.path), str(tmp_path / "feed.npz"), str(tmp_path / "out.npy")]
     done = subprocess.run(call, capture_output=True, text=True, timeout=300)
