@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import Camera, DepthOfField, blur_by_coc, native
@@ -64,6 +65,21 @@ def test_what_compression_leaves_beside_steps_is_no_ramp(
     assert torch.equal(repair_edges(scene.image, depth, "auto"), depth)
     soft = compressed(degrade(scene.depth, "half-res"), quantum)
     assert wrong(repair_edges(scene.image, soft, "auto"), scene.depth) < 0.5 * wrong(soft, scene.depth)
+
+
+@pytest.mark.parametrize("engine", ["torch", pytest.param("native", marks=compiled)])
+def test_means_over_edges_are_ramps_though_they_are_narrow(
+    scene: Scene, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As depth is that was made smaller with its image, or rendered with smooth edges."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    image = functional.avg_pool2d(scene.image, 2)
+    depth = 1 / functional.avg_pool2d(1 / scene.depth, 2)
+    nearest = -functional.max_pool2d(-scene.depth, 2), functional.max_pool2d(scene.depth, 2)
+    repaired = repair_edges(image, depth, "auto")
+    between = [((d > 1.1 * nearest[0]) & (d < nearest[1] / 1.1)).float().mean() for d in (depth, repaired)]
+    assert between[0] > 0.05
+    assert between[1] < 0.3 * between[0]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +182,7 @@ def test_a_turned_map_is_repaired_as_it_is_unturned(
 ) -> None:
     """Its sizes are odd; a sample that is not turned with it meets other damage and noise."""
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-    monkeypatch.setattr(edges, "_SAMPLED", 128)  # else the plain engine looks at all of a small frame
+    monkeypatch.setattr(edges, "_SAMPLED", 2**12)  # else the plain engine looks at all of a small frame
     image = scene.image.repeat(1, 1, *times)[..., :-1, :-3]
     exact, damaged = (
         scene.camera.coc_px(degrade(scene.depth, k), 192).repeat(1, 1, *times)[..., :-1, :-3] for k in ("exact", kind)
@@ -324,7 +340,7 @@ def test_engines_agree(scene: Scene, kind: str, auto: bool) -> None:
 def test_engines_agree_on_frames_of_which_a_part_decides(scene: Scene, kind: str, is_exact: bool) -> None:
     image = scene.image.repeat(1, 1, 6, 5)
     nearness = -scene.camera.coc_px(degrade(scene.depth, kind), 192).repeat(1, 1, 6, 5)
-    assert sum(nearness.shape[-2:]) > 2 * edges._SAMPLED
+    assert nearness[0, 0].numel() > 4 * edges._SAMPLED
     plain = edges._repair(image, nearness, torch.tensor(1.0), True)[0, 0]
     fast = native.repair_edges(image[0], nearness[0, 0], torch.tensor(1.0), True)
     assert torch.equal(fast, nearness[0, 0]) == torch.equal(plain, nearness[0, 0]) == is_exact

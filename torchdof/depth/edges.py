@@ -36,9 +36,8 @@ _FALLOFF_PX = 2.5
 _ABRUPT = 0.3  # part of a step that lies between two neighbours
 _SURE = (0.0, 0.02, 0.06, 0.2, 1.0)  # weight of a pixel as witness, by ring; beside an edge it may be wrong itself
 _RAMP_REACH = 6  # half the width of the widest ramp that is one, not a slope
-_FLAT = 0.017  # part of a step from which on one of its directions counts: off the multiples of 1/25 that means are
-_OCTANT = 0.41421  # tangent of 22.5 degrees: a direction closer to an axis lies along it
-_DIRECTIONS = 9
+_TIE = 0.017  # part of a step by which directions must differ: off the multiples of 1/25 that means of steps are
+_DIRECTIONS = 5
 _SHALLOW = 0.03  # slope, of what lies between the surfaces around, from which on it belongs to a ramp
 _LEVELS = 6  # places on a ramp that are calibrated apart
 _PLACES = 2 * _RINGS + _LEVELS
@@ -53,9 +52,11 @@ _LEAN = 2.0  # by how much likelier the far surface must be, as a logarithm: for
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
 _EXACT = 0.025  # share of wrong pixels up to which a map's steps count as exact
 _DOUBTFUL = 0.05  # share of wrong pixels of a kind from which on each of them is asked
-_SOFT = 1.5  # width of its ramps from which on a map counts as soft; what compression leaves beside steps is less
+_SOFT = 0.1  # share of ramps among the pixels of edges from which on a map counts as soft, if its ramps are either
+_WIDE = 1.5  # so wide in pixels, or
+_MIXED = 0.5  # to such a part far from both surfaces: compression leaves narrow ones near one of them
 _RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
-_SAMPLED = 768  # rows and columns of a frame, together, in each of which every block calibrates a map
+_SAMPLED = 2**17  # pixels of a frame among which a map is calibrated, in blocks
 _BLOCK = 32
 _NEVER = 1e30
 _LARGEST = 1e15  # nearness, and light, whose squares are numbers too: beyond it the one is none, the other no brighter
@@ -70,7 +71,7 @@ class _Edges(NamedTuple):
     is_ramp: Tensor  # the map passes from one to the other here
     ring: Tensor  # how many pixels from a step: 1 is beside it; one more than there are: none is near
     is_edge: Tensor
-    direction: Tensor  # towards the near surface: one of the eight neighbours, row by row, or none, the middle
+    direction: Tensor  # towards the near surface: up, left, none (it lies diagonally), right or down
 
 
 def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> Tensor:
@@ -178,16 +179,20 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     witness = given.new_tensor(_SURE)[edges.ring] * (valid & ~edges.is_ramp)
 
     # how far the map can be trusted, at each kind of place on an edge: from part of the frame
-    spacing = (sum(given.shape[-2:]) + _SAMPLED - 1) // _SAMPLED
-    rows, columns = (_from_border(n, given.device) // _BLOCK % spacing == 0 for n in given.shape[-2:])
-    sampled = pixels.indices(edges.is_edge & rows[:, None] & columns)
+    height, width = given.shape[-2:]
+    every = (height * width + _SAMPLED - 1) // _SAMPLED
+    rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
+    sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
     kind = _kind(given, edges)
     sampled_score = _judge(light, given, witness, edges, sampled)[0]
     prior = _calibrate(kind, sampled, sampled_score, given.shape[0])[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
     climb = _climb(given, valid, edges)
-    ramps, length = (_mean_of(part, edges.is_edge, sampled) for part in (edges.is_ramp.float(), climb))
-    is_soft = ramps > _SOFT * length
+    level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
+    is_mixed = edges.is_edge & ((level - 0.5).abs() < 0.25)
+    parts = (edges.is_ramp.float(), (edges.is_ramp & is_mixed).float(), climb)
+    ramps, mixed, length = (_mean_of(part, edges.is_edge, sampled) for part in parts)
+    is_soft = (ramps > _SOFT) & ((ramps > _WIDE * length) | (mixed > _MIXED * ramps))
     if auto:
         is_related = _is_related(given, edges, sampled, sampled_score)
         is_soft = is_soft & is_related
@@ -206,10 +211,10 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
 
     # and what is so thin that a ramp swallowed part of its depth
     length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
-    sigma = _blur_of(given, edges, length)
+    # standard deviation of the blur that made ramps of an item's steps
+    sigma = (is_mixed.sum((1, 2, 3), keepdim=True) / (_MIDDLE_HALF * length)).clamp(0.2, 3.0)
     label = torch.where(edges.is_edge, is_near, 2.0 * given > _highest(given, 6) - _highest(-given, 6))
     label = pixels.put(label.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
-    level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
     lost_px = torch.where(edges.is_edge, label - level, 0.0).sum((1, 2, 3), keepdim=True) / length
     near, far = _unmix(given, edges, label, sigma, lost_px, edge_pixels, near, far)
 
@@ -287,10 +292,10 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
 
     mean = _mean(functional.pad(nearness, (2,) * 4, mode="replicate"), 2)
     right, down = mean[..., 2:-2, 4:] - mean[..., 2:-2, :-4], mean[..., 4:, 2:-2] - mean[..., :-4, 2:-2]
-    flat = _FLAT * (near - far)
-    across = torch.where(right.abs() > torch.maximum(_OCTANT * down.abs(), flat), right.sign(), 0.0)
-    along = torch.where(down.abs() > torch.maximum(_OCTANT * right.abs(), flat), down.sign(), 0.0)
-    direction = (3.0 * along + across).long() + _DIRECTIONS // 2
+    tie = _TIE * (near - far)
+    across = torch.where(right.abs() > down.abs() + tie, right.sign(), 0.0)
+    along = torch.where(down.abs() > right.abs() + tie, down.sign(), 0.0)
+    direction = (2.0 * along + across).long() + _DIRECTIONS // 2
     return _Edges(near, far, is_ramp, ring, is_edge, direction)
 
 
@@ -433,13 +438,6 @@ def _climb(nearness: Tensor, valid: Tensor, edges: _Edges) -> Tensor:
     below = [functional.pad(along, (0, 0, *ends)) for ends in ((1, 0), (0, 1))]
     steepness = 0.25 * sum(torch.hypot(a, b) for a in beside for b in below)
     return torch.where(edges.is_edge, steepness / (edges.near - edges.far).clamp_min(1e-12), 0.0)
-
-
-def _blur_of(nearness: Tensor, edges: _Edges, length: Tensor) -> Tensor:
-    """Standard deviation in pixels, ``[B, 1, 1, 1]``, of the blur that made ramps of an item's steps of this length."""
-    level = (nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12)
-    middle = edges.is_edge & ((level - 0.5).abs() < 0.25)
-    return (middle.sum((1, 2, 3), keepdim=True) / (_MIDDLE_HALF * length)).clamp(0.2, 3.0)
 
 
 def _unmix(

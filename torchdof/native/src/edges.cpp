@@ -13,10 +13,10 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 9, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, FLAT = 0.017f, OCTANT = 0.41421f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 1.5f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
+constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr float NOISES = 12.0f;
-constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 768, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
@@ -267,22 +267,22 @@ class Repair {
   bool run() {
     allocate();
     noise_step_ = NOISES * noise();
-    const int spacing = (height_ + width_ + SAMPLED - 1) / SAMPLED;
-    const bool spares = map_.automatic && spacing > 2;  // blocks of a sample are apart, and a look at them alone may do
+    const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
+    const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
     std::vector<Group> groups, sampled;
     if (spares) {
-      sampled = find_in(blocks(spacing), REACH, false);
+      sampled = find_in(blocks(every), REACH, false);
     } else {
       sampled = groups = find_in(tiles(), 0, false);
     }
     list(sampled, [&](const Edge &edge) {
       const int y = edge.i / width_, x = edge.i % width_;
-      return std::min(y, height_ - 1 - y) / SAMPLE_BLOCK % spacing == 0 && std::min(x, width_ - 1 - x) / SAMPLE_BLOCK % spacing == 0;
+      return (std::min(y, height_ - 1 - y) / SAMPLE_BLOCK + std::min(x, width_ - 1 - x) / SAMPLE_BLOCK) % every == 0;
     });
     judge(sampled);
     decide(sampled);
     calibrate(sampled);
-    const bool is_soft = width_of_ramps(sampled) > SOFT;
+    const bool is_soft = is_on_ramps(sampled);
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
     parallel(height_, [&](int y) {
       memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
@@ -333,16 +333,19 @@ class Repair {
     return 0.6053f * std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
   }
 
-  // Pixels on ramps of a sample for each of its steps' length.
-  double width_of_ramps(const std::vector<Group> &sampled) const {
-    double ramps = 0, length = 0;
+  // Whether a sample's steps are ramps, wide ones or such as are not close to one of their surfaces.
+  bool is_on_ramps(const std::vector<Group> &sampled) const {
+    double edges = 0, ramps = 0, mixed = 0, length = 0;
     for (const Group &group : sampled)
       each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
-        const float *value = map_.nearness + edge.i;
-        ramps += marks_[edge.i] & RAMP ? 1 : 0;
+        const float *value = map_.nearness + edge.i, level = (*value - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        const bool is_ramp = marks_[edge.i] & RAMP;
+        edges++;
+        ramps += is_ramp;
+        mixed += is_ramp && std::fabs(level - 0.5f) < 0.25f;
         length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, edge.near - edge.far);
       });
-    return ramps / std::max(length, 1e-12);
+    return ramps > SOFT * edges && (ramps > WIDE * length || mixed > MIXED * ramps);
   }
 
   // Part of a step that a pixel climbs, by the places of its neighbours: summed, the length of the step in pixels.
@@ -377,22 +380,23 @@ class Repair {
   }
 
   // Parts for a sample: by their distance to the nearest border, so that it is the same of a turned frame.
-  std::vector<Group> blocks(int spacing) const {
+  std::vector<Group> blocks(int every) const {
     struct Run {
-      int start, size;
+      int block, start, size;
     };
     const auto along = [&](int size) {
       std::vector<Run> runs;
-      for (int start = 0; start < (size + 1) / 2; start += spacing * SAMPLE_BLOCK) {
+      for (int block = 0, start = 0; start < (size + 1) / 2; block++, start += SAMPLE_BLOCK) {
         const int near = std::min(SAMPLE_BLOCK, (size + 1) / 2 - start), far = std::min(SAMPLE_BLOCK, size / 2 - start);
-        runs.push_back({start, near});
-        if (far > 0) runs.push_back({size - start - far, far});
+        runs.push_back({block, start, near});
+        if (far > 0) runs.push_back({block, size - start - far, far});
       }
       return runs;
     };
     std::vector<Group> parts;
     for (const Run &y : along(height_))
-      for (const Run &x : along(width_)) parts.push_back({{y.start, x.start, y.size, x.size}, {}});
+      for (const Run &x : along(width_))
+        if ((y.block + x.block) % every == 0) parts.push_back({{y.start, x.start, y.size, x.size}, {}});
     return parts;
   }
 
@@ -643,11 +647,11 @@ class Repair {
         found.lost += (marks[k] & NEAR ? 1.0f : 0.0f) - clamp01(level);
         found.middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
-        const int across = std::fabs(right) > std::max(OCTANT * std::fabs(below), FLAT * gap) ? (right > 0 ? 1 : -1) : 0;
-        const int along = std::fabs(below) > std::max(OCTANT * std::fabs(right), FLAT * gap) ? (below > 0 ? 1 : -1) : 0;
+        const int across = std::fabs(right) > std::fabs(below) + TIE * gap ? (right > 0 ? 1 : -1) : 0;
+        const int along = std::fabs(below) > std::fabs(right) + TIE * gap ? (below > 0 ? 1 : -1) : 0;
         const int ring = RINGS - marks[k] / UNSURE;
         const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
-        group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * DIRECTIONS + 3 * along + across + DIRECTIONS / 2)});
+        group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * DIRECTIONS + 2 * along + across + DIRECTIONS / 2)});
       }
     }
     return true;
