@@ -183,18 +183,18 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     every = (height * width + _SAMPLED - 1) // _SAMPLED
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
-    kind = _kind(given, edges)
+    level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
+    kind = _kind(level, edges)
     sampled_score = _judge(light, given, witness, edges, sampled)[0]
     prior = _calibrate(kind, sampled, sampled_score, given.shape[0])[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
     climb = _climb(given, valid, edges)
-    level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
     is_mixed = edges.is_edge & ((level - 0.5).abs() < 0.25)
     parts = (edges.is_ramp.float(), (edges.is_ramp & is_mixed).float(), climb)
     ramps, mixed, length = (_mean_of(part, edges.is_edge, sampled) for part in parts)
     is_soft = (ramps > _SOFT) & ((ramps > _WIDE * length) | (mixed > _MIXED * ramps))
     if auto:
-        is_related = _is_related(given, edges, sampled, sampled_score)
+        is_related = _is_related(level, edges, sampled, sampled_score)
         is_soft = is_soft & is_related
         is_inexact = is_related & (is_soft | (_mean_of(wrong, ~edges.is_ramp, sampled) > _EXACT))
 
@@ -299,15 +299,14 @@ def _find(nearness: Tensor, valid: Tensor, step: Tensor) -> _Edges:
     return _Edges(near, far, is_ramp, ring, is_edge, direction)
 
 
-def _kind(nearness: Tensor, edges: _Edges) -> Tensor:
+def _kind(level: Tensor, edges: _Edges) -> Tensor:
     """Which pixels are calibrated together: those of one ring and side of a step, or one level of a ramp, by direction.
 
     Numbers ``[B, 1, H, W]``: of items, then of places, then of directions.
     """
-    level = (nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12)
     side = (level > 0.5).long() * _RINGS + edges.ring.clamp(max=_RINGS) - 1
     place = torch.where(edges.is_ramp, 2 * _RINGS + (level * _LEVELS).long().clamp(0, _LEVELS - 1), side)
-    item = torch.arange(nearness.shape[0], device=nearness.device).view(-1, 1, 1, 1)
+    item = torch.arange(level.shape[0], device=level.device).view(-1, 1, 1, 1)
     return (item * _PLACES + place) * _DIRECTIONS + edges.direction
 
 
@@ -387,19 +386,19 @@ def _mean_of(values: Tensor, mask: Tensor, sampled: Tensor) -> Tensor:
     return (sums[1] / sums[0].clamp_min(1.0)).view(-1, 1, 1, 1)
 
 
-def _is_related(nearness: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:
+def _is_related(level: Tensor, edges: _Edges, sampled: Tensor, score: Tensor) -> Tensor:
     """Whether what an item's colours say agrees with its map where that is hardly in doubt, ``[B, 1, 1, 1]``.
 
     That is as far from steps as they are looked at, and at the ends of ramps. An image that knows nothing of the depth
     agrees by half.
     """
-    level = pixels.pick((nearness - edges.far) / (edges.near - edges.far).clamp_min(1e-12), sampled)[0]
+    own = pixels.pick(level, sampled)[0]
     is_ramp, ring = pixels.pick(edges.is_ramp, sampled)[0], pixels.pick(edges.ring, sampled)[0]
-    clear = torch.where(is_ramp, (level - 0.5).abs() > 0.3, ring == _RINGS)
+    clear = torch.where(is_ramp, (own - 0.5).abs() > 0.3, ring == _RINGS)
     weight = (0.5 * score.abs()).clamp(max=1.0) * clear
-    agrees = ((score > 0) == (level > 0.5)).to(score.dtype)
-    item = sampled // nearness[0].numel()
-    sums = [score.new_zeros(nearness.shape[0]).index_add(0, item, w) for w in (weight, weight * agrees)]
+    agrees = ((score > 0) == (own > 0.5)).to(score.dtype)
+    item = sampled // level[0].numel()
+    sums = [score.new_zeros(level.shape[0]).index_add(0, item, w) for w in (weight, weight * agrees)]
     return ((sums[1] + 0.5 * _PRIOR_COUNT) / (sums[0] + _PRIOR_COUNT) > _RELATED).view(-1, 1, 1, 1)
 
 

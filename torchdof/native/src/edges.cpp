@@ -269,16 +269,14 @@ class Repair {
     noise_step_ = NOISES * noise();
     const int every = (int)(((int64_t)area_ + SAMPLED - 1) / SAMPLED);
     const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
+    const auto is_sampled = [&](int y, int x) { return (block_of(y, height_) + block_of(x, width_)) % every == 0; };
     std::vector<Group> groups, sampled;
     if (spares) {
-      sampled = find_in(blocks(every), REACH, false);
+      sampled = find_in(blocks(is_sampled), REACH, false);
     } else {
       sampled = groups = find_in(tiles(), 0, false);
     }
-    list(sampled, [&](const Edge &edge) {
-      const int y = edge.i / width_, x = edge.i % width_;
-      return (std::min(y, height_ - 1 - y) / SAMPLE_BLOCK + std::min(x, width_ - 1 - x) / SAMPLE_BLOCK) % every == 0;
-    });
+    list(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
     judge(sampled);
     decide(sampled);
     calibrate(sampled);
@@ -379,24 +377,28 @@ class Repair {
     return parts;
   }
 
-  // Parts for a sample: by their distance to the nearest border, so that it is the same of a turned frame.
-  std::vector<Group> blocks(int every) const {
+  // Which block a row or column lies in, counted from the nearest border: the same in a turned frame.
+  static int block_of(int at, int size) { return std::min(at, size - 1 - at) / SAMPLE_BLOCK; }
+
+  // The wanted ones of these blocks.
+  template <typename Wanted>
+  std::vector<Group> blocks(const Wanted &wanted) const {
     struct Run {
-      int block, start, size;
+      int start, size;
     };
     const auto along = [&](int size) {
       std::vector<Run> runs;
-      for (int block = 0, start = 0; start < (size + 1) / 2; block++, start += SAMPLE_BLOCK) {
+      for (int start = 0; start < (size + 1) / 2; start += SAMPLE_BLOCK) {
         const int near = std::min(SAMPLE_BLOCK, (size + 1) / 2 - start), far = std::min(SAMPLE_BLOCK, size / 2 - start);
-        runs.push_back({block, start, near});
-        if (far > 0) runs.push_back({block, size - start - far, far});
+        runs.push_back({start, near});
+        if (far > 0) runs.push_back({size - start - far, far});
       }
       return runs;
     };
     std::vector<Group> parts;
     for (const Run &y : along(height_))
       for (const Run &x : along(width_))
-        if ((y.block + x.block) % every == 0) parts.push_back({{y.start, x.start, y.size, x.size}, {}});
+        if (wanted(y.start, x.start)) parts.push_back({{y.start, x.start, y.size, x.size}, {}});
     return parts;
   }
 
