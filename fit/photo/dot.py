@@ -18,6 +18,7 @@ __all__ = [
     "noise_inside",
     "noise_of",
     "radial_mean",
+    "rounding_of",
 ]
 
 _THRESHOLD = 0.15  # of the peak: low enough to keep an uneven ring in one piece
@@ -234,6 +235,17 @@ def noise_of(picture: Array) -> float:
     usual = 1.4826 * float(np.median(sizes))
     usual = usual if usual > 1e-9 * float(np.abs(picture).max()) else float(np.percentile(sizes, 90))
     return float(np.sqrt(np.mean(sizes[sizes <= 5 * usual] ** 2)))
+
+
+def rounding_of(levels: Array) -> float:
+    """Variance of the noise that a file's few levels make, or hide, at most: of a level halfway between two of them.
+
+    Args:
+        levels: of some pixels. They may be means of three colours, whose levels lie three times as far apart.
+    """
+    steps = np.diff(np.unique(levels))
+    steps = steps[steps > 1e-6 * np.abs(levels).max(initial=0.0)]  # sums of one mean differ in their last digit
+    return 3 * float(steps.min()) ** 2 / 4 if steps.size else 0.0
 
 
 def mixed_differences(picture: Array) -> Array:

@@ -11,7 +11,7 @@ from ..problems import NotInFocusWarning, NotLinearWarning, warn
 from ..result import Array
 from .description import kernel_lists
 from .diagnostics import left_open, unexplained
-from .dot import Dot, mixed_differences, noise_inside, noise_of
+from .dot import Dot, mixed_differences, noise_inside, noise_of, rounding_of
 from .dot_model import Edge, soft_edge, with_softness
 from .forward import Forward, Solution
 
@@ -48,8 +48,10 @@ _STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and
 def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> bool:
     """Whether a sharp picture seems to be in linear light, by its noise and its dot's edge; warns where it does not."""
     inside = noise_inside(still, dot)
+    rounding = rounding_of(still[still > dot.background + 0.5 * dot.peak])
     # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
-    if inside and dot.noise > (1 + 4 / np.sqrt(inside[1])) * inside[0] and dot.noise > 1e-4 * dot.peak:
+    most = (1 + 4 / np.sqrt(inside[1])) * np.sqrt(inside[0] ** 2 + rounding) if inside else np.inf
+    if inside and dot.noise > max(most, 1e-4 * dot.peak):
         ratio = dot.noise / max(inside[0], 1e-9 * dot.peak)
         text = (
             f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
@@ -99,6 +101,7 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
     expected = noise_of(pair.data) ** 2 + pair.shot_noise * light
     if not expected > 0:  # a file of few levels, which hide the paper's noise
         return True
+    expected += rounding_of(pair.data[1:-1, 1:-1][middling])
     # second differences of neighbours go together: a third of them is independent
     most = _LOUDER * (1 + 4 * np.sqrt(2 * 3 / count))
     if found > most * expected and found > (_DRAWN * level) ** 2:

@@ -209,8 +209,7 @@ def read_captures(
                 (first.colours, moved.colours) if wanted == "each" else None,
             )
         )
-    if transfer is None:
-        _check_stated(encoded, where)
+    _check_stated(transfer, encoded, where)
     camera = {name: _optional(fields, name, where) for name in ("focal_length_mm", "f_number", "sensor_width_mm")}
     from_exif = [name for name, value in camera.items() if value is None and name in first.facts]
     _check_exif(camera, first.facts, where)
@@ -266,8 +265,8 @@ def read_pair(
     still, moved, files = first.light, second.light, (str(sharp), str(blurred))
     if still.shape != moved.shape:
         raise FitError(f"the pictures must have one size, got {size_of(still)} and {size_of(moved)}", file=str(blurred))
-    if transfer is None:
-        _check_stated([Path(f).name for f, p in zip(files, (first, second), strict=True) if p.encoded], None)
+    encoded = [Path(f).name for f, p in zip(files, (first, second), strict=True) if p.encoded]
+    _check_stated(transfer, encoded, None)
     return cut_pairs(still, moved, distance_m, magnification, "one", files, first.white, None, first.middle)[0]
 
 
@@ -419,9 +418,9 @@ def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | 
     return value[0], value[1], value[2], value[3]
 
 
-def _check_stated(encoded: Sequence[str], where: str | None) -> None:
+def _check_stated(transfer: str | None, encoded: Sequence[str], where: str | None) -> None:
     """Warn of pictures that are decoded as sRGB because nobody said how they are encoded."""
-    if encoded:
+    if transfer is None and encoded:
         more = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = (
             f"nobody said how {encoded[0]}{more} are encoded, and they are taken for sRGB. A camera's own tone curve "

@@ -12,6 +12,7 @@ __all__ = ["check_blacks", "plateau", "used_pixels"]
 
 _MOST = 0.6  # share of the dot's pixels beyond which what is left does not fix a fit
 _CUT = 0.1  # share of the paper on the lowest level, from which on what is cut off lifts it by a twentieth of the noise
+_WIDER = 1.5  # noise over its mean to noise below; where a tenth of it is cut off, 1.9
 
 
 def plateau(picture: Array, dot: Dot) -> float | None:
@@ -35,7 +36,8 @@ def plateau(picture: Array, dot: Dot) -> float | None:
 def check_blacks(picture: Array, dot: Dot, file: str | None, name: str) -> None:
     """Warn where the dark paper's noise is cut off below: it is then brighter than it was, and faint light is not.
 
-    Paper without noise, and paper that keeps within a few levels of a file, lies on its lowest level by right.
+    Paper without noise, and paper that keeps within a few levels of a file, lies on its lowest level by right: there
+    noise is no wider than a level, or as wide below as above.
 
     Args:
         picture: `[H, W]`.
@@ -49,6 +51,9 @@ def check_blacks(picture: Array, dot: Dot, file: str | None, name: str) -> None:
     if levels.size < 2 or counts[0] < _CUT * paper.size:
         return
     if not dot.noise > max(0.6 * (levels[1] - levels[0]), 1e-6 * dot.peak):
+        return
+    mean = float(paper.mean())
+    if float(np.quantile(paper, 0.995)) - mean < _WIDER * (mean - levels[0]):
         return
     share = float(counts[0] / paper.size)
     text = (

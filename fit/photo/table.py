@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +16,7 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
 
-from ..problems import ExposureWarning, FitError, SingleDistanceWarning, warn
+from ..problems import ExposureWarning, FitError, FitWarning, SingleDistanceWarning, warn
 from ..result import Array, BlurFit
 from .agreement import check_agreement, frame_width, promised_px
 from .colours import Colour, fit_colours
@@ -210,7 +211,10 @@ def _first_fits(
     """Every pair by itself, which tells the family, or the lens's opening."""
     fits = []
     for i, pair in enumerate(pairs):
-        fits.append(fit_one(pair, focus_m, family, None, accuracy_db))
+        with warnings.catch_warnings():
+            # the fit that is kept says what there is to say
+            warnings.simplefilter("ignore", FitWarning)
+            fits.append(fit_one(pair, focus_m, family, None, accuracy_db))
         if progress:
             progress(i + 1, total, f"{pair.distance_m:g} m")
     return fits

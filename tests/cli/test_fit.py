@@ -63,6 +63,17 @@ def test_pictures_whose_transfer_nobody_stated_are_said(folder: Path, tmp_path: 
     assert "nobody said how 0500mm.png" in json.loads(result.stdout)["warnings"][0]
 
 
+def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(simulator: ModuleType, tmp_path: Path) -> None:
+    camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
+    grid = [(-60, 0), (60, 0)]
+    folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], kernel, grid=grid, width=240, height=120)
+    manifest = folder / "capture.toml"
+    manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
+    result = run(folder, "-o", tmp_path / "mine.json", "--family", "disc", "--dots", "each")
+    assert result.exit_code == 0, result.output
+    assert "dot 1 at" in result.output and result.output.count("nobody said how") == 1
+
+
 def test_a_polygon_becomes_a_table_with_its_blades(simulator: ModuleType, tmp_path: Path) -> None:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
 

@@ -13,11 +13,10 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.arguments import AsJson
-from torchdof.cli.printed import json_line
+from torchdof.cli.printed import json_line, print_columns
 from torchdof.fit.photo.across import table_of_dots
 from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
 from torchdof.fit.photo.photographs import Photographs, read_photographs
@@ -184,6 +183,7 @@ def fit(
             root=root,
         )
     first: TableFit | None = None  # the dot nearest to the centre, whose scale all share
+    said = set[str]()
     across = capture_sets[0].notes["dots"] == "field"
     fitted = []
     for i, capture_set in enumerate(capture_sets):
@@ -192,7 +192,8 @@ def fit(
             console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
-        messages = [*doubts, *messages]
+        messages = [message for message in (*doubts, *messages) if message not in said]
+        said.update(messages)
         first = first or result
         fitted.append((capture_set, result))
         _summary(capture_set, result, messages, console)
@@ -255,17 +256,16 @@ def _trace(
 
 def _tell(photographs: Photographs, console: Console) -> None:
     """What was found in the photographs, and what to do better, on one screen."""
-    shown = Table(title="the target in the photographs", title_justify="left")
-    for column in ("file", "distance m", "square px", "paper %", "edge px", ""):
-        shown.add_column(column, justify="right")
-    sharp = photographs.captures.notes["sharp"]
-    for picture in photographs.pictures:
-        shown.add_row(
-            picture.file, f"{picture.distance_m:.3f}", f"{picture.target.side_px:.0f}",
-            f"{100 * picture.target.white:.0f}", f"{1 / picture.sharpness:.1f}",
-            "in focus" if picture.file == sharp else "",
-        )  # fmt: skip
-    console.print(shown)
+    sharp, pictures = photographs.captures.notes["sharp"], photographs.pictures
+    columns = {
+        "file": [picture.file for picture in pictures],
+        "distance m": [f"{picture.distance_m:.3f}" for picture in pictures],
+        "square px": [f"{picture.target.side_px:.0f}" for picture in pictures],
+        "paper %": [f"{100 * picture.target.white:.0f}" for picture in pictures],
+        "edge px": [f"{1 / picture.sharpness:.1f}" for picture in pictures],
+        "": ["in focus" if picture.file == sharp else "" for picture in pictures],
+    }
+    print_columns(console, "the target in the photographs", columns)
     for sentence in photographs.advice:
         console.print(f"better: {sentence}", style="cyan", markup=False, highlight=False)
 
@@ -312,21 +312,19 @@ def _heard() -> Iterator[list[str]]:
 
 def _summary(captures: Captures, result: TableFit, messages: list[str], console: Console) -> None:
     """Prints a table of the fits at all distances, why the family was chosen, and the warnings."""
-    shown = Table(
-        title=f"{captures.name or 'captures'}: {result.fits[0].family}, focus {captures.focus_m:g} m",
-        title_justify="left",
-    )
-    names = [n for n in result.fits[0].params if n != "values"]
-    for column in ("distance m", "coc px", "measured", *names, "residual %", "x noise", "magnified"):
-        shown.add_column(column, justify="right")
-    for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True):
-        values = [f"{fitted.params[n]:.3f} ± {fitted.stderr[n]:.2g}" for n in names]
-        ratio = fitted.residual_over_noise
-        shown.add_row(
-            f"{pair.distance_m:g}", f"{coc:+.2f}", f"{fitted.radius:.2f}", *values, f"{100 * fitted.residual:.2f}",
-            "" if math.isnan(ratio) else f"{ratio:.2f}", f"{fitted.magnification:.4f}",
-        )  # fmt: skip
-    console.print(shown)
+    fits = result.fits
+    ratios = ["" if math.isnan(f.residual_over_noise) else f"{f.residual_over_noise:.2f}" for f in fits]
+    columns = {
+        "distance m": [f"{pair.distance_m:g}" for pair in captures],
+        "coc px": [f"{coc:+.2f}" for coc in result.coc_px],
+        "measured": [f"{f.radius:.2f}" for f in fits],
+        **{n: [f"{f.params[n]:.3f} ± {f.stderr[n]:.2g}" for f in fits] for n in fits[0].params if n != "values"},
+        "residual %": [f"{100 * f.residual:.2f}" for f in fits],
+        "x noise": ratios,
+        "magnified": [f"{f.magnification:.4f}" for f in fits],
+    }
+    title = f"{captures.name or 'captures'}: {fits[0].family}, focus {captures.focus_m:g} m"
+    print_columns(console, title, columns)
     console.print(f"family: {result.why}", markup=False, highlight=False)
     console.print(
         "circles of confusion: "
@@ -341,16 +339,17 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
 
 def _tell_colours(captures: Captures, result: TableFit, console: Console) -> None:
     """Prints what differs between the colours: the size of their blur, their focus, and where they lie."""
-    shown = Table(title="colours, beside green", title_justify="left")
-    for column in ("", "focus m", *(f"radius px at {pair.distance_m:g} m" for pair in captures), "lateral px in focus"):
-        shown.add_column(column, justify="right")
+    focuses = []
     for colour in result.colours:
-        shift, (x, y) = colour.focus_shift_dioptres, colour.lateral_px[0]
-        vergence = 1 / captures.focus_m + shift
-        focus = "" if math.isnan(shift) else f"{1 / vergence:.4g}" if vergence > 0 else "beyond infinity"
-        radii = [f"{f.radius:.2f} ± {f.radius_stderr:.2g}" for f in colour.fits]
-        shown.add_row(colour.name, focus, *radii, f"({x:+.2f}, {y:+.2f})")
-    console.print(shown)
+        vergence = 1 / captures.focus_m + colour.focus_shift_dioptres
+        focuses.append("" if math.isnan(vergence) else f"{1 / vergence:.4g}" if vergence > 0 else "beyond infinity")
+    columns = {"": [colour.name for colour in result.colours], "focus m": focuses}
+    for i, pair in enumerate(captures):
+        fits = [colour.fits[i] for colour in result.colours]
+        columns[f"radius px at {pair.distance_m:g} m"] = [f"{f.radius:.2f} ± {f.radius_stderr:.2g}" for f in fits]
+    lateral = [colour.lateral_px[0] for colour in result.colours]
+    columns["lateral px in focus"] = [f"({x:+.2f}, {y:+.2f})" for x, y in lateral]
+    print_columns(console, "colours, beside green", columns)
     console.print("the table holds a kernel a colour; lateral colour is no blur, and not in it", highlight=False)
 
 

@@ -1,5 +1,7 @@
 """From captures at several distances to a table, and from the table to the picture."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -110,6 +112,14 @@ def test_auto_takes_one_family_for_all_and_tells_its_progress(simulator):
     assert result.table.family == "softm" and "60 dB" in result.why
     assert steps == [(i, 4) for i in (1, 2, 3, 4)]
     assert result.table.provenance["distances_m"] == [0.7, 1.5] and result.table.provenance["focus_m"] == 1.0
+
+
+def test_fits_that_only_tell_the_family_say_nothing(simulator):
+    pair = simulator.Simulator(size=71, misfocus=1.4).pair("disc", {"radius": 6.0})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fit_captures(Captures((Capture(*pair, 2.0),), focus_m=1.0, width_px=WIDTH))
+    assert [type(w.message) for w in caught].count(p.NotInFocusWarning) == 1
 
 
 def test_a_gain_against_the_exposures_warns(simulator):

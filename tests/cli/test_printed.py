@@ -1,0 +1,33 @@
+"""Tables for people: whole on any terminal."""
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from torchdof.cli.printed import print_columns
+
+COLUMNS = {
+    "distance m": ["0.7", "1.5"],
+    **{f"radius px at {d} m": [f"{d}.25 ± 0.012", f"{d}.5 ± 0.013"] for d in range(5)},
+    "lateral px": ["(+0.29, -0.10)", "[red](+0.00, -0.10)"],
+}
+
+
+def printed(width: int) -> list[str]:
+    file = io.StringIO()
+    print_columns(Console(file=file, width=width, soft_wrap=True), "colours", COLUMNS)
+    return file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_columns_that_have_no_room_are_folded_and_none_is_cut(width: int) -> None:
+    lines = printed(width)
+    assert max(map(len, lines)) <= width
+    cells = [cell.strip() for line in lines for cell in re.split("[│┃]", line)]
+    for name, values in COLUMNS.items():
+        assert name in cells and all(value in cells for value in values)
+    # the first column stands before each part, and the title above the first alone
+    assert cells.count("distance m") == sum("┏" in line for line in lines) == {40: 6, 80: 2, 200: 1}[width]
+    assert sum("colours" in line for line in lines) == 1
