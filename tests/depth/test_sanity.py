@@ -73,6 +73,8 @@ def test_sensible_extremes_raise_no_doubt(depth: torch.Tensor, camera: Camera) -
         (100.0, 3.0, r"is it centimetres \(--depth-scale 0.01\)"),
         (0.001, 3.0, r"1000 times too small for metres \(--depth-scale 1000\).*within a hand's breadth"),
         (1000.0, 3000.0, r"all depth is far .*nothing is blurred; is it millimetres \(--depth-scale 0.001\)"),
+        (1.0, 3000.0, r"1000 times too small .*; or is the focus in millimetres \(--focus-m 3\)"),
+        (1.0, 300.0, r"; or is the focus in centimetres \(--focus-m 3\)"),
         (1.0, 20.0, r"the focus at 20 m is farther than all depth \(2.11 to 5.017 m\).*--focus-at"),
         (1.0, 0.5, r"the focus at 0.5 m is nearer than all depth.*disparity \(--depth-kind disparity\)"),
         (1.0, INF, "the focus at inf m is farther than all depth"),
@@ -126,11 +128,18 @@ def test_a_scale_that_was_given_in_vain_is_to_be_left_out(metres: torch.Tensor) 
         (field(0.002, 0.005), Camera.from_fov(40.0, 0.01, 0.003)),  # all in millimetres but the opening
         (field(2.0, 5.0), Camera.from_fov(40.0, 12.0, 3.0)),  # the opening alone
         (field(2.0, 5.0), Camera(50.0, 0.01, 3.0)),
+        (field(2.0, 5.0), Camera(50.0, 1.8, 3.0, sensor_width_mm=0.036)),
     ],
 )
 def test_blur_that_no_lens_makes_is_told(depth: torch.Tensor, camera: Camera) -> None:
-    with pytest.warns(DepthWarning, match="more than a lens makes.*which is in another unit"):
+    sensor = f"on a sensor of {camera.sensor_width_mm:g} mm"
+    with pytest.warns(DepthWarning, match=f"more than a lens makes.*{sensor}.*which is in another unit"):
         check(depth, camera)
+
+
+def test_a_focal_length_in_metres_is_told() -> None:
+    with pytest.warns(DepthWarning, match="focal length of 0.05 mm on a sensor of 36 mm .* take millimetres"):
+        check(field(2.0, 5.0), Camera(0.05, 1.8, 3.0))
 
 
 def test_a_gap_of_depth_around_the_focus_is_told() -> None:

@@ -19,12 +19,14 @@ from .kinds import DepthKind
 __all__ = ["DepthWarning", "Mistake", "check", "coc_mistakes", "depth_mistakes"]
 
 _FACTORS = (0.001, 0.01, 1000.0, 100.0)  # millimetres and centimetres; and what was taken for such and is none
+_UNITS = {0.001: "millimetres", 0.01: "centimetres"}
 _SHARP_PX, _SHARP_WIDTHS = 1.0, 1e-3  # what counts as in focus: the larger of both
 _NUMBERS = ("focal_length_mm", "f_number", "sensor_width_mm")
 _FAR_OFF = 30.0  # times that the focus may be nearer or farther than all depth where the blur tells nothing
 _FAR_M, _HAND_M = 500.0, 0.1
 _LARGE_WIDTHS, _LARGEST_WIDTHS = 1 / 8, 1.0  # a real macro lens reaches half the frame's width
 _WIDEST_F_NUMBER = 0.5  # of an aplanatic lens in air
+_SHORTEST_WIDTHS = 1 / 20  # focal length over the sensor's width: 169 degrees across
 
 
 class DepthWarning(UserWarning):
@@ -37,12 +39,12 @@ class Mistake:
 
     Args:
         name: "focus": nothing is in focus, or the focus is far from all depth; "far": everything is so far that nothing
-            is blurred; "bits": whole numbers as files of 8 bits hold; "blur": blur that no lens makes; "range":
-            relative depth of a sequence without the range of its values.
+            is blurred; "bits": whole numbers as files of 8 bits hold; "blur": blur that no lens makes; "lens": a focal
+            length that none has; "range": relative depth of a sequence without the range of its values.
         message: What is the case, the likely mistake and what mends it.
     """
 
-    name: Literal["focus", "far", "bits", "blur", "range"]
+    name: Literal["focus", "far", "bits", "blur", "lens", "range"]
     message: str
 
 
@@ -170,6 +172,9 @@ def _mistakes(
         found.append(Mistake("far", message))
     if is_too_blurred:
         found.append(Mistake("blur", _too_blurred(largest, width, far, extent, camera)))
+    if (focal_mm := float(camera.focal_length_mm)) < _SHORTEST_WIDTHS * (sensor_mm := float(camera.sensor_width_mm)):
+        lens = f"a focal length of {focal_mm:.4g} mm on a sensor of {sensor_mm:.4g} mm is shorter than any lens's"
+        found.append(Mistake("lens", f"{lens}; --focal-length-mm and --sensor-width-mm take millimetres"))
     return found
 
 
@@ -198,6 +203,8 @@ def _out_of_focus(
         hints.append(f"if these are relative depth from 0 to 1, {_RELATIVE}")
     elif kind != "relative" and factor is not None:
         hints.append(f"is it {_advice(factor, scale)}?")
+        if factor > 1.0 and far >= _HAND_M and scale is None:
+            hints.append(f"or is the focus in {_UNITS[1.0 / factor]} (--focus-m {focus_m / factor:.4g})?")
     if kind in ("z", "distance") and focus_m < near:
         hints.append("if near is large in it, it is disparity (--depth-kind disparity)")
     if far < _HAND_M:
@@ -216,8 +223,9 @@ def _too_blurred(largest: float, width: int, far: float, extent: str, camera: Ca
     return (
         f"a blur radius of {_pixels(largest)} px on an image of {width} px is more than a lens makes: {hand} {extent}, "
         f"the focus {float(camera.focus_m):.4g} m, the opening {2 * float(camera.aperture_radius_m):.4g} m across "
-        f"(f/{float(camera.f_number):.2g}); which is in another unit? --depth-scale, --focus-m and --aperture-radius-m "
-        "make or take metres"
+        f"(f/{float(camera.f_number):.2g}, {float(camera.focal_length_mm):.4g} mm on a sensor of "
+        f"{float(camera.sensor_width_mm):.4g} mm); which is in another unit? --depth-scale, --focus-m and "
+        "--aperture-radius-m make or take metres, --focal-length-mm and --sensor-width-mm millimetres"
     )
 
 
@@ -230,7 +238,7 @@ def _advice(factor: float, scale: float | None) -> str:
     option = "leave --depth-scale out" if math.isclose(total, 1.0) else f"--depth-scale {total:.4g}"
     if factor > 1.0:
         return f"{factor:g} times too small for metres ({option})"
-    return f"{'millimetres' if factor == 0.001 else 'centimetres'} ({option})"
+    return f"{_UNITS[factor]} ({option})"
 
 
 def _whole_numbers(values: Tensor) -> bool:
