@@ -427,9 +427,16 @@ class Composite {
       for (int c = 0; c < C; c++) {
         const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
         float *term = b.term[c] + to;
-        for (int x = 0; x < width; x += LANES) {
-          const vec n = load<vec>(node + x), v = load<vec>(far + x);
-          store(term + x, n == at ? load<vec>(light + x) - v : n == before ? v : vec{});
+        for (int x0 = 0; x0 < width; x0 += 16) {
+          const bool none = !(occupied >> std::min(x0 / 16, 31) & 1);
+          for (int x = x0; x < x0 + 16; x += LANES) {
+            if (none) {
+              store(term + x, vec{});
+              continue;
+            }
+            const vec n = load<vec>(node + x), v = load<vec>(far + x);
+            store(term + x, n == at ? load<vec>(light + x) - v : n == before ? v : vec{});
+          }
         }
       }
     }
