@@ -64,7 +64,7 @@ struct Scratch {
   float *traced;                // light of rays in a tile
   std::vector<float *> mine;    // a row of each surface's share
   float *rest;                  // what lies wholly behind a coarse layer
-  std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for 16 columns
+  std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for so many columns as mark tells
   std::vector<Cut> cuts = std::vector<Cut>(TILE / Turned::COLUMNS);
   std::vector<const float *> pointers;
   std::vector<uint64_t> layers, block_layers;
@@ -72,11 +72,11 @@ struct Scratch {
   WindowPieces pieces;
 };
 
-// What a row of terms has, a bit for 16 columns: something; something behind the layer; something before it.
+// What a row of terms has, by its columns' marks: something; something behind the layer; something before it.
 struct Occupied {
   uint32_t some = 0, open = 0, uneven = 0;
   void add(int x, float share, float room, bool over) {
-    const uint32_t bit = 1u << std::min(x / 16, 31);
+    const uint32_t bit = mark(x);
     if (share > 0) some |= bit;
     if (over && room != share) open |= bit;  // of a hair there is less room than share
     if (over && (room - 1.0f) * (room - 1.0f) > EVEN) uneven |= bit;
@@ -401,9 +401,9 @@ class Composite {
       const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(2, top + y) + left;
       float *share = b.term[C] + to, *room = b.term[C + 1] + to;
       uint32_t occupied = 0, open = 0, uneven = 0;
-      for (int x0 = 0; x0 < width; x0 += 16) {
+      for (int x0 = 0; x0 < width; x0 += MARKED) {
         vec some = {}, more = {}, other = {};
-        for (int x = x0; x < x0 + 16; x += LANES) {
+        for (int x = x0; x < x0 + MARKED; x += LANES) {
           const vec n = load<vec>(node + x);
           const auto ahead = n == before, behind = n == at;
           const vec w = load<vec>(one + x), part = load<vec>(two + x);
@@ -416,10 +416,10 @@ class Composite {
           more = most(more, its_room - its_share);
           other = most(other, lacking * lacking - all(EVEN));
         }
-        const int bit = std::min(x0 / 16, 31);
-        occupied |= (uint32_t)any_positive(some) << bit;
-        open |= (uint32_t)any_positive(more) << bit;
-        uneven |= (uint32_t)any_positive(other) << bit;
+        const uint32_t bit = mark(x0);
+        occupied |= any_positive(some) ? bit : 0;
+        open |= any_positive(more) ? bit : 0;
+        uneven |= any_positive(other) ? bit : 0;
       }
       b.occupied[y] = occupied;
       b.open[y] = open;
@@ -427,9 +427,9 @@ class Composite {
       for (int c = 0; c < C; c++) {
         const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
         float *term = b.term[c] + to;
-        for (int x0 = 0; x0 < width; x0 += 16) {
-          const bool none = !(occupied >> std::min(x0 / 16, 31) & 1);
-          for (int x = x0; x < x0 + 16; x += LANES) {
+        for (int x0 = 0; x0 < width; x0 += MARKED) {
+          const bool none = !(occupied & mark(x0));
+          for (int x = x0; x < x0 + MARKED; x += LANES) {
             if (none) {
               store(term + x, vec{});
               continue;
@@ -446,7 +446,7 @@ class Composite {
         const int piece = p.order[i], at = p.at[piece];
         const float *one = p.values[piece], *two = one + C + 1;
         auto part = [&](int v) { return behind ? one[v] - two[v] : two[v]; };
-        const uint32_t bit = 1u << std::min(at % pitch_ / 16, 31);
+        const uint32_t bit = mark(at % pitch_);
         b.occupied[at / pitch_] |= bit;
         b.open[at / pitch_] |= bit;
         b.uneven[at / pitch_] |= bit;
@@ -659,14 +659,14 @@ class Composite {
         for (int c = 0; c < C_ + 1; c++) fill(b.term[c], w, 0.0f);
       }
       if (!over_) continue;
-      const uint32_t bit = 1u << std::min(w.column / BLOCK, 31);
+      const uint32_t bits = mark(w.column) | mark(w.column + BLOCK / 2);
       if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
         w.room = -1;
         block_room(layers_[k], w, y0, y1, x0, x1, b);
       } else {
         if (w.room != (int)behind) fill(b.term[C_ + 1], w, behind ? 1.0f : 0.0f);
         w.room = behind;
-        for (int y = y0; y < y1; y++) (behind ? b.open : b.uneven)[y] |= bit;
+        for (int y = y0; y < y1; y++) (behind ? b.open : b.uneven)[y] |= bits;
       }
     }
   }
@@ -684,7 +684,6 @@ class Composite {
     const int C = CHANNELS ? CHANNELS : C_;
     for (int y = y0; y < y1; y++) {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
-      vec some = {}, more = {}, other = {};
       for (int x = x0; x < x1; x += LANES) {
         vec mine[COUNT], share = {}, room = {}, p[COUNT], h[COUNT], weight[COUNT];
         for (int j = 0; j < COUNT; j++) {
@@ -699,23 +698,18 @@ class Composite {
           share += mine[j];
           room += h[j] * weight[j];
         }
+        const bool some = any_positive(share);
+        const uint32_t bit = mark(w.column + x);
         store(b.term[C] + at + x, share);
-        if (over_) store(b.term[C + 1] + at + x, room);
         for (int c = 0; c < C; c++) {
-          vec sum = load<vec>(w.surfaces[0].light + c * w.surfaces[0].channel + row * w.surfaces[0].light_pitch + x) * mine[0];
-          for (int j = 1; j < COUNT; j++)
+          vec sum = {};
+          for (int j = 0; some && j < COUNT; j++)
             sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * mine[j];
           store(b.term[c] + at + x, sum);
         }
-        const vec lacking = room - all(1.0f);
-        some = most(some, share);
-        more = most(more, room - share);
-        other = most(other, lacking * lacking - all(EVEN));
+        b.occupied[y] |= some ? bit : 0;
+        if (over_) mark_room(room, share, bit, y, at + x, b);
       }
-      const int bit = std::min(w.column / BLOCK, 31);
-      b.occupied[y] |= (uint32_t)any_positive(some) << bit;
-      b.open[y] |= (uint32_t)any_positive(more) << bit;
-      b.uneven[y] |= (uint32_t)any_positive(other) << bit;
     }
   }
 
@@ -723,7 +717,6 @@ class Composite {
   void block_room(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, Scratch &b) {
     for (int y = y0; y < y1; y++) {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
-      vec more = {}, other = {};
       for (int x = x0; x < x1; x += LANES) {
         vec room = {}, p[2], h[2], weight[2];
         for (int j = 0; j < w.count; j++) {
@@ -734,15 +727,17 @@ class Composite {
         }
         if (w.count == 2) add_going_on(p, h, weight);
         for (int j = 0; j < w.count; j++) room += h[j] * weight[j];
-        store(b.term[C_ + 1] + at + x, room);
-        const vec lacking = room - all(1.0f);
-        more = most(more, room);
-        other = most(other, lacking * lacking - all(EVEN));
+        mark_room(room, vec{}, mark(w.column + x), y, at + x, b);
       }
-      const int bit = std::min(w.column / BLOCK, 31);
-      b.open[y] |= (uint32_t)any_positive(more) << bit;
-      b.uneven[y] |= (uint32_t)any_positive(other) << bit;
     }
+  }
+
+  // Puts a layer's room into its term, and tells of it beside its share.
+  void mark_room(vec room, vec share, uint32_t bit, int y, size_t at, Scratch &b) const {
+    const vec lacking = room - all(1.0f);
+    store(b.term[C_ + 1] + at, room);
+    b.open[y] |= any_positive(room - share) ? bit : 0;
+    b.uneven[y] |= any_positive(lacking * lacking - all(EVEN)) ? bit : 0;
   }
 
   // To the weights of two surfaces, given their places and what they have at or behind a layer.

@@ -521,11 +521,13 @@ inline float per_half_diagonal(const torchdof_scene &scene) {
 bool ends_dark(const torchdof_shares &shares, int distances);
 // A kernel of a layer, made not one-sided, with what does not pass left out and its light made whole again.
 void cut_kernel(const Layer &layer, int colour, const Turned &turned, Kernel &cut);
-// Columns from which a strip at column x is spread, counted from its input's first: a bit for each 16 of them.
+// So many columns of an input share a bit that tells whether something is there; this is the bit of a column.
+constexpr int MARKED = 8;
+inline uint32_t mark(int x) { return 1u << std::min(x / MARKED, 31); }
+// Marks of the columns from which a strip at column x is spread, counted from its input's first.
 inline uint32_t strip_inputs(int x, int half) {
-  uint32_t columns = 0;
-  for (int block = x / 16; block <= (x + STRIP_COLUMNS - 1 + 2 * half) / 16; block++) columns |= 1u << std::min(block, 31);
-  return columns;
+  const uint32_t last = mark(x + STRIP_COLUMNS - 1 + 2 * half);
+  return (last | (last - 1)) & ~(mark(x) - 1);
 }
 // Spreads values (of rows with a gap `pitch`) with a kernel to a strip: out [STRIP_ROWS, STRIP_COLUMNS]. The input has the
 // kernel's half more on each side and begins there. Input row i matters where rows[i] has one of the bits of `columns`.
