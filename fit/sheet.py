@@ -28,7 +28,8 @@ def sheet_of_photographs(
     """Draw the sheet.
 
     A row a distance: the target that was found, the window around its dot, its pixels over the distance from the centre
-    with the model's line, the residual, and the kernel. Below, lights from near to far rendered with the table.
+    with the model's line, the residual, and the kernel. Below, rendered with the table: lights from near to far, and
+    the photograph in focus, around its dot, as far out of focus as was measured.
 
     Args:
         photographs: from `read_photographs`.
@@ -55,17 +56,23 @@ def sheet_of_photographs(
         residual.set_title(f"residual {fit.residual_over_noise:.2f} x noise", fontsize=8)
         shape = result.table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)[0, 0]
         _show(kernel, shape.detach().numpy(), [], f"kernel at coc {coc:+.2f} px")
-    for unused in axes[rows, 1:]:
+    for unused in axes[rows]:
         unused.remove()
-    lights = _lights(render, result.table, captures.width_px, min(0.0, *result.coc_px), max(0.0, *result.coc_px))
-    wide = figure.add_subplot(axes[rows, 0].get_gridspec()[rows, :])
-    axes[rows, 0].remove()
+    grid = axes[rows, 0].get_gridspec()
+    (sharp,) = (p for p in photographs.pictures if p.file == captures.notes["sharp"])
+    window = _around_the_dot(sharp)
+    most, blurrest = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
+    ends = min(0.0, *result.coc_px), max(0.0, *result.coc_px)
+    lights = _rendered(render, _lights(), result.table, captures.width_px, *ends)
+    photograph = _rendered(render, window, result.table, captures.width_px, most, most)
     _show(
-        wide,
+        figure.add_subplot(grid[rows, :3]),
         lights,
         [],
         "lights and edges from one end of the measured distances through the focus to the other, with this table",
     )
+    _show(figure.add_subplot(grid[rows, 3]), window, [], f"{sharp.file}, in focus")
+    _show(figure.add_subplot(grid[rows, 4]), photograph, [], f"with this table, as at {blurrest.distance_m:.3f} m")
     return figure
 
 
@@ -88,22 +95,32 @@ def _thumbnail(picture: Photograph) -> tuple[Array, list[tuple[float, float]]]:
     return small, [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in corners]
 
 
-def _lights(
+def _lights() -> Array:
+    """A row of small lights over stripes `[H, W]`."""
+    scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))
+    scene[44:46, 18::36] = 25.0
+    return scene
+
+
+def _around_the_dot(picture: Photograph) -> Array:
+    """The photograph's pixels `[H, W]` around the dot, half of the square wide and 240 at most."""
+    half = int(min(picture.target.side_px / 4, 120))
+    x, y = round(picture.target.x), round(picture.target.y)
+    return picture.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
+
+
+def _rendered(
     render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor],
+    scene: Array,
     table: BlurTable,
     width_px: int,
-    low: float,
-    high: float,
+    left: float,
+    right: float,
 ) -> Array:
-    """A row of small lights over stripes, the circle of confusion going from one measured end to the other."""
-    width, height = 720, 90
-    scene = 0.15 + 0.1 * (np.arange(width) // 12 % 2) * np.ones((height, 1))
-    scene[height // 2 - 1 : height // 2 + 1, 18::36] = 25.0
-    coc = torch.linspace(low, high, width, dtype=torch.float32).expand(1, 1, height, width)
+    """A part `[H, W]` of a frame of `width_px`, its circle of confusion going from `left` to `right` px."""
+    coc = torch.linspace(left, right, scene.shape[1], dtype=torch.float32).expand(1, 1, *scene.shape)
     # a table in mm of the sensor: seen through a part of the frame as wide as this picture
-    scaled = coc * (width / width_px) if table.unit == "relative" else coc
-    picture = torch.from_numpy(scene).float()[None, None]
-    shown = render(picture, scaled, _through(table, width / width_px))
+    shown = render(torch.from_numpy(scene).float()[None, None], coc, _through(table, scene.shape[1] / width_px))
     return np.clip(shown[0, 0].numpy().astype(np.float64), 0, 1)
 
 

@@ -1,15 +1,17 @@
 """`torchdof fit` as a user runs it."""
 
 import functools
+import importlib
 import json
 import shutil
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from torch import Tensor
 from typer.testing import CliRunner, Result
 
-from torchdof import BlurTable
+from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.main import app
 from torchdof.fit.lens import trace
 
@@ -109,8 +111,17 @@ def test_the_target_is_written_and_nothing_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
-def test_photographs_of_the_target_become_a_table_and_a_sheet(simulator: ModuleType, tmp_path: Path) -> None:
+def test_photographs_of_the_target_become_a_table_and_a_sheet(
+    simulator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     simulator.write_photographs(tmp_path / "phone", 0.2, [0.4], width=560, tone=0.0, noise=0.004)
+    rendered = []
+
+    def recorded(image: Tensor, coc_px: Tensor, *, table: BlurTable) -> Tensor:
+        rendered.append((image, coc_px))
+        return blur_by_coc(image, coc_px, table=table)
+
+    monkeypatch.setattr(importlib.import_module("torchdof.cli.fit"), "blur_by_coc", recorded)
     result = run(tmp_path / "phone", "-o", tmp_path / "phone.json", "--family", "disc")
     assert result.exit_code == 0, result.output
     told = " ".join(result.output.split())
@@ -118,6 +129,10 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(simulator: ModuleT
     table = BlurTable.load(tmp_path / "phone.json")
     assert table.unit == "mm" and table.provenance["sharp"] == "img_0000.jpg"
     assert (tmp_path / "phone.png").stat().st_size > 20_000
+    # lights through all circles of confusion, and the photograph in focus at the largest one
+    (_, lights), (photograph, coc_px) = rendered
+    assert lights.min() == 0 and coc_px.unique().tolist() == [lights.max()]
+    assert photograph.shape[-1] > 60 and photograph.max() > 0.7 and photograph[..., :5].max() < 0.1
 
 
 def test_field_and_wavelengths_of_a_lens(tmp_path: Path) -> None:
