@@ -162,19 +162,18 @@ def check_fit(
     if outside > _OUTSIDE_WARNED:
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {_size(pair)}; cut a larger one"
         warn(WindowWarning(text, file=file, number=outside), stacklevel)
-    if (
-        fit is not freest
-        and fit.residual > _SEEN
-        and fit.residual_over_noise > max(2.0, 1.3 * freest.residual_over_noise)
-    ):
+    ratio = freest.residual_over_noise
+    unexplained_light = (freest.residual > _MATTERS and ratio > FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0)
+    # of a residual that is said already, only what the family adds
+    most = max(2.0, 1.3 * ratio) if unexplained_light else 2.0
+    if fit is not freest and fit.residual > _SEEN and fit.residual_over_noise > most:
         text = (
             f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise ({100 * fit.residual:.1f} % "
-            f"of the light), the free profile {freest.residual_over_noise:.1f} times; it was chosen because what is "
+            f"of the light), the free profile {ratio:.1f} times; it was chosen because what is "
             "missing would not be seen at accuracy_db: ask for more, or for a richer family"
         )
         warn(ResidualWarning(text, file=file, number=fit.residual_over_noise), stacklevel)
-    ratio = freest.residual_over_noise
-    if (freest.residual > _MATTERS and ratio > FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0):
+    if unexplained_light:
         text = (
             f"the residual is {100 * freest.residual:.1f} %, {ratio:.1f} times the noise; is the image linear, not "
             "sRGB encoded, a single white dot, and not a strong JPEG?"

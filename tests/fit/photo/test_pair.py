@@ -13,7 +13,8 @@ from scipy.stats import norm
 
 from torchdof.fit import fit_pair, natural_psnr
 from torchdof.fit import problems as p
-from torchdof.fit.photo.diagnostics import asymmetry_of
+from torchdof.fit.photo.description import describe
+from torchdof.fit.photo.diagnostics import asymmetry_of, check_fit
 from torchdof.fit.photo.kernel_image import fit_kernel_image
 from torchdof.fit.photo.pair import prepared_pair
 from torchdof.optics.psf import pixel_kernels
@@ -295,6 +296,17 @@ def test_the_rounding_of_a_file_is_no_tone_curve(simulator, harm, colours):
     camera = simulator.Simulator(bits=8, dot_radius=9.0, **harm)
     pairs = [camera.pair("disc", {"radius": 6.0}, seed) for seed in range(colours)]
     fit_pair(*np.mean(pairs, axis=0), "disc", white=1.0)  # as of a file
+
+
+@pytest.mark.parametrize(("cheap", "freest"), [(2.1, 1.7), (2.5, 1.95), (2.1, 1.0)])
+def test_twice_the_noise_is_never_silent(simulator, cheap, freest):
+    pair, _, _ = prepared_pair(*simulator.Simulator().pair("disc", {"radius": 6.0}), "auto", 1.0, None, (None, None))
+    solution = pair.solve("disc")
+    fit = describe(pair, solution, "")
+    noise = 0.0015
+    chosen = replace(fit, residual=cheap * noise, noise=noise)
+    with pytest.warns(p.ResidualWarning, match=f"'disc' leaves {cheap} times the noise"):
+        check_fit(pair, solution, chosen, (None, None), replace(chosen, family="radial", residual=freest * noise))
 
 
 def test_a_dot_that_is_mostly_clipped_is_refused(simulator):
