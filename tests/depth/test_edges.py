@@ -151,6 +151,16 @@ def test_a_lamp_whose_depth_was_averaged_away_gets_it_back() -> None:
     assert 0.4 < float((1 / repair_edges(image, given, "auto"))[lamps].mean()) < 0.6
 
 
+def test_the_pixels_of_a_lamp_get_one_depth_though_some_are_brighter() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image, depth = 0.2 + 0.02 * torch.rand(1, 3, 96, 128, generator=generator), torch.full((1, 1, 96, 128), 8.0)
+    lamps = [(..., slice(row, row + 3), slice(row // 3 + 4, row // 3 + 7)) for row in range(12, 90, 16)]
+    for lamp in lamps:
+        image[lamp], depth[lamp] = 50.0 + 150.0 * torch.rand(1, 3, 3, 3, generator=generator), 2.0
+    mended = 1 / repair_edges(image, degrade(depth, "half-res"), "auto")
+    assert max(float(mended[lamp].max() - mended[lamp].min()) for lamp in lamps) < 0.005
+
+
 @pytest.mark.parametrize("times", [2.0**-10, 2.0**20])
 def test_the_brightness_of_the_image_changes_nothing(scene: Scene, times: float) -> None:
     depth = degrade(scene.depth, "half-res")

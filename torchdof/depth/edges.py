@@ -46,7 +46,8 @@ _ROUNDS = 10
 _SHARPNESS = 1.6  # how much surer colours are than their likelihoods say, which count witnesses on the wrong side
 _MOST = 4.0  # times its own step, a thin structure stands out at most
 _BLUR_REACH = 9
-_MIDDLE_HALF = 1.47  # standard deviations that the middle half of a blurred step is wide; 1.35 if its ends were known
+_CLIMBED = 0.35  # standard deviations of the blur, by pixels of the middle half of its ramps and steps they climb
+_PIXEL = 0.2  # of its variance that comes from looking at pixels
 _BETTER = 0.5  # part of what a shape leaves unexplained that its blur explains, where it is blurred
 _LEAN = 2.0  # by how much likelier the far surface must be, as a logarithm: foreground left behind is seen more
 _PRIOR_COUNT = 30.0  # pixels for which the assumption that a map is exact stands
@@ -212,11 +213,13 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     # and what is so thin that a ramp swallowed part of its depth
     length = climb.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     # standard deviation of the blur that made ramps of an item's steps
-    sigma = (is_mixed.sum((1, 2, 3), keepdim=True) / (_MIDDLE_HALF * length)).clamp(0.2, 3.0)
+    climbed = (climb * is_mixed).sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    ramp_px = _CLIMBED * is_mixed.sum((1, 2, 3), keepdim=True) / climbed
+    sigma = (ramp_px.square() - _PIXEL).clamp_min(0.0).sqrt().clamp(0.2, 3.0)
     label = torch.where(edges.is_edge, is_near, 2.0 * given > _highest(given, 6) - _highest(-given, 6))
     label = pixels.put(label.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
     lost_px = torch.where(edges.is_edge, label - level, 0.0).sum((1, 2, 3), keepdim=True) / length
-    near, far = _unmix(given, edges, label, sigma, lost_px, edge_pixels, near, far)
+    near, far = _unmix(given, edges, label, is_soft, sigma, lost_px, edge_pixels, near, far)
 
     own = pixels.pick(given, edge_pixels)[0]
     is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
@@ -443,13 +446,14 @@ def _unmix(
     nearness: Tensor,
     edges: _Edges,
     label: Tensor,
+    is_soft: Tensor,
     sigma: Tensor,
     lost_px: Tensor,
     edge_pixels: Tensor,
     near: Tensor,
     far: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best."""
+    """The surfaces at a soft map's edges where one is thin: as near and far as its blurred shape explains best."""
     blurred = _blurred(label, sigma)
     gap = near - far
     item = edge_pixels // label[0].numel()
@@ -457,7 +461,7 @@ def _unmix(
         shape = label if is_near else 1.0 - label
         whole = torch.where(edges.is_edge, shape, 1.0)
         thick = _highest(-_highest(-whole, 2), 2) > 0
-        thin = pixels.pick(edges.is_edge & (shape > 0) & ~thick, edge_pixels)[0]
+        thin = pixels.pick(edges.is_edge & is_soft & (shape > 0) & ~thick, edge_pixels)[0]
         chosen = thin.nonzero()[:, 0]
         at = edge_pixels[chosen]
         least, difference, fit = _regress(nearness, label, blurred, at)
@@ -492,10 +496,15 @@ def _lift_lamps(
     cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
     lamp_pixels = pixels.indices(is_lamp)
     behind, difference, fit = _regress(nearness, cover, _blurred(cover, sigma), lamp_pixels)
+    # the pixels of a lamp are one surface
+    weight = fit * pixels.pick(cover, lamp_pixels)[0]
+    window, none = pixels.around(lamp_pixels, nearness, 2), torch.zeros_like(nearness)
+    values = (weight, weight * (behind + difference.clamp_min(0.0)), weight * fit)
+    total, level, fit = (pixels.pick(pixels.put(none, lamp_pixels, v), window)[0].sum(0) for v in values)
+    level, fit = (values / total.clamp_min(1e-9) for values in (level, fit))
     fit = fit * _is_lost(lost_px)[lamp_pixels // nearness[0].numel()]
     own = pixels.pick(repaired, lamp_pixels)[0]
-    gain = fit * (behind + difference.clamp_min(0.0) - own).clamp_min(0.0)
-    return pixels.put(repaired, lamp_pixels, own + gain)
+    return pixels.put(repaired, lamp_pixels, own + fit * (level - own).clamp_min(0.0))
 
 
 def _is_lost(lost_px: Tensor) -> Tensor:

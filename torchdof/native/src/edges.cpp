@@ -14,9 +14,9 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
-constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, SHARPNESS = 1.6f, MOST = 4.0f, MIDDLE_HALF = 1.47f, BETTER = 0.5f, LEAN = 2.0f;
+constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, SHARPNESS = 1.6f, MOST = 4.0f, CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr float NOISES = 12.0f;
-constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+constexpr int NOISE_SAMPLED = 1 << 15, SAMPLED = 1 << 17, SAMPLE_BLOCK = 32, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
@@ -255,6 +255,7 @@ struct Group {
 // What edges are, in sums.
 struct Found {
   double length = 0;    // of steps, in pixels
+  double climbed = 0;   // of it in the middle half of steps
   double lost = 0;      // pixels that the map shows as near, less what it has of the near surface
   int64_t middles = 0;  // pixels in the middle half of a step
 };
@@ -291,7 +292,8 @@ class Repair {
     decide(groups);
     const float sigma = blur();
     const float lost_px = choose(groups);
-    move(groups, sigma, lost_px);
+    if (is_soft) unmix(groups, sigma, lost_px);
+    move(groups);
     if (is_soft) lift_lamps(sigma, lost_px);
     return true;
   }
@@ -499,6 +501,7 @@ class Repair {
     found_ = {};
     for (const Found &here : found) {
       found_.length += here.length;
+      found_.climbed += here.climbed;
       found_.lost += here.lost;
       found_.middles += here.middles;
     }
@@ -645,9 +648,12 @@ class Repair {
         if (!(marks[k] & EDGE) || !group.part.has(y, x)) continue;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
         const bool is_ramp = marks[k] & RAMP;
-        found.length += climb(value, -1, 1, -raw.pitch, raw.pitch, gap);
+        const float climbed = climb(value, -1, 1, -raw.pitch, raw.pitch, gap);
+        const bool is_middle = std::fabs(level - 0.5f) < 0.25f;
+        found.length += climbed;
+        found.climbed += is_middle ? climbed : 0.0f;
+        found.middles += is_middle;
         found.lost += (marks[k] & NEAR ? 1.0f : 0.0f) - clamp01(level);
-        found.middles += std::fabs(level - 0.5f) < 0.25f;
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
         const int across = std::fabs(right) > std::fabs(below) + TIE * gap ? (right > 0 ? 1 : -1) : 0;
         const int along = std::fabs(below) > std::fabs(right) + TIE * gap ? (below > 0 ? 1 : -1) : 0;
@@ -927,7 +933,10 @@ class Repair {
   }
 
   // Standard deviation of the blur that made ramps of steps.
-  float blur() const { return clamp((float)(found_.middles / (MIDDLE_HALF * std::max(found_.length, 1e-12))), 0.2f, 3.0f); }
+  float blur() const {
+    const double width = CLIMBED * found_.middles / std::max(found_.climbed, 1e-12);
+    return clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), 0.2f, 3.0f);
+  }
 
   // Marks the pixels that show the near surface; returns how many pixels of it at each edge the map has as far ones.
   float choose(const std::vector<Group> &groups) {
@@ -954,12 +963,10 @@ class Repair {
   static float is_lost(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
 
   // Gives pixels the depth of the surface that they show; on ramps as far as there is evidence.
-  void move(const std::vector<Group> &groups, float sigma, float lost_px) const {
-    const std::vector<float> weights = even_window();
+  void move(const std::vector<Group> &groups) const {
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
       if (group.edges.empty()) return;
-      unmix(group, weights.data(), sigma, lost_px);
       // from the ends of a wide ramp only one of the surfaces is in sight: what is three pixels away tells
       const Part around = group.bounds.grown(3);
       const Grid evidence(around), strongest(group.bounds), rows(around);
@@ -1017,7 +1024,14 @@ class Repair {
     return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - 0.5f) / 0.3f) * better : 0.0f};
   }
 
-  // The surfaces at edge pixels where one is thin: as near and far as their blurred shape explains the map best.
+  // The surfaces at a soft map's edges where one is thin: as near and far as its blurred shape explains best.
+  void unmix(const std::vector<Group> &groups, float sigma, float lost_px) const {
+    const std::vector<float> weights = even_window();
+    parallel((int)groups.size(), [&](int g) {
+      if (!groups[g].edges.empty()) unmix(groups[g], weights.data(), sigma, lost_px);
+    });
+  }
+
   void unmix(const Group &group, const float *weights, float sigma, float lost_px) const {
     const int reach = blur_reach(sigma);
     const std::vector<uint8_t> is_thin = thin(group);
@@ -1107,7 +1121,7 @@ class Repair {
     const std::vector<Group> all_parts = tiles();
     const int reach = blur_reach(sigma);
     parallel((int)all_parts.size(), [&](int g) {
-      const Part &part = all_parts[g].part;
+      const Part &inner = all_parts[g].part, part = in_frame(inner.grown(LAMP_REACH));
       const Grid near(part.grown(REACH));
       fetch(map_.nearness, near, valid);
       vec high = all(-NONE), low = all(NONE);
@@ -1129,11 +1143,26 @@ class Repair {
       go_on(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
       fetch(map_.nearness, given, valid);
+      const Grid lamps(part.grown(LAMP_REACH), 3);  // weights, and by these nearness and how well it fits
+      std::fill(lamps.at(lamps.y0, lamps.x0), lamps.at(lamps.y0, lamps.x0) + 3 * lamps.size, 0.0f);
+      each_edge(group, [&](size_t, const Edge &, int y, int x) {
+        const Line line = regress(given, usual, blurred, weights.data(), y, x);
+        const float weight = line.fit * *usual.at(y, x);
+        float *lamp = lamps.at(y, x);
+        lamp[0] = weight;
+        lamp[lamps.size] = weight * (line.least + std::max(line.difference, 0.0f));
+        lamp[2 * lamps.size] = weight * line.fit;
+      });
+      // the pixels of a lamp are one surface
       each_edge(group, [&](size_t, const Edge &lamp, int y, int x) {
-        Line line = regress(given, usual, blurred, weights.data(), y, x);
-        line.fit *= is_lost(lost_px);
+        if (!inner.has(y, x)) return;
+        float sums[3] = {0, 0, 0};
+        for (int v = y - LAMP_REACH; v <= y + LAMP_REACH; v++)
+          for (int u = x - LAMP_REACH; u <= x + LAMP_REACH; u++)
+            for (int n = 0; n < 3; n++) sums[n] += lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
+        const float per_weight = 1.0f / std::max(sums[0], 1e-9f);
         float &out = map_.out[lamp.i];
-        out += line.fit * std::max(line.least + std::max(line.difference, 0.0f) - out, 0.0f);
+        out += sums[2] * per_weight * is_lost(lost_px) * std::max(sums[1] * per_weight - out, 0.0f);
       });
     });
   }
