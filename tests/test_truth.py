@@ -12,6 +12,7 @@ import torch
 import torchdof.render
 from torchdof import DepthOfField
 from torchdof.bench.accuracy import ikoma
+from torchdof.optics import placed_kernels
 from torchdof.optics.kernel_cache import KernelCache
 from torchdof.reference import metrics
 from torchdof.reference.scenes import Scene, read_scenes
@@ -82,13 +83,6 @@ SPEED_OR_ROUNDING = {
     "downsampling._MOMENT_REACH",
     "downsampling._PERIOD",
     "downsampling._STEP_PX",
-    "field.DISTANCES",
-    "field._ASIDE",
-    "field._FINE",
-    "field._LEAST",
-    "field._MARGIN",
-    "field._MOST",
-    "field._SMALLEST",
     "headroom._SUMMED",
     "highlights.COARSE_CELL",
     "highlights._TAPS",
@@ -98,6 +92,13 @@ SPEED_OR_ROUNDING = {
     "matting._MOST_WEIGHT",
     "matting._UNBOUNDED",
     "pipeline._REACH",
+    "placed_kernels.DISTANCES",
+    "placed_kernels._ASIDE",
+    "placed_kernels._FINE",
+    "placed_kernels._LEAST",
+    "placed_kernels._MARGIN",
+    "placed_kernels._MOST",
+    "placed_kernels._SMALLEST",
     "plan.KERNELS_PER_PX",
     "plan._FEWER_KERNELS_PER_PX",
     "plan._SMALL_RADII",
@@ -108,9 +109,6 @@ HELD_BESIDE_IT = {
     "attention._FADE",
     "disocclusion._CERTAIN",
     "field.BLOCK",
-    "field._LEAST_SEEN",
-    "field._LEAST_SIZE",
-    "field._RAY_STEP",
     "highlights._LEAST_PX",
     "layer_cocs.DENSE",
     "layer_cocs._FINEST_PARTS",
@@ -120,6 +118,9 @@ HELD_BESIDE_IT = {
     "layer_weights._IN_FOCUS",
     "matting._ALIKE",
     "pipeline._SAME_PX",
+    "placed_kernels._LEAST_SEEN",
+    "placed_kernels._LEAST_SIZE",
+    "placed_kernels._RAY_STEP",
     "plan._FARTHEST_PX",
     "plan._LEAST_CUT",
     "surfaces._HAIR",
@@ -127,10 +128,14 @@ HELD_BESIDE_IT = {
 """What no crop needs, but a test of its own module does: seen to fail with twice the number."""
 
 
+# modules of the plain engine
+FOLDERS = ("torchdof.render.", "torchdof.optics.placed_kernels")
+
+
 def numbers() -> list[str]:
     """Numbers that the plain engine is made with, as ``module.NAME``."""
     found = []
-    for path in sorted(Path(torchdof.render.__file__).parent.glob("*.py")):
+    for path in [*sorted(Path(torchdof.render.__file__).parent.glob("*.py")), Path(placed_kernels.__file__)]:
         for statement in ast.parse(path.read_text()).body:
             if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
                 name = f"{path.stem}.{statement.targets[0].id}"
@@ -141,7 +146,8 @@ def numbers() -> list[str]:
 
 def value_of(name: str) -> Any:
     module, constant = name.split(".")
-    return getattr(importlib.import_module(f"torchdof.render.{module}"), constant)
+    folder = "optics" if module == "placed_kernels" else "render"
+    return getattr(importlib.import_module(f"torchdof.{folder}.{module}"), constant)
 
 
 def test_what_is_held_elsewhere_exists() -> None:
@@ -156,7 +162,7 @@ def test_twice_a_number_is_another_picture(monkeypatch: pytest.MonkeyPatch, name
     monkeypatch.setattr(downsampling, "_factors", KernelCache(2**20))
     value, constant = value_of(name), name.split(".")[1]
     twice = tuple(2 * part for part in value) if isinstance(value, tuple) else 2 * value
-    for module in [m for key, m in sys.modules.items() if key.startswith("torchdof.render.")]:
+    for module in [m for key, m in sys.modules.items() if key.startswith(FOLDERS)]:
         if getattr(module, constant, None) is value:  # where it is made, and where it was imported to
             monkeypatch.setattr(module, constant, twice)
     try:

@@ -18,11 +18,11 @@ from pathlib import Path
 import torch
 
 from torchdof import BlurTable, Camera, DepthOfField
-from torchdof.optics import psf
+from torchdof.optics import placed_kernels, psf
 from torchdof.optics.field import Field
-from torchdof.render import compiled, downsampling, field, plan
+from torchdof.render import compiled, downsampling, plan
 
-CACHES = [plan._kernels, compiled._kernels, field._shares, psf._quadrants, downsampling._factors]
+CACHES = [plan._kernels, compiled._kernels, placed_kernels._shares, psf._quadrants, downsampling._factors]
 
 
 def lens_with_a_field() -> BlurTable:

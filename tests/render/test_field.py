@@ -12,8 +12,9 @@ from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.io.transfer import encode
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
+from torchdof.optics.placed_kernels import layer_shares, own_kernels, placed
 from torchdof.reference.metrics import psnr
-from torchdof.render.field import BLOCK, layer_shares, own_kernels, placed
+from torchdof.render.field import BLOCK
 
 CUT = Aperture(vignetting=0.4)
 TABLE = BlurTable.disc().with_aperture(CUT)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..io.sheet import write_sheet
 from ..optics import table_file
 from ..optics.blur_table import BlurTable
-from ..render.field import layer_shares, own_kernels, placed
+from ..optics.placed_kernels import layer_shares, own_kernels, placed
 from .arguments import ApertureImage, AsJson, Blades, Curvature, Rotation, Squeeze, Vignetting
 from .printed import json_line
 from .settings import load_aperture, load_table

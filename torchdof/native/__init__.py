@@ -46,7 +46,7 @@ _Floats = ctypes.POINTER(ctypes.c_float)
 
 
 class FieldShares(Protocol):
-    """What the field lets through of kernels of a radius: :class:`torchdof.render.field.Shares`."""
+    """What the field lets through of kernels of a radius: :class:`torchdof.optics.placed_kernels.Shares`."""
 
     @property
     def values(self) -> Tensor:

@@ -47,7 +47,7 @@ class Aperture:
         vignetting: How much of its width a cat's eye in the corner of the frame lacks in height, from 0 (none) to 1
             (closed): the lens's rims, one in front of the opening and one behind it, move before it towards the corners
             and cut off half of that each. Or the share of either, ``(front, rear)``
-            (:mod:`torchdof.render.field`).
+            (:mod:`torchdof.optics.placed_kernels`).
 
     Raises:
         ValueError: If a number is out of its range, or the mask is dark or has blades as well.

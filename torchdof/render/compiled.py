@@ -10,10 +10,10 @@ from .. import native
 from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
+from ..optics.placed_kernels import Shares, ray_shares
 from ..options import Options
 from ..validation import is_traced
 from . import headroom
-from .field import Shares, ray_shares
 from .plan import KERNELS_PER_PX, Blur, Plan, kernels_for
 
 __all__ = ["picture"]

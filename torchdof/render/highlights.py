@@ -22,9 +22,9 @@ from torch import Tensor
 from .. import pixels
 from ..exporting import exported_graph, where_needed
 from ..optics.blur_table import BlurTable
+from ..optics.placed_kernels import Shares, placed_between, ray_shares
 from ..validation import is_traced
 from .disocclusion import HIDDEN_WEIGHT
-from .field import Shares, placed, ray_shares
 from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import Surface
 
@@ -185,7 +185,7 @@ def splat(
         if shares:
             half_diagonal = 0.5 * math.hypot(height, width)
             y, x = ((row[part] + 0.5 - height / 2) / half_diagonal, (column[part] + 0.5 - width / 2) / half_diagonal)
-            kernels = _placed(kernels, shares, coc[part], y, x)
+            kernels = placed_between(kernels, shares, coc[part], y, x)
         half = kernels.shape[-1] // 2
         step = torch.arange(-half, half + 1, device=light.device)
         landing = kernels * light[:, part].t()[:, :, None, None]
@@ -198,19 +198,6 @@ def splat(
         start = stop
     frame = splats.unflatten(1, (batch, height + 2 * margin, across)).transpose(0, 1)
     return frame[..., margin : margin + height, margin : margin + width]
-
-
-def _placed(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]`` of sources ``[n]`` at places, with the shares of the radii around each of them."""
-    radii = torch.tensor([each.coc_px for each in shares], dtype=coc.dtype, device=coc.device)
-    low = (torch.searchsorted(radii, coc.detach().contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
-    parts = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)
-    made = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], shares[0].values.shape[0]), -1, -1))
-    for k in low.unique().tolist():
-        of = (low == k).nonzero()[:, 0]
-        pair = [(shares[k], 1.0 - parts[of]), (shares[k + 1], parts[of])]
-        made = made.index_put((of,), placed(kernels[of], pair, y[of], x[of]))
-    return made
 
 
 def obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
+from ..optics.placed_kernels import Shares, layer_shares, own_kernels
 from ..options import tolerance_of
 from ..validation import is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
-from .field import Shares, layer_shares, own_kernels
 from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 
 __all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]

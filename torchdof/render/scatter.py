@@ -9,9 +9,10 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..optics.placed_kernels import Shares
 from ..validation import is_traced
 from .convolution import DIRECT_TAPS, widest_float
-from .field import Shares, of_pixels
+from .field import of_pixels
 
 __all__ = ["fold"]
 

@@ -25,7 +25,7 @@ enum {
   TORCHDOF_STACK = 2,       // surfaces that cover each other, near to far, as they are
 };
 
-// What the field lets through of a kernel, as render/field.py tells it.
+// What the field lets through of a kernel, as optics/placed_kernels.py tells it.
 typedef struct {
   const float *values;     // [colours, distances, rows, columns]
   const float *boxes;      // [distances, 3]: middle away from the middle of the frame, half length, width, in its pixels

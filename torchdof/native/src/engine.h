@@ -410,7 +410,7 @@ class Downsampled {
 constexpr int STRIP_ROWS = 4, STRIP_COLUMNS = 2 * LANES, STRIP = STRIP_ROWS * STRIP_COLUMNS;
 Kernel make_kernel(const float *values, int half, bool one_sided);
 
-// What the field lets through of a kernel at a place in the frame: render/field.py.
+// What the field lets through of a kernel at a place in the frame: optics/placed_kernels.py.
 class Turned {
  public:
   static constexpr int ROWS = 8, COLUMNS = 16;  // whose pixels share a kernel

@@ -1,0 +1,226 @@
+"""Kernels that depend on the place in the frame: a kernel times what the field lets through, turned by the azimuth.
+
+A lens is round. So what it does off its axis is told along one line from the middle of the frame, at a few distances
+from it, in coordinates ``u`` away from the middle and ``v`` across (:mod:`torchdof.optics.field`). The kernel of a
+place is the table's own at each pixel times the *share* there: of two distances the mean, turned by the place's
+azimuth, sampled linearly. Then its light is made whole again: how much darker corners are, the sharp image shows
+already.
+
+* Traced and measured spots: the table's kernel is even light, the share the spot itself, seen by a pixel.
+* Cat's eyes (``vignetting=``): the table's kernel is that of the middle of the frame, with all its blades. A ray
+  through the point ``w`` of the aperture, to a place ``p`` in the frame (from its middle, in half diagonals), passes
+  where ``|w + 2 front p| <= 1`` and ``|w - 2 rear p| <= 1``: a rim in front of the aperture and one behind it cut.
+  The share is the distance in pixels to the nearer rim's edge, plus half a pixel, from 0 to 1.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from .blur_table import BlurTable
+from .field import deviations
+from .kernel_cache import KernelCache
+
+__all__ = ["DISTANCES", "Shares", "layer_shares", "own_kernels", "placed", "placed_between", "ray_shares"]
+
+DISTANCES = 17
+"""Distances from the middle of the frame to its corner at which shares are told."""
+
+_FINE = 4.0  # samples a pixel
+_MOST = 64  # samples on each side of the origin
+_LEAST_SEEN = 0.5  # px around a sample
+_MARGIN = 1.0  # px around a spot: none of its light is at the border of the samples
+_ASIDE = 1e-6  # half diagonals: the middle of the frame has an azimuth
+_SMALLEST = 1e-6  # px of blur, that a spot has a size
+_LEAST = 1e-6  # of a kernel; where less passes it stays whole
+_LEAST_SIZE = 0.5  # of a spot, which is made smaller by what pixels add to it
+_RAY_STEP = 1.09  # between radii of highlights for which shares are told
+_shares = KernelCache(128 * 2**20)
+
+
+def own_kernels(table: BlurTable, coc_px: Tensor, width: float, window: int | None = None) -> Tensor:
+    """Kernels ``[n, 1 or C, k, k]`` that shares are taken of: a table's own, or even light as far as spots reach.
+
+    Arguments are those of :meth:`torchdof.BlurTable.kernels`, which lenses that are alike everywhere have.
+    """
+    if table.field is None:
+        return table.kernels(coc_px, width, window=window)
+    per_unit = table.px_per_unit(width)
+    reach = table.field.reach(coc_px.detach() / per_unit) * (per_unit * coc_px.detach().abs().clamp(max=1.0))
+    reach = torch.where(coc_px.detach() == 0, 0.0, reach.to(torch.float64) + math.sqrt(2.0) * _MARGIN)
+    half = math.floor(float(reach.max()))
+    half = half if window is None else min(half, window // 2)
+    step = torch.arange(-half, half + 1, dtype=torch.float64, device=coc_px.device)
+    disc = (torch.hypot(step[:, None], step) <= reach[:, None, None]).to(torch.float64)
+    return (disc / disc.sum((-2, -1), keepdim=True)).unsqueeze(1).expand(-1, table.channels, -1, -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shares:
+    """What the field lets through, of one radius.
+
+    Args:
+        values: ``[1 or C, distances, rows, columns]``: rows along u, from the end next to the middle of the frame, and
+            columns along v from 0; :data:`DISTANCES` of them, evenly from the middle of the frame to its corner.
+        boxes: Where these lie ``[distances, 3]``: their middle in u, half their length in u and their width in v, in
+            pixels of the kernel.
+        coc_px: The radius, signed, in such pixels.
+        squeeze: Height of the blur over its width: of places across, the share is that of so many times as far.
+    """
+
+    values: Tensor
+    boxes: Tensor
+    coc_px: float
+    squeeze: float | Tensor = 1.0
+
+    def to(self, like: Tensor) -> "Shares":
+        """The same in the type and on the device of a tensor."""
+        return dataclasses.replace(
+            self, values=self.values.to(like).contiguous(), boxes=self.boxes.to(like).contiguous()
+        )
+
+
+def layer_shares(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int]) -> Shares:
+    """Shares of a layer.
+
+    Args:
+        table: One that depends on the place.
+        coc_px: Signed coc in pixels of the image.
+        scale: Every so many pixels of the image are one of the layer's.
+        size: Height and width of the image.
+    """
+    key = ("layer", table.fingerprint(), coc_px, scale, size)
+    values, boxes = _shares.get(key, lambda: _made(table, coc_px, scale, size))
+    return Shares(values, boxes, coc_px / scale, _squeeze(table))
+
+
+def ray_shares(table: BlurTable, coc_px: Sequence[float], size: tuple[int, int]) -> list[Shares]:
+    """Shares for highlights of so many signed coc, by growing coc: those of two fixed radii around each of them."""
+    steps = set()
+    for coc in coc_px:
+        step = math.floor(math.log(max(abs(coc), 1.0)) / math.log(_RAY_STEP))
+        steps |= {(coc < 0, step), (coc < 0, step + 1)}
+    radii = sorted(math.copysign(_RAY_STEP**step, -1.0 if near else 1.0) for near, step in steps)
+    keys = [("ray", table.fingerprint(), radius, 1, size) for radius in radii]
+    made = _shares.get_all(keys, lambda missing: [_made(table, key[2], 1, size) for key in missing])
+    squeeze = _squeeze(table)
+    return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(made, radii, strict=True)]
+
+
+def _squeeze(table: BlurTable) -> float | Tensor:
+    return 1.0 if table.aperture is None else table.aperture.squeeze
+
+
+@torch.inference_mode(False)  # what is kept must serve autograd as well
+def _made(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Values and boxes of :class:`Shares`, float64."""
+    half_diagonal = 0.5 * math.hypot(*size)
+    distance = torch.linspace(0.0, 1.0, DISTANCES, dtype=torch.float64)
+    if table.field is None:
+        return _through_rims(table, coc_px / scale, size[1] / scale, distance)
+    per_unit = table.px_per_unit(size[1])
+    boxes, light = table.field.spots(coc_px / per_unit, distance * half_diagonal / per_unit)
+    # in focus a point stays one; nothing sets in at once
+    boxes = boxes * (per_unit / scale * min(1.0, max(abs(coc_px), _SMALLEST)))
+    # what averaging over blocks, interpolation between them, and the box of a pixel here add
+    added = (1 / 4 - 1 / (12 * scale**2) if scale > 1 else 0.0) + 1 / 12
+    cells = boxes[:, 1:] * torch.tensor([2.0, 1.0], dtype=torch.float64) / torch.tensor(light.shape[-2:])
+    spread = deviations(boxes, light).square()
+    smaller = (1.0 - added / spread.clamp_min(1e-12)).clamp_min(_LEAST_SIZE**2).sqrt()
+    boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * smaller], -1)
+    around = boxes + torch.tensor([0.0, _MARGIN, _MARGIN], dtype=torch.float64)
+    rows, columns = (min(_MOST, math.ceil(_FINE * float(side))) for side in around[:, 1:].amax(0))
+    along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64) * around[:, 1:2] + around[:, :1]
+    across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64) * around[:, 2:]
+    length, width = light.shape[-2:]
+    ends = torch.linspace(-1.0, 1.0, length + 1, dtype=torch.float64) * boxes[:, 1:2] + boxes[:, :1]
+    sides = torch.linspace(-1.0, 1.0, 2 * width + 1, dtype=torch.float64) * boxes[:, 2:]
+    whole = torch.cat([light.flip(-1), light], -1)  # [C, distances, U, 2 V]
+    area = cells.prod(-1)[:, None, None]
+    # a sample sees as much of it as makes one pixel with what light gathered in cells and linear interpolation add
+    samples = around[:, 1:] / torch.tensor([rows, columns])
+    pixel = (1.0 - 2.0 * samples.square() - 3.0 * cells.square()).clamp_min(_LEAST_SEEN**2).sqrt()
+    values = _overlaps(along, ends, pixel[:, 0]) @ (whole / area)
+    values = values @ _overlaps(across, sides, pixel[:, 1]).transpose(-2, -1)
+    return values / values.amax((0, 2, 3), keepdim=True), around
+
+
+def _overlaps(place: Tensor, ends: Tensor, width: Tensor) -> Tensor:
+    """Length of each cell that so much around a place covers: ``[n, places, cells]``."""
+    place, half = place[:, :, None], 0.5 * width[:, None, None]
+    low = torch.maximum(place - half, ends[:, None, :-1])
+    return (torch.minimum(place + half, ends[:, None, 1:]) - low).clamp_min(0.0)
+
+
+def _through_rims(table: BlurTable, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances in pixels from the edges of the aperture's rims, as shares."""
+    if table.aperture is None:
+        raise AssertionError("a table that depends on the place has a field or rims")
+    reach = math.ceil(table.reach_px(coc_px, width)) + 1.0
+    boxes = torch.tensor([0.0, reach, reach * max(1.0, float(table.aperture.squeeze))], dtype=torch.float64)
+    boxes = boxes[[0, 2, 2]].expand(len(distance), 3)
+    count = min(2 * _MOST, math.ceil(float(boxes[0, 1])))
+    along = torch.linspace(-1.0, 1.0, 2 * count + 1, dtype=torch.float64) * boxes[0, 1]
+    across = torch.linspace(0.0, 1.0, count + 1, dtype=torch.float64) * boxes[0, 2]
+    front, rear = table.aperture.rims
+    inside = []
+    for shift in (2.0 * front * coc_px, -2.0 * rear * coc_px):
+        away = torch.hypot(along[None, :, None] + shift * distance[:, None, None], across)
+        # a rim that is shifted by less than a pixel cuts off less: kernels of the middle stay as they are
+        slack = 4.0 * (abs(coc_px) + 1.0) * (1.0 - abs(shift) * distance).clamp_min(0.0)[:, None, None]
+        inside.append(abs(coc_px) + 0.5 + slack - away)
+    return torch.minimum(*inside).unsqueeze(0), boxes.contiguous()
+
+
+def placed(kernel: Tensor, shares: Sequence[tuple[Shares, Tensor]], y: Tensor, x: Tensor) -> Tensor:
+    """Kernels of places in the frame.
+
+    Args:
+        kernel: The table's own, ``[1 or n, 1 or C, k, k]``.
+        shares: Those of one radius, or of two neighbouring ones, each with its part ``[n]`` or ``[]``.
+        y: Places ``[n]``, in half diagonals down from the middle of the frame.
+        x: The same to the right.
+
+    Returns:
+        ``[n, 1 or C, k, k]``, each with as much light as the table's own.
+    """
+    step = torch.arange(kernel.shape[-1], dtype=kernel.dtype, device=kernel.device) - kernel.shape[-1] // 2
+    y, x = (t.to(kernel.dtype)[:, None, None] for t in (y, x))
+    x = x + _ASIDE
+    distance = torch.sqrt(y * y + x * x)
+    down, right = y / distance, x / distance
+    place = distance.flatten().clamp(max=1.0) * (DISTANCES - 1)
+    low = place.long().clamp(max=DISTANCES - 2)
+    near = place - low
+    across = step * shares[0][0].squeeze
+    u, v = step[:, None] * down + across * right, (across * down - step[:, None] * right).abs()
+    of_place = []
+    for each, _ in shares:
+        of_place.append(torch.lerp(each.boxes[low], each.boxes[low + 1], near[:, None]))  # [n, 3]
+    box = torch.stack([part.reshape(-1, 1) * box for (_, part), box in zip(shares, of_place, strict=True)]).sum(0)
+    grid = torch.stack([2.0 * v / box[:, 2:, None] - 1.0, (u - box[:, :1, None]) / box[:, 1:2, None]], -1)
+    share = kernel.new_zeros(())
+    for each, part in shares:
+        values = torch.lerp(each.values[:, low], each.values[:, low + 1], near[:, None, None]).transpose(0, 1)
+        taken = functional.grid_sample(values, grid, padding_mode="border", align_corners=True).clamp(0.0, 1.0)
+        share = share + part.reshape(-1, 1, 1, 1) * taken
+    cut = kernel * share
+    light, left = (k.sum((-2, -1), keepdim=True) for k in (kernel, cut))
+    return torch.where(left > _LEAST * light, cut * (light / left.clamp_min(1e-30)), kernel)
+
+
+def placed_between(kernels: Tensor, shares: Sequence[Shares], coc: Tensor, y: Tensor, x: Tensor) -> Tensor:
+    """Kernels ``[n, 1 or C, k, k]`` of sources ``[n]`` at places, with the shares of the radii around each of them."""
+    radii = torch.tensor([each.coc_px for each in shares], dtype=coc.dtype, device=coc.device)
+    low = (torch.searchsorted(radii, coc.detach().contiguous(), right=True) - 1).clamp(0, len(radii) - 2)
+    parts = ((coc - radii[low]) / (radii[low + 1] - radii[low])).clamp(0.0, 1.0)
+    made = torch.empty_like(kernels.expand(-1, max(kernels.shape[1], shares[0].values.shape[0]), -1, -1))
+    for k in low.unique().tolist():
+        of = (low == k).nonzero()[:, 0]
+        pair = [(shares[k], 1.0 - parts[of]), (shares[k + 1], parts[of])]
+        made = made.index_put((of,), placed(kernels[of], pair, y[of], x[of]))
+    return made
