@@ -71,9 +71,12 @@ def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(simulator: Modu
     folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], kernel, grid=grid, width=240, height=120)
     manifest = folder / "capture.toml"
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
-    result = run(folder, "-o", tmp_path / "mine.json", "--family", "disc", "--dots", "each")
+    options = ("-o", tmp_path / "mine.json", "--family", "disc", "--dots", "each")
+    result = run(folder, *options)
     assert result.exit_code == 0, result.output
     assert "dot 1 at" in result.output and result.output.count("nobody said how") == 1
+    lines = run(folder, *options, "--json").stdout.splitlines()  # each is for a table of its own
+    assert ["nobody said how" in json.loads(line)["warnings"][0] for line in lines] == [True, True]
 
 
 def test_a_polygon_becomes_a_table_with_its_blades(simulator: ModuleType, tmp_path: Path) -> None:

@@ -192,11 +192,11 @@ def fit(
             console.print(f"dot {i} at {capture_set.notes['position_px']} px from the centre")
         command = f"torchdof fit {Path(str(captures)).name} --family {family} --accuracy-db {accuracy_db:g}"
         result, messages = _fit_with_progress(capture_set, family, accuracy_db, command, first, console)
-        messages = [message for message in (*doubts, *messages) if message not in said]
-        said.update(messages)
+        messages = [*doubts, *messages]
         first = first or result
         fitted.append((capture_set, result))
-        _summary(capture_set, result, messages, console)
+        _summary(capture_set, result, [message for message in messages if message not in said], console)
+        said.update(messages)
         if not across:
             _write(result.table, table_file, console)
         if as_json:
