@@ -315,7 +315,7 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
     fits = result.fits
     ratios = ["" if math.isnan(f.residual_over_noise) else f"{f.residual_over_noise:.2f}" for f in fits]
     columns = {
-        "distance m": [f"{pair.distance_m:g}" for pair in captures],
+        "distance m": [f"{pair.distance_m:.4g}" for pair in captures],
         "coc px": [f"{coc:+.2f}" for coc in result.coc_px],
         "measured": [f"{f.radius:.2f}" for f in fits],
         **{n: [f"{f.params[n]:.3f} ± {f.stderr[n]:.2g}" for f in fits] for n in fits[0].params if n != "values"},
@@ -323,7 +323,7 @@ def _summary(captures: Captures, result: TableFit, messages: list[str], console:
         "x noise": ratios,
         "magnified": [f"{f.magnification:.4f}" for f in fits],
     }
-    title = f"{captures.name or 'captures'}: {fits[0].family}, focus {captures.focus_m:g} m"
+    title = f"{captures.name or 'captures'}: {fits[0].family}, focus {captures.focus_m:.4g} m"
     print_columns(console, title, columns)
     console.print(f"family: {result.why}", markup=False, highlight=False)
     console.print(
