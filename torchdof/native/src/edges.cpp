@@ -1169,14 +1169,19 @@ class Repair {
 
   // The brightest channel of a grid's pixels, and in a part of it what is usual around.
   void brightest(const Grid &bright, const Grid &usual, const Grid &rows, const Part &part) const {
-    bright.clear();
-    const Part &whole = bright;
-    const Grid light(whole);
-    for (int c = 0; c < channels_; c++) {
-      fetch(map_.light + c * area_, light, [](float v) { return (v <= FINITE) & (v > 0) ? std::min(v, BRIGHTEST) : 0.0f; });
-      each_vector(bright, [&](int y, int x) { store(bright.at(y, x), most(load<vec>(bright.at(y, x)), load<vec>(light.at(y, x)))); });
+    const Grid light{Part(bright)};
+    const int first = std::max(0, -bright.x0), last = std::min(bright.pitch, width_ - bright.x0);
+    for (int y = bright.y0; y < bright.bottom(); y++) {
+      const float *from = map_.light + (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + bright.x0;
+      float *to = bright.at(y, bright.x0), *roots = light.at(y, bright.x0);
+      std::fill(to, to + bright.pitch, 0.0f);
+      for (int c = 0; c < channels_; c++, from += area_)
+        for (int x = first; x < last; x++) to[x] = from[x] <= FINITE && from[x] > to[x] ? from[x] : to[x];
+      for (int x = first; x < last; x++) to[x] = std::min(to[x], BRIGHTEST);
+      std::fill(to, to + first, to[first]);
+      std::fill(to + last, to + bright.pitch, to[last - 1]);
+      for (int x = 0; x < bright.pitch; x++) roots[x] = std::sqrt(to[x]);
     }
-    for (size_t i = 0; i < light.size; i++) light.at(light.y0, light.x0)[i] = std::sqrt(bright.at(light.y0, light.x0)[i]);
     sums<USUAL_REACH>(light, usual, rows, part, 1.0f / ((2 * USUAL_REACH + 1) * (2 * USUAL_REACH + 1)));
     each_vector(part, [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
   }
