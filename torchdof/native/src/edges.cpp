@@ -29,7 +29,7 @@ static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 
 // Marks of a pixel. NEAR: it shows the near surface; GIVEN_NEAR: it has its depth. Above them how unsure a witness it is.
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, GIVEN_NEAR = 8, LISTED = 16, UNSURE = 32;
-constexpr float SURE[RINGS + 2] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};  // its weight: far from steps, RINGS from one, ..., beside it; none
+constexpr float SURE[256 / UNSURE] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};  // its weight: far from steps, RINGS from one, ..., beside it; none
 
 // A part of the frame, and what is around it, even beyond the frame.
 struct Part {
@@ -752,10 +752,7 @@ class Repair {
     const Grid given(around), witness(around), colour(around, channels);
     for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
     fetch(map_.nearness, given, valid);
-    fetch(marks_.data(), witness, [](uint8_t marks) {
-      const int unsure = marks / UNSURE;
-      return unsure == 0 ? SURE[0] : unsure == 1 ? SURE[1] : unsure == 2 ? SURE[2] : unsure == 3 ? SURE[3] : SURE[4];
-    });
+    fetch(marks_.data(), witness, [](uint8_t marks) { return SURE[marks / UNSURE]; });
     struct Lanes {
       vec lanes;
     };
