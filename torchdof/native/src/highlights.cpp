@@ -382,6 +382,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
   std::vector<int> nearer;  // bins that may take of its light
   std::vector<const float *> surface_light(C);
   std::vector<Turned> turned;  // of each colour
+  std::vector<float> taps((size_t)E * PATCH * PATCH);  // the same
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
@@ -389,11 +390,11 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
     turned.clear();
     for (int e = 0; e < E && !gains.empty(); e++) turned.push_back(turned_of(job, ray_kernels, ray, e));
     // adds a row of one of its two kernels
-    auto add_taps = [&](int which, float part, int c, int y, int x, int n, float *taps) {
+    auto add_taps = [&](int which, float part, int e, int y, int x, int n, float *taps) {
       const int h = halves[which], first = std::max(x, ray.column - h), last = std::min(x + n - 1, ray.column + h);
       if (std::abs(y - ray.row) > h) return;
       const size_t side = 2 * h + 1;
-      const float *from = kernels[which] + (E > 1 ? c * side * side : 0) + (y - ray.row + h) * side + h - ray.column;
+      const float *from = kernels[which] + e * side * side + (y - ray.row + h) * side + h - ray.column;
       for (int i = first; i <= last; i++) taps[i - x] += part * from[i];
     };
     // the part of the tile in which its rays land
@@ -421,41 +422,43 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
         if (!(ray.coc - NEARER_PX > v.low + k)) break;
         if (may_meet(k, top, left, bottom - top, right - left)) nearer.push_back(k);
       }
+    // how much of the rays that land in a patch nearer surfaces take; whether that is all of them
+    auto block_all = [&](int y, int x, int rows, int columns, float (&blocked)[PATCH][PATCH]) {
+      for (int k : nearer) {
+        const float place = v.low + k;
+        if (!may_meet(k, y, x, rows, columns)) continue;
+        add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), y, x, rows, columns, surface_light.data(), blocked);
+        vec least_blocked = all(1.0f);
+        for (int i = 0; i < rows; i++)
+          for (int j = 0; j < PATCH; j += LANES) least_blocked = least(least_blocked, load<vec>(blocked[i] + j));
+        if (!any_of(least_blocked < all(1.0f))) return true;
+      }
+      return false;
+    };
     for (int py = top; py < bottom; py += PATCH)
       for (int px = left; px < right; px += PATCH) {
         const int ny = std::min(PATCH, bottom - py), nx = std::min(PATCH, right - px);
-        float taps[PATCH][PATCH], blocked[PATCH][PATCH] = {};
-        bool any = false, asked = false, all_blocked = false;
-        for (int c = 0; c < C && !all_blocked; c++) {
-          if (!c || E > 1) {
-            const int e = E > 1 ? c : 0;
-            const float gain = gains.empty() ? 0.0f : gains[(size_t)rays[r] * E + e];
-            any = false;
-            for (int i = 0; i < ny; i++) {
-              std::fill(taps[i], taps[i] + PATCH, 0.0f);
-              add_taps(ray.radius, 1.0f - ray.part, c, py + i, px, nx, taps[i]);
-              add_taps(ray.radius + 1, ray.part, c, py + i, px, nx, taps[i]);
-              for (int x = 0; x < nx && gain > 0; x++)
-                if (taps[i][x] != 0) taps[i][x] *= gain * turned[e].share((float)(py + i - ray.row), (float)(px + x - ray.column));
-              for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(taps[i] + x));
-            }
-          }
-          if (!any) continue;
-          for (size_t i = 0; i < nearer.size() && !asked && !all_blocked; i++) {
-            const float place = v.low + nearer[i];
-            if (!may_meet(nearer[i], py, px, ny, nx)) continue;
-            add_blocked(job, ray, place, clamp01(ray.coc - NEARER_PX - place), py, px, ny, nx, surface_light.data(), blocked);
-            vec least_blocked = all(1.0f);
-            for (int y = 0; y < ny; y++)
-              for (int x = 0; x < PATCH; x += LANES) least_blocked = least(least_blocked, load<vec>(blocked[y] + x));
-            all_blocked = !any_of(least_blocked < all(1.0f));
-          }
-          asked = true;
-          for (int i = 0; i < ny && !all_blocked; i++) {
-            float *to = tile + (size_t)c * TILE * TILE + (py + i - y0) * TILE + (px - x0);
-            for (int x = 0; x < nx; x++) to[x] += taps[i][x] * (1.0f - std::min(blocked[i][x], 1.0f)) * light[c];
+        bool any = false;
+        for (int e = 0; e < E; e++) {
+          const float gain = gains.empty() ? 0.0f : gains[(size_t)rays[r] * E + e];
+          for (int i = 0; i < ny; i++) {
+            float *row = &taps[(e * PATCH + i) * PATCH];
+            std::fill(row, row + PATCH, 0.0f);
+            add_taps(ray.radius, 1.0f - ray.part, e, py + i, px, nx, row);
+            add_taps(ray.radius + 1, ray.part, e, py + i, px, nx, row);
+            for (int x = 0; x < nx && gain > 0; x++)
+              if (row[x] != 0) row[x] *= gain * turned[e].share((float)(py + i - ray.row), (float)(px + x - ray.column));
+            for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }
+        float blocked[PATCH][PATCH] = {};
+        if (!any || block_all(py, px, ny, nx, blocked)) continue;
+        for (int c = 0; c < C; c++)
+          for (int i = 0; i < ny; i++) {
+            const float *row = &taps[((E > 1 ? c : 0) * PATCH + i) * PATCH];
+            float *to = tile + (size_t)c * TILE * TILE + (py + i - y0) * TILE + (px - x0);
+            for (int x = 0; x < nx; x++) to[x] += row[x] * (1.0f - std::min(blocked[i][x], 1.0f)) * light[c];
+          }
       }
   }
 }
