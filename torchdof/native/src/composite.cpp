@@ -428,12 +428,11 @@ class Composite {
         const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
         float *term = b.term[c] + to;
         for (int x0 = 0; x0 < width; x0 += MARKED) {
-          const bool none = !(occupied & mark(x0));
+          if (!(occupied & mark(x0))) {
+            std::fill(term + x0, term + x0 + MARKED, 0.0f);
+            continue;
+          }
           for (int x = x0; x < x0 + MARKED; x += LANES) {
-            if (none) {
-              store(term + x, vec{});
-              continue;
-            }
             const vec n = load<vec>(node + x), v = load<vec>(far + x);
             store(term + x, n == at ? load<vec>(light + x) - v : n == before ? v : vec{});
           }
@@ -659,7 +658,7 @@ class Composite {
         for (int c = 0; c < C_ + 1; c++) fill(b.term[c], w, 0.0f);
       }
       if (!over_) continue;
-      const uint32_t bits = mark(w.column) | mark(w.column + BLOCK / 2);
+      const uint32_t bits = marks(w.column, w.column + BLOCK - 1);
       if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
         w.room = -1;
         block_room(layers_[k], w, y0, y1, x0, x1, b);

@@ -524,11 +524,10 @@ void cut_kernel(const Layer &layer, int colour, const Turned &turned, Kernel &cu
 // So many columns of an input share a bit that tells whether something is there; this is the bit of a column.
 constexpr int MARKED = 8;
 inline uint32_t mark(int x) { return 1u << std::min(x / MARKED, 31); }
+// The bits of the columns from the first to the last.
+inline uint32_t marks(int first, int last) { return (mark(last) | (mark(last) - 1)) & ~(mark(first) - 1); }
 // Marks of the columns from which a strip at column x is spread, counted from its input's first.
-inline uint32_t strip_inputs(int x, int half) {
-  const uint32_t last = mark(x + STRIP_COLUMNS - 1 + 2 * half);
-  return (last | (last - 1)) & ~(mark(x) - 1);
-}
+inline uint32_t strip_inputs(int x, int half) { return marks(x, x + STRIP_COLUMNS - 1 + 2 * half); }
 // Spreads values (of rows with a gap `pitch`) with a kernel to a strip: out [STRIP_ROWS, STRIP_COLUMNS]. The input has the
 // kernel's half more on each side and begins there. Input row i matters where rows[i] has one of the bits of `columns`.
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
