@@ -25,9 +25,6 @@ export PIP_BUILD_CONSTRAINT := $(PIP_CONSTRAINT)
 demo: $(FOR_DEMO)
 	$(BIN)/python examples/demo.py --data examples/data/motorcycle --out out
 
-# Two workers have a core each: threads of linear algebra, which fits use, would wait for each other's.
-test sweep: export OPENBLAS_NUM_THREADS := 1
-
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 

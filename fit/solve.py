@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 
 from .problems import NotConvergedError
 from .result import Array
 
-__all__ = ["best_of", "information_criterion"]
+__all__ = ["best_of", "information_criterion", "one_thread"]
 
 _ROUGH = 1e-3
 _LAST = 1e-5
 _TIGHT = 1e-13  # well-posed noise-free data should come back to ten digits
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """In which numpy, SciPy and PyTorch compute in one thread: a fit's steps are small, and threads cost more."""
+    import scipy.linalg  # noqa: F401  # only what is loaded can be limited
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(limits=1)
 
 
 def best_of(

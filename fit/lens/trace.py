@@ -15,6 +15,7 @@ from torchdof.optics.psf import FAMILIES
 from torchdof.validation import number, show, whole
 
 from ..result import Array
+from ..solve import one_thread
 from .field import coc_nodes, trace_field
 from .lens import Lens
 from .nodes import Tracer, fit_radial, fit_shapes, place_nodes
@@ -139,18 +140,19 @@ def trace_table(
 
     near, far = (signed_coc_mm(z, focal, f_number, focus_m) for z in (nearest_m, math.inf))
     pixel = sensor_width_mm / width_px
-    tracer = Tracer(partial(spot, None), points, pixel)
-    places = place_nodes(tracer, near, far, nodes)
-    fitted = []
-    for wavelength in wavelengths_um or (None,):
-        if wavelength is not None:
-            tracer = Tracer(partial(spot, wavelength), points, pixel)
-        fitted.append(fit_radial(tracer, places) if family == "radial" else fit_shapes(tracer, places, family))
-    across = None
-    if field is not None:
-        blurs = coc_nodes(near, far, field_nodes)
-        across = trace_field(stopped, sensor, distance, blurs, field, wavelengths_um, field_rays, reference)
-        call += f", field={tuple(field)}, field_nodes={field_nodes}, field_rays={field_rays}"
+    with one_thread():
+        tracer = Tracer(partial(spot, None), points, pixel)
+        places = place_nodes(tracer, near, far, nodes)
+        fitted = []
+        for wavelength in wavelengths_um or (None,):
+            if wavelength is not None:
+                tracer = Tracer(partial(spot, wavelength), points, pixel)
+            fitted.append(fit_radial(tracer, places) if family == "radial" else fit_shapes(tracer, places, family))
+        across = None
+        if field is not None:
+            blurs = coc_nodes(near, far, field_nodes)
+            across = trace_field(stopped, sensor, distance, blurs, field, wavelengths_um, field_rays, reference)
+            call += f", field={tuple(field)}, field_nodes={field_nodes}, field_rays={field_rays}"
     params = {key: [_rounded(channel[0][key]) for channel in fitted] for key in FAMILIES[family]}
     residual = np.sqrt(np.mean([channel[1] ** 2 for channel in fitted], axis=0))
     provenance = {

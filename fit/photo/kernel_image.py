@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..problems import FitError
 from ..result import Array
+from ..solve import one_thread
 from ..validation import a_picture
 from .deconvolution import estimate
 from .diagnostics import signal_pixels
@@ -72,8 +73,9 @@ def fit_kernel_image(
     still, data = a_picture("sharp", sharp, 15, files[0]), a_picture("blurred", blurred, 15, files[1])
     if still.shape != data.shape:
         raise FitError(f"sharp and blurred must have the same shape, got {list(still.shape)} and {list(data.shape)}")
-    pair = prepared_pair(still, data, "auto", magnification, white, files)[0]
-    found = estimate(pair, solve_round(pair))
+    with one_thread():
+        pair = prepared_pair(still, data, "auto", magnification, white, files)[0]
+        found = estimate(pair, solve_round(pair))
     near = signal_pixels(pair)
     light = float(np.sqrt(np.mean((pair.data[near] - found.background) ** 2)))
     rms = float(np.sqrt(np.mean((pair.values - found.model)[near.ravel()[pair.flat]] ** 2)))

@@ -14,6 +14,7 @@ from torchdof.validation import show
 
 from ..problems import DistanceError, FitError, SaturatedWarning, warn
 from ..result import Array, BlurFit
+from ..solve import one_thread
 from ..validation import a_count, a_number, a_picture
 from .description import bic_of, describe, kernel_lists
 from .diagnostics import FAR_ABOVE, check_fit
@@ -140,48 +141,49 @@ def fit_pair(
         return replace(fit, model="ratio")
     if softness is not None:
         a_number("softness", softness, -1e-9, unit="pixels")
-    pair, edge, linear = prepared_pair(still, data, source, magnification, white, files, softness)
-    if start is not None and start.family in SHAPES:
-        pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
-    pair.prior = dict(prior or {})
-    # whether the magnification is settled before the fit: a point has none
-    held = True if sharp is None else None if fit_magnification is None else not fit_magnification
-    pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
-    why, psnr = "", dict[str, float]()
-    if family in ("auto", "radial", *OPENINGS) and aperture is None:
-        expected, solution = _solve_radial(pair, held, knots, reach)
-        freest = solution
-        if family == "auto":
-            solution, why, psnr = _choose(pair, freest, accuracy_db)
-            found = solve_opening(pair, freest)
-            if found is not None and not _alike((pair, solution), found[:2], accuracy_db):
-                pair, solution, why = found
+    with one_thread():
+        pair, edge, linear = prepared_pair(still, data, source, magnification, white, files, softness)
+        if start is not None and start.family in SHAPES:
+            pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
+        pair.prior = dict(prior or {})
+        # whether the magnification is settled before the fit: a point has none
+        held = True if sharp is None else None if fit_magnification is None else not fit_magnification
+        pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
+        why, psnr = "", dict[str, float]()
+        if family in ("auto", "radial", *OPENINGS) and aperture is None:
+            expected, solution = _solve_radial(pair, held, knots, reach)
+            freest = solution
+            if family == "auto":
+                solution, why, psnr = _choose(pair, freest, accuracy_db)
+                found = solve_opening(pair, freest)
+                if found is not None and not _alike((pair, solution), found[:2], accuracy_db):
+                    pair, solution, why = found
+                    freest = expected = solution
+                elif found is None and hides_a_polygon(pair, freest):
+                    why += "; a hexagon would not have been told from it in this noise"
+            elif family != "radial":
+                pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
                 freest = expected = solution
-            elif found is None and hides_a_polygon(pair, freest):
-                why += "; a hexagon would not have been told from it in this noise"
-        elif family != "radial":
-            pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
-            freest = expected = solution
-    else:
-        pair.opening = aperture
-        solution = freest = expected = pair.solve(family)
-        if held is None and _improves(pair, solution, free := _with_magnification(pair).solve(family)):
-            pair.fit_moves, solution, freest = ALL_MOVES, free, free
-    fit = describe(pair, solution, why)
-    # a family that was chosen for being cheap is not to blame for what the freest kernel explains
-    judged = fit if freest is solution else describe(pair, freest, "")
-    check_fit(pair, solution, fit, files, judged)
-    # what demosaicing leaves at an edge is louder than what it leaves of the noise
-    if edge is not None and linear and pair.fine_share > _FINE:
-        linear = check_noise(pair, solution, edge.level, files[1])
-    # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed, and
-    # what that leaves goes with the level, too
-    most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
-    large = edge is not None and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
-    if edge is not None and linear and large and judged.residual_over_noise < most:
-        check_levels(pair, freest, expected, edge, files[1])
-    if edge is not None:
-        check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
+        else:
+            pair.opening = aperture
+            solution = freest = expected = pair.solve(family)
+            if held is None and _improves(pair, solution, free := _with_magnification(pair).solve(family)):
+                pair.fit_moves, solution, freest = ALL_MOVES, free, free
+        fit = describe(pair, solution, why)
+        # a family that was chosen for being cheap is not to blame for what the freest kernel explains
+        judged = fit if freest is solution else describe(pair, freest, "")
+        check_fit(pair, solution, fit, files, judged)
+        # what demosaicing leaves at an edge is louder than what it leaves of the noise
+        if edge is not None and linear and pair.fine_share > _FINE:
+            linear = check_noise(pair, solution, edge.level, files[1])
+        # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed, and
+        # what that leaves goes with the level, too
+        most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
+        large = edge is not None and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
+        if edge is not None and linear and large and judged.residual_over_noise < most:
+            check_levels(pair, freest, expected, edge, files[1])
+        if edge is not None:
+            check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
     return replace(fit, psnr=psnr)
 
 

@@ -9,7 +9,14 @@ import typer
 
 __all__ = ["advice", "told_in_one_sentence"]
 
-_EXTRAS = {"scipy": "fit", "onnx": "export", "onnxscript": "export", "onnxruntime": "export", "matplotlib": "plot"}
+_EXTRAS = {
+    "scipy": "fit",
+    "threadpoolctl": "fit",
+    "onnx": "export",
+    "onnxscript": "export",
+    "onnxruntime": "export",
+    "matplotlib": "plot",
+}
 
 _TOO_LITTLE = "there is too little memory for this image; try a smaller one, or --tolerance draft"
 # PyTorch's own words for it on the CPU are those of what it is built from

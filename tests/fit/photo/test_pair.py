@@ -10,6 +10,7 @@ import torch
 from scipy.ndimage import center_of_mass, gaussian_filter, shift
 from scipy.signal import fftconvolve
 from scipy.stats import norm
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from torchdof.fit import fit_pair, natural_psnr
 from torchdof.fit import problems as p
@@ -31,6 +32,20 @@ def test_sigma_at_40_db(simulator, sigma, most):
     for seed in range(3):
         fit = fit_pair(*simulator.Simulator().pair("gaussian", {"sigma": float(sigma)}, seed), "gaussian")
         assert off(fit, "sigma", sigma) < most, seed
+
+
+def test_a_fit_takes_one_thread_and_gives_the_others_back(simulator, monkeypatch):
+    during = []
+
+    def spied(*given):
+        during.extend(library["num_threads"] for library in threadpool_info())
+        return describe(*given)
+
+    monkeypatch.setattr("torchdof.fit.photo.pair.describe", spied)
+    with threadpool_limits(limits=2):
+        fit_pair(*simulator.Simulator(size=61).pair("disc", {"radius": 4.0}), "disc")
+        after = [library["num_threads"] for library in threadpool_info()]
+    assert len(during) >= 2 and set(during) == {1} and set(after) == {2}
 
 
 @pytest.mark.parametrize("magnification", [0.4, 2.0])
