@@ -45,7 +45,9 @@ struct WindowBlock {
   int count;
   const uint64_t *layers;  // that occur in it
   bool clear;              // no layer's light or share stands in the terms
-  int room;                // 0 or 1 where that is all that stands in this term, else -1
+  int room;                // 0 or 1 where that is all that stands in this term, KEPT if it holds until a layer occurs, else -1
+  uint32_t open[BLOCK], uneven[BLOCK];  // of the room that is kept: marks of each row
+  static constexpr int KEPT = 2;
 };
 
 // A layer's kernels as the field leaves them, in a block of its pixels.
@@ -660,8 +662,12 @@ class Composite {
       if (!over_) continue;
       const uint32_t bits = marks(w.column, w.column + BLOCK - 1);
       if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
-        w.room = -1;
-        block_room(layers_[k], w, y0, y1, x0, x1, b);
+        if (w.room != WindowBlock::KEPT) block_room(layers_[k], w, b);
+        w.room = WindowBlock::KEPT;
+        for (int y = y0; y < y1; y++) {
+          b.open[y] |= w.open[y - w.top];
+          b.uneven[y] |= w.uneven[y - w.top];
+        }
       } else {
         if (w.room != (int)behind) fill(b.term[C_ + 1], w, behind ? 1.0f : 0.0f);
         w.room = behind;
@@ -707,16 +713,17 @@ class Composite {
           store(b.term[c] + at + x, sum);
         }
         b.occupied[y] |= some ? bit : 0;
-        if (over_) mark_room(room, share, bit, y, at + x, b);
+        if (over_) put_room(room, share, bit, b.term[C + 1] + at + x, b.open[y], b.uneven[y]);
       }
     }
   }
 
-  // The same of a block in which the layer does not occur: its room alone.
-  void block_room(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, Scratch &b) {
-    for (int y = y0; y < y1; y++) {
-      const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
-      for (int x = x0; x < x1; x += LANES) {
+  // The same of a whole block in which the layer does not occur: its room alone.
+  void block_room(const Layer &l, WindowBlock &w, Scratch &b) {
+    for (int row = 0; row < w.rows; row++) {
+      const size_t at = (size_t)(w.top + row) * pitch_ + w.column;
+      w.open[row] = w.uneven[row] = 0;
+      for (int x = 0; x < BLOCK; x += LANES) {
         vec room = {}, p[2], h[2], weight[2];
         for (int j = 0; j < w.count; j++) {
           const WindowBlock::Surface &of = w.surfaces[j];
@@ -726,17 +733,17 @@ class Composite {
         }
         if (w.count == 2) add_going_on(p, h, weight);
         for (int j = 0; j < w.count; j++) room += h[j] * weight[j];
-        mark_room(room, vec{}, mark(w.column + x), y, at + x, b);
+        put_room(room, vec{}, mark(w.column + x), b.term[C_ + 1] + at + x, w.open[row], w.uneven[row]);
       }
     }
   }
 
   // Puts a layer's room into its term, and tells of it beside its share.
-  void mark_room(vec room, vec share, uint32_t bit, int y, size_t at, Scratch &b) const {
+  static void put_room(vec room, vec share, uint32_t bit, float *term, uint32_t &open, uint32_t &uneven) {
     const vec lacking = room - all(1.0f);
-    store(b.term[C_ + 1] + at, room);
-    b.open[y] |= any_positive(room - share) ? bit : 0;
-    b.uneven[y] |= any_positive(lacking * lacking - all(EVEN)) ? bit : 0;
+    store(term, room);
+    open |= any_positive(room - share) ? bit : 0;
+    uneven |= any_positive(lacking * lacking - all(EVEN)) ? bit : 0;
   }
 
   // To the weights of two surfaces, given their places and what they have at or behind a layer.
