@@ -17,26 +17,18 @@ constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is t
 
 constexpr int REACH = 1;                   // pixels around a mixed pixel that tell what its two surfaces look like
 constexpr int AROUND = 2 * REACH + 1;
+constexpr int TAPS = AROUND * AROUND;
 constexpr int MARGIN = REACH + 1;          // an edge is told by its neighbours
 constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
 constexpr int EDGES = BLOCK + 2 * REACH;   // of the windows of edges and light
-constexpr int PITCH = 24;                  // of both; four values may be read from any pixel's window
-typedef float f4 __attribute__((vector_size(16)));  // a row of a pixel's window, and one lane more
+constexpr int PITCH = 24;                  // of both
 
-inline float sum(f4 v) { return (v[0] + v[1]) + v[2]; }
-inline float largest(f4 v) { return std::max(std::max(v[0], v[1]), v[2]); }
-inline f4 all4(float v) { return f4{v, v, v, v}; }
-inline f4 clamp_lanes(f4 v) {
-  f4 zero = all4(0.0f), one = all4(1.0f);
-  v = v > zero ? v : zero;
-  return v < one ? v : one;
-}
 float falloff_at(int dy, int dx) { return (float)std::exp(-(dy * dy + dx * dx) / 4.5); }
 
 struct Window {
   float coc[SIDE * PITCH], valid[SIDE * PITCH], edge[EDGES * PITCH];
   std::vector<float> light;  // [channels, EDGES, PITCH]
-  std::vector<float> front, behind, colour;
+  std::vector<vec> around;   // light around some pixels, [channels, TAPS], and of their surfaces
 };
 
 // How surely the pixels of a block, and those around it, lie beside another surface; false if none of the block does.
@@ -93,122 +85,132 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
   return any;
 }
 
-// Weighted mean of the light around a pixel, and its variance, summed over colours.
-float mean(const Window &w, int channels, size_t first, float scale, const f4 *weight, float *mean) {
-  f4 whole = {};
-  for (int r = 0; r < AROUND; r++) whole += weight[r];
-  const float total = std::max(sum(whole), 1e-12f);
-  float variance = 0;
-  for (int c = 0; c < channels; c++) {
-    const float *light = w.light.data() + (size_t)c * EDGES * PITCH + first;
-    f4 v[AROUND], one = {}, two = {};
-    for (int r = 0; r < AROUND; r++) one += (v[r] = load<f4>(light + r * PITCH) / all4(scale)) * weight[r];
-    mean[c] = sum(one) / total;
-    for (int r = 0; r < AROUND; r++) two += (v[r] - all4(mean[c])) * (v[r] - all4(mean[c])) * weight[r];
-    variance += sum(two) / total;
+// Weighted mean of the light around pixels [channels, TAPS], and its variance, summed over colours.
+template <int CHANNELS>
+vec mean(const vec *light, int channels, const vec *weight, vec *mean) {
+  const int C = CHANNELS ? CHANNELS : channels;
+  vec total = {}, variance = {};
+  for (int i = 0; i < TAPS; i++) total += weight[i];
+  const vec per_total = all(1.0f) / most(total, all(1e-12f));
+  for (int c = 0; c < C; c++, light += TAPS) {
+    vec one = {}, two = {};
+    for (int i = 0; i < TAPS; i++) one += light[i] * weight[i];
+    mean[c] = one * per_total;
+    for (int i = 0; i < TAPS; i++) two += (light[i] - mean[c]) * (light[i] - mean[c]) * weight[i];
+    variance += two * per_total;
   }
   return variance;
 }
 
-void split(const Job &job, Window &w, int y, int x, const f4 *falloff, const Block &block) {
-  const int channels = job.channels;
+// Splits those of LANES pixels of a row that lie beside another surface.
+template <int CHANNELS>
+void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
+  const int C = CHANNELS ? CHANNELS : job.channels;
   const bool masked = job.surfaces.valid;
-  float near = NEVER, far = -NEVER;
-  for (int v = y + MARGIN - 1; v <= y + MARGIN + 1; v++)
-    for (int u = x + MARGIN - 1; u <= x + MARGIN + 1; u++) {
-      if (masked && !w.valid[v * PITCH + u]) continue;
-      near = std::min(near, w.coc[v * PITCH + u]);
-      far = std::max(far, w.coc[v * PITCH + u]);
-    }
-  const float here = w.coc[(y + MARGIN) * PITCH + x + MARGIN], gap = std::max(far - near, 1e-6f);
-  const size_t first = (size_t)y * PITCH + x;
-  float scale = 1.17549435e-38f;
-  for (int c = 0; c < channels; c++)
-    for (int r = 0; r < AROUND; r++) {
-      const f4 v = load<f4>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH);
-      scale = std::max(scale, std::max(largest(v), largest(-v)));
-    }
-  f4 nearer[AROUND], farther[AROUND];
-  for (int r = 0; r < AROUND; r++) {
-    const size_t in_coc = (size_t)(y + 1 + r) * PITCH + x + 1;
-    f4 weight = (all4(1.0f + UNCLEAN) - load<f4>(w.edge + first + r * PITCH)) * falloff[r];
-    if (masked) weight *= load<f4>(w.valid + in_coc);
-    const f4 nearness = (all4(far) - load<f4>(w.coc + in_coc)) / all4(gap);
-    nearer[r] = weight * clamp_lanes(all4(4.0f) * nearness - all4(2.8f));
-    farther[r] = weight * clamp_lanes(all4(1.2f) - all4(4.0f) * nearness);
+  const size_t first = (size_t)y * PITCH + x, in_coc = first + PITCH + 1;
+  auto tap = [](int i) { return i / AROUND * PITCH + i % AROUND; };
+  vec coc[TAPS], near = all(NEVER), far = all(-NEVER), scale = all(1.17549435e-38f);
+  for (int i = 0; i < TAPS; i++) {
+    coc[i] = load<vec>(w.coc + in_coc + tap(i));
+    const auto known = masked ? load<vec>(w.valid + in_coc + tap(i)) > vec{} : ivec{} == 0;
+    near = least(near, known ? coc[i] : all(NEVER));
+    far = most(far, known ? coc[i] : all(-NEVER));
   }
-  float *front = w.front.data(), *behind = w.behind.data(), *colour = w.colour.data();
-  const float behind_variance = mean(w, channels, first, scale, farther, behind);
+  vec *const light = w.around.data(), *const front = light + C * TAPS, *const behind = front + C, *const colour = behind + C;
+  for (int c = 0; c < C; c++)
+    for (int i = 0; i < TAPS; i++) {
+      const vec v = light[c * TAPS + i] = load<vec>(w.light.data() + (size_t)c * EDGES * PITCH + first + tap(i));
+      scale = most(scale, most(v, -v));
+    }
+  const vec per_scale = all(1.0f) / scale;
+  for (int i = 0; i < C * TAPS; i++) light[i] *= per_scale;
+  const vec here = coc[TAPS / 2], gap = most(far - near, all(1e-6f)), per_gap = all(1.0f) / gap;
+  vec nearer[TAPS], farther[TAPS], whole = {};
+  for (int i = 0; i < TAPS; i++) {
+    vec weight = (all(1.0f + UNCLEAN) - load<vec>(w.edge + first + tap(i))) * falloff[i];
+    if (masked) weight *= load<vec>(w.valid + in_coc + tap(i));
+    const vec nearness = (far - coc[i]) * per_gap;
+    nearer[i] = weight * clamp01(4.0f * nearness - 2.8f);
+    farther[i] = weight * clamp01(1.2f - 4.0f * nearness);
+    whole += nearer[i];
+  }
+  const vec behind_variance = mean<CHANNELS>(light, C, farther, behind);
   // a thin foreground has no clean pixel: trust the one that differs most from what is behind
-  f4 whole = {}, differs[AROUND] = {};
-  for (int r = 0; r < AROUND; r++) whole += nearer[r];
-  const float clean = clamp01(0.1f * sum(whole) / UNCLEAN - 1.0f);
-  if (clean < 1) {
-    float most = 0;
-    for (int r = 0; r < AROUND; r++) {
-      for (int c = 0; c < channels; c++) {
-        const f4 d = load<f4>(w.light.data() + (size_t)c * EDGES * PITCH + first + r * PITCH) / all4(scale) - all4(behind[c]);
-        differs[r] += d * d;
+  const vec clean = clamp01(whole * (0.1f / UNCLEAN) - 1.0f);
+  if (any_of(clean < all(1.0f))) {
+    vec differs[TAPS] = {}, most_of = {};
+    for (int c = 0; c < C; c++)
+      for (int i = 0; i < TAPS; i++) {
+        const vec d = light[c * TAPS + i] - behind[c];
+        differs[i] += d * d;
       }
-      most = std::max(most, largest(differs[r]));
-    }
-    for (int r = 0; r < AROUND; r++) {
-      const f4 part = (differs[r] + all4(ALIKE * ALIKE)) / all4(most + ALIKE * ALIKE);
-      nearer[r] *= part + all4(clean) * (all4(1.0f) - part);
+    for (int i = 0; i < TAPS; i++) most_of = most(most_of, differs[i]);
+    const vec each = 1.0f / (most_of + ALIKE * ALIKE);
+    for (int i = 0; i < TAPS; i++) {
+      const vec part = (differs[i] + ALIKE * ALIKE) * each;
+      nearer[i] *= part + clean * (1.0f - part);
     }
   }
-  const float front_variance = mean(w, channels, first, scale, nearer, front);
+  const vec front_variance = mean<CHANNELS>(light, C, nearer, front);
 
-  float strength = 0, along = 0, misfit = 0;
-  for (int c = 0; c < channels; c++) {
-    const float contrast = front[c] - behind[c];
-    colour[c] = w.light[(size_t)c * EDGES * PITCH + first + REACH * PITCH + REACH] / scale;
+  vec strength = {}, along = {}, misfit = {};
+  for (int c = 0; c < C; c++) {
+    const vec contrast = front[c] - behind[c];
+    colour[c] = light[c * TAPS + TAPS / 2];
     strength += contrast * contrast;
     along += (colour[c] - behind[c]) * contrast;
   }
-  const bool is_near = here - near < far - here;
-  const float fitted = clamp01(along / std::max(strength, 1e-12f));
-  for (int c = 0; c < channels; c++) {
-    const float left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
+  const auto is_near = here - near < far - here;
+  const vec fitted = clamp01(along / most(strength, all(1e-12f)));
+  for (int c = 0; c < C; c++) {
+    const vec left = colour[c] - behind[c] - fitted * (front[c] - behind[c]);
     misfit += left * left;
   }
-  const float trust = strength / (strength + TRUST * (behind_variance + front_variance + misfit) + ALIKE * ALIKE);
-  const float sided = std::fabs((here - near) - (far - here)) / gap;
-  const float certainty = w.edge[first + REACH * PITCH + REACH] * trust * clamp01(4.0f * sided - 2.0f);
-  const float weight = std::min(is_near ? 1.0f - fitted : fitted, 0.5f) * certainty, rest = 1.0f - weight;
-  const int at = y * BLOCK + x;
-  for (int c = 0; c < channels; c++) {
-    const float own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
-    const float unexplained = colour[c] - rest * own_mean - weight * other_mean;
-    const float least = std::max(job.light_least[c] / scale, -UNBOUNDED), most = std::min(job.light_most[c] / scale, UNBOUNDED);
-    float moved = weight * (other_mean + unexplained * weight / (weight * weight + rest * rest));
-    moved = std::min(std::max(moved, colour[c] - rest * most), colour[c] - rest * least);
-    moved = std::min(std::max(moved, weight * least), weight * most);
-    block.own[c * BLOCK_PIXELS + at] = (colour[c] - moved) / rest * scale;
-    block.other[c * BLOCK_PIXELS + at] = weight > 0 ? moved / std::max(weight, 1e-12f) * scale : 0.0f;
+  const vec trust = strength / (strength + TRUST * (behind_variance + front_variance + misfit) + ALIKE * ALIKE);
+  const vec aside = (here - near) - (far - here), sided = most(aside, -aside) * per_gap;
+  const vec certainty = load<vec>(w.edge + first + tap(TAPS / 2)) * trust * clamp01(4.0f * sided - 2.0f);
+  const vec weight = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * certainty, rest = 1.0f - weight;
+  const vec per_rest = 1.0f / rest, per_weight = 1.0f / most(weight, all(1e-12f)), of_each = weight / (weight * weight + rest * rest);
+  auto put = [&](float *plane, vec value) {
+    float *const to = plane + y * BLOCK + x;
+    store(to, beside ? value : load<vec>(to));
+  };
+  for (int c = 0; c < C; c++) {
+    const vec own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
+    const vec unexplained = colour[c] - rest * own_mean - weight * other_mean;
+    const vec darkest = most(job.light_least[c] * per_scale, all(-UNBOUNDED)), brightest = least(job.light_most[c] * per_scale, all(UNBOUNDED));
+    vec moved = weight * (other_mean + unexplained * of_each);
+    moved = least(most(moved, colour[c] - rest * brightest), colour[c] - rest * darkest);
+    moved = least(most(moved, weight * darkest), weight * brightest);
+    put(block.own + c * BLOCK_PIXELS, (colour[c] - moved) * per_rest * scale);
+    put(block.other + c * BLOCK_PIXELS, weight > vec{} ? moved * per_weight * scale : vec{});
   }
-  block.coc[at] = is_near ? far : near;
-  block.weight[at] = weight;
-  block.seen[at] = rest;
-  if (masked) {
-    const float valid = w.valid[(y + MARGIN) * PITCH + x + MARGIN];
-    block.weight[at] *= valid;
-    block.seen[at] *= valid;
-  }
+  const vec valid = masked ? load<vec>(w.valid + in_coc + tap(TAPS / 2)) : all(1.0f);
+  put(block.coc, is_near ? far : near);
+  put(block.weight, weight * valid);
+  put(block.seen, rest * valid);
 }
 
-void split_block(Job &job, int by, int bx, Window &w, const f4 *falloff) {
+void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
   const int y0 = by * BLOCK, x0 = bx * BLOCK, height = job.height, width = job.width;
+  const bool inside = x0 >= REACH && x0 + BLOCK + REACH <= width;
   for (int c = 0; c < job.channels; c++)
     for (int i = 0; i < EDGES; i++) {
       const float *from = job.surfaces.light + c * job.surfaces.area() + (size_t)std::clamp(y0 - REACH + i, 0, height - 1) * width;
       float *to = w.light.data() + ((size_t)c * EDGES + i) * PITCH;
-      for (int j = 0; j < EDGES; j++) to[j] = from[std::clamp(x0 - REACH + j, 0, width - 1)];
+      if (inside)
+        memcpy(to, from + x0 - REACH, EDGES * sizeof(float));
+      else
+        for (int j = 0; j < EDGES; j++) to[j] = from[std::clamp(x0 - REACH + j, 0, width - 1)];
     }
   const Block block = job.surfaces.make_block(by * job.surfaces.block_columns + bx);
+  ivec lane;
+  for (int i = 0; i < LANES; i++) lane[i] = i;
   for (int y = 0; y < std::min(BLOCK, height - y0); y++)
-    for (int x = 0; x < std::min(BLOCK, width - x0); x++)
-      if (w.edge[(y + REACH) * PITCH + x + REACH] > 0) split(job, w, y, x, falloff, block);
+    for (int x = 0; x < std::min(BLOCK, width - x0); x += LANES) {
+      const ivec beside = (load<vec>(w.edge + (y + REACH) * PITCH + x + REACH) > vec{}) & (lane < width - x0 - x);
+      if (any_of(beside)) job.channels == 3 ? split<3>(job, w, y, x, beside, falloff, block) : split<0>(job, w, y, x, beside, falloff, block);
+    }
 }
 
 // Gives the light of a highlight's pixel to the farther surface on which the emitter lies.
@@ -303,9 +305,8 @@ Block Surfaces::make_block(int i) {
 }
 
 void Job::split_mixed() {
-  f4 falloff[AROUND] = {};
-  for (int r = 0; r < AROUND; r++)
-    for (int d = 0; d < AROUND; d++) falloff[r][d] = falloff_at(r - REACH, d - REACH);
+  float falloff[TAPS];
+  for (int i = 0; i < TAPS; i++) falloff[i] = falloff_at(i / AROUND - REACH, i % AROUND - REACH);
   std::vector<float> around_emitter;
   for (int dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
     for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++) around_emitter.push_back(falloff_at(dy, dx));
@@ -316,7 +317,7 @@ void Job::split_mixed() {
     if (!windows[worker]) {
       windows[worker].reset(new Window());
       windows[worker]->light.assign((size_t)channels * EDGES * PITCH, 0.0f);
-      for (auto *v : {&windows[worker]->front, &windows[worker]->behind, &windows[worker]->colour}) v->resize(channels);
+      windows[worker]->around.resize((size_t)channels * (TAPS + 3));
     }
     Window &w = *windows[worker];
     for (int bx = 0; bx < columns; bx++) {
