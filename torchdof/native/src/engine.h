@@ -342,10 +342,16 @@ Border border_of(const Job &job, int farthest);
 
 // What the image shows, as rays of highlights meet it; highlights.cpp
 struct Visibility {
+  static constexpr int CLASSES = 62;  // of coc, a bit each
   float low = 0, class_width = 1;
-  std::vector<int> bins;  // of 1 px of coc in which there is something, or in the one before
+  std::vector<int> bins;  // of 1 px of coc in which there may be something, or in the one before
   int cell_rows = 0, cell_columns = 0;
-  std::vector<uint64_t> cells;  // classes of coc that occur in each cell, a bit each
+  std::vector<uint64_t> cells;  // classes of coc that occur in each cell
+  // Classes of what may lie in a bin, or in the one before.
+  uint64_t classes_of(int bin) const {
+    const int first = std::min((int)(std::max(0, bin - 1) / class_width), CLASSES - 1), last = std::min((int)((bin + 1) / class_width), CLASSES - 1);
+    return (2ull << last) - (1ull << first);
+  }
 };
 Visibility look_at(const Job &job);
 // Adds the light of rays to a tile [channels, TILE, TILE].

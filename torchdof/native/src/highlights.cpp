@@ -15,7 +15,6 @@ constexpr float NEARER_PX = 1.0f;       // difference in coc from which on a sur
 constexpr float WHOLE = 4.0f;           // times the share of a highlight that is splatted is what counts of its rays
 constexpr int TAPS_PER_PIXEL = 16;      // of the frame: rays beyond this number are left to the layers
 constexpr int STEPS_PER_PX = 32;        // of radius: kernels of rays
-constexpr int CLASSES = 62;             // of coc, a bit each
 constexpr int PATCH = 16;               // rays a side that are looked at together
 
 struct Candidate {
@@ -222,42 +221,48 @@ Visibility look_at(const Job &job) {
   }
   v.low = low;
   const int bins = (int)(high - low) + 2;
-  std::vector<uint8_t> present(bins + 1, 0);
-  v.class_width = std::max(1.0f, bins / (float)CLASSES);
+  v.class_width = std::max(1.0f, bins / (float)v.CLASSES);
   v.cell_rows = ceil_div(H, CELL);
   v.cell_columns = ceil_div(W, CELL);
   v.cells.assign((size_t)v.cell_rows * v.cell_columns, 0);
-  std::vector<uint8_t> floors((size_t)v.cell_rows * bins);
   const Surfaces &surfaces = job.surfaces;
+  typedef uint64_t wide __attribute__((vector_size(LANES * 8)));
+  auto bits_of = [&](vec coc, ivec shown) {
+    const vec place = least(most(coc - low, vec{}), all(high - low));
+    const ivec which = least(convert(place * (1.0f / v.class_width)), ivec{} + (v.CLASSES - 1));
+    return __builtin_convertvector(shown, wide) & ((wide{} + 1) << __builtin_convertvector(which, wide));
+  };
   job.parallel(v.cell_rows, [&](int row, int) {
-    uint8_t *here = floors.data() + (size_t)row * bins;
     uint64_t *cells = &v.cells[(size_t)row * v.cell_columns];
-    auto add = [&](int x, float coc) {
-      const float place = clamp(coc - low, 0.0f, high - low);
-      here[(int)place] = 1;
-      cells[x / CELL] |= 1ull << std::min((int)(place / v.class_width), CLASSES - 1);
-    };
     std::vector<const float *> light(job.channels);
     for (int x = 0; x < W; x += BLOCK) {
       const int block = row * CELL / BLOCK * surfaces.block_columns + x / BLOCK, n = std::min(BLOCK, W - x);
-      // the image's own surface within 1 px has no other bins and classes than its ends
+      // the image's own surface within 1 px has no other classes than its ends
       const float ends[2] = {job.block_low[block], job.block_high[block]};
       const bool flat = !surfaces.whole() && ends[1] - ends[0] < 1;
-      for (int j = 0; flat && j < n; j += CELL)
-        for (float coc : ends) add(x + j, coc);
-      if (flat && !surfaces.has_block(block)) continue;
-      for (int y = row * CELL; y < std::min(H, (row + 1) * CELL); y++)
+      wide bits[BLOCK / CELL] = {};
+      for (wide &of_cell : bits)
+        for (float coc : ends) of_cell |= bits_of(all(coc), ivec{} - flat);
+      for (int y = row * CELL; y < std::min(H, (row + 1) * CELL) && !(flat && !surfaces.has_block(block)); y++)
         each_shown(surfaces, y, x, light.data(), [&](bool own, const float *coc, const float *weight, float least_weight) {
           if (own && flat) return;
-          for (int j = 0; j < n; j++)
-            if (!weight || weight[j] > least_weight) add(x + j, coc[j]);
+          float its_coc[BLOCK] = {}, its_weight[BLOCK] = {};
+          if (n < BLOCK) {
+            memcpy(its_coc, coc, n * sizeof(float));
+            for (int j = 0; j < n; j++) its_weight[j] = weight ? weight[j] : 1.0f;
+            coc = its_coc, weight = its_weight;
+          }
+          for (int j = 0; j < BLOCK; j += LANES)
+            bits[j / CELL] |= bits_of(load<vec>(coc + j), weight ? load<vec>(weight + j) > all(least_weight) : ivec{} == 0);
         });
+      for (int j = 0; j < n; j += CELL)
+        for (int i = 0; i < LANES; i++) cells[(x + j) / CELL] |= bits[j / CELL][i];
     }
   });
-  for (size_t i = 0; i < floors.size(); i++)
-    if (floors[i]) present[i % bins] = present[i % bins + 1] = 1;
+  uint64_t any = 0;
+  for (uint64_t cell : v.cells) any |= cell;
   for (int k = 0; k <= bins; k++)
-    if (present[k]) v.bins.push_back(k);
+    if (any & v.classes_of(k)) v.bins.push_back(k);
   return v;
 }
 
@@ -412,9 +417,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
       uint64_t classes = 0;
       for (int i = r0; i <= r1; i++)
         for (int j = c0; j <= c1; j++) classes |= v.cells[(size_t)i * v.cell_columns + j];
-      const int first = std::min((int)(std::max(0, k - 1) / v.class_width), CLASSES - 1);
-      const int last = std::min((int)((k + 1) / v.class_width), CLASSES - 1);
-      return (classes & ((2ull << last) - (1ull << first))) != 0;
+      return (classes & v.classes_of(k)) != 0;
     };
     nearer.clear();
     if (job.scene.occlusion)
