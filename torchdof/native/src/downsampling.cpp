@@ -8,39 +8,39 @@ namespace TORCHDOF_SIMD {
 namespace {
 
 typedef float f4 __attribute__((vector_size(16)));
+typedef int32_t i4 __attribute__((vector_size(16)));
 
-// Adds up what a block of one surface has between two nodes; out as Pieces::values. Weights, in the layer before and in the
-// one behind, lie without gaps.
-template <int CHANNELS, int S>
-void sum_part(const float *const *light, size_t light_step, const float *coc, size_t coc_step, const float *before,
-              const float *after, const LayerIndex &index, const Layer &l, bool over, float *out) {
+// Four pixels of a block of S x S, the i-th of them the first.
+template <int S>
+inline f4 four(const float *from, size_t step, int i) {
+  if (S == 2) return f4{from[0], from[1], from[step], from[step + 1]};
+  return load<f4>(from + i / S * step + i % S);
+}
+
+// Adds up what a block of one surface, of three channels, has between two nodes; out as Pieces::values. Weights, in the layer
+// before and in the one behind, lie without gaps, and so does how far between the nodes each pixel lies.
+template <int S>
+void sum_part(const float *const *light, size_t light_step, const float *before, const float *after, const float *far, float *out) {
+  constexpr int CHANNELS = 3;
   f4 share = {}, part_sum = {}, one[CHANNELS] = {}, two[CHANNELS] = {};
-  auto add = [&](const f4 first, const f4 second, const f4 c, auto light_at) {
-    const f4 far = behind(l, index.place(c), over), part = far * second, w = first + far * (second - first);
+  for (int i = 0; i < S * S; i += 4) {
+    const f4 first = load<f4>(before + i), second = load<f4>(after + i), its_far = load<f4>(far + i);
+    const f4 part = its_far * second, w = first + its_far * (second - first);
     share += w;
     part_sum += part;
-    for (int i = 0; i < CHANNELS; i++) {
-      const f4 v = light_at(light[i]);
-      one[i] += v * w;
-      two[i] += v * part;
+    for (int c = 0; c < CHANNELS; c++) {
+      const f4 v = four<S>(light[c], light_step, i);
+      one[c] += v * w;
+      two[c] += v * part;
     }
-  };
-  if (S == 2) {
-    auto four = [](const float *from, size_t step) { return f4{from[0], from[1], from[step], from[step + 1]}; };
-    add(load<f4>(before), load<f4>(after), four(coc, coc_step), [&](const float *from) { return four(from, light_step); });
-  } else {
-    for (int y = 0; y < S; y++)
-      for (int x = 0; x < S; x += 4)
-        add(load<f4>(before + y * S + x), load<f4>(after + y * S + x), load<f4>(coc + y * coc_step + x),
-            [&](const float *from) { return load<f4>(from + y * light_step + x); });
   }
   auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
   float *two_of = out + CHANNELS + 1;
   out[0] += sum(share);
   two_of[0] += sum(part_sum);
-  for (int i = 0; i < CHANNELS; i++) {
-    out[1 + i] += sum(one[i]);
-    two_of[1 + i] += sum(two[i]);
+  for (int c = 0; c < CHANNELS; c++) {
+    out[1 + c] += sum(one[c]);
+    two_of[1 + c] += sum(two[c]);
   }
 }
 
@@ -73,7 +73,9 @@ class Downsampling {
  public:
   Downsampling(const Job &job, const LayerIndex &index, const Border &border, Downsampled &to)
       : job_(job), s_(job.surfaces), index_(index), border_(border), over_(job.scene.occlusion), to_(to), C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)),
-        gathered_(stride_), cell_sums_(2 * stride_ * (CELL / 2)), light_(C_) {}
+        gathered_(stride_), cell_sums_(2 * stride_ * (CELL / 2)), light_(C_), light_of_{light_, light_} {
+    for (const Layer &l : job.layers) ramps_.push_back({l.at, l.per_after});
+  }
 
   // Rows of blocks of BLOCK pixels.
   void band(int band) {
@@ -228,110 +230,124 @@ class Downsampling {
     return false;
   }
 
+  // Pixels of a surface in a block within the frame; false if it has no weight there.
+  template <int S>
+  bool read(int surface, int y0, int x0) {
+    const int W = job_.width;
+    const float *coc, *weight;
+    if (!s_.row(surface, y0, x0, light_of_[surface].data(), coc, weight)) return false;
+    const uint16_t *interval = &index_.intervals[surface][(size_t)y0 * W + x0];
+    float any = 0;
+    for (int y = 0; y < S; y++)
+      for (int x = 0; x < S; x++) {
+        any += weight_[surface][y * S + x] = weight ? weight[y * BLOCK + x] : 1.0f;
+        interval_[surface][y * S + x] = interval[(size_t)y * W + x];
+      }
+    for (int i = 0; i < S * S; i += 4) store(coc_[surface] + i, four<S>(coc, surface ? BLOCK : W, i));
+    return any != 0;
+  }
+  // The same of a block that the frame cuts off, where it goes on with its last pixels.
+  bool read_beyond(int surface, int y0, int x0) {
+    const int s = to_.scale, H = job_.height, W = job_.width;
+    float any = 0;
+    for (int i = 0; i < s * s; i++) {
+      const int y = std::clamp(y0 + i / s, 0, H - 1), x = std::clamp(x0 + i % s, 0, W - 1);
+      const float *coc, *weight;
+      const bool has_it = s_.row(surface, y, x, light_.data(), coc, weight);
+      coc_[surface][i] = has_it ? *coc : 0.0f;
+      any += weight_[surface][i] = !has_it ? 0.0f : weight ? *weight : 1.0f;
+      interval_[surface][i] = index_.intervals[surface][(size_t)y * W + x];
+    }
+    return any != 0;
+  }
+
+  // How far between its two nodes each pixel of a surface lies.
+  void find_far(int surface) {
+    for (int i = 0; i < to_.scale * to_.scale; i += 4) {
+      const int32_t *k = interval_[surface] + i;
+      const Ramp of[4] = {ramps_[k[0]], ramps_[k[1]], ramps_[k[2]], ramps_[k[3]]};
+      const f4 at = {of[0].at, of[1].at, of[2].at, of[3].at}, per = {of[0].per, of[1].per, of[2].per, of[3].per};
+      store(far_[surface] + i, ramp((index_.place(load<f4>(coc_[surface] + i)) - at) * per, over_));
+    }
+  }
+
   // Weights of both surfaces of a block's pixels, in the layer before each and in the one behind it. The farther one of a
   // mixed pixel goes on behind the nearer: there it counts for more than its share, and what it thereby has too much of in
   // the layers up to the nearer one is to be taken from their room. False if there is no such pixel.
-  bool share_out(int y0, int x0, bool inside) {
+  bool share_out() {
     lacking_.clear();
-    const int s = to_.scale, run = inside ? std::min(s, 4) : 1;
     bool any = false;
-    for (int i = 0; i < s * s; i += 4) {
-      f4 coc[2], weight[2];
-      int interval[2][4];
-      for (int lane = 0; lane < 4; lane += run) {
-        const int y = std::clamp(y0 + (i + lane) / s, 0, job_.height - 1), x = std::clamp(x0 + (i + lane) % s, 0, job_.width - 1);
-        for (int j = 0; j < 2; j++) {
-          const float *coc_of, *weight_of;
-          s_.row(j, y, x, light_.data(), coc_of, weight_of);
-          for (int k = 0; k < run; k++) {
-            coc[j][lane + k] = coc_of[k];
-            weight[j][lane + k] = weight_of[k];
-            interval[j][lane + k] = index_.intervals[j][(size_t)y * job_.width + x + k];
-          }
-        }
-      }
-      const auto other_is_nearer = coc[1] < coc[0];
+    for (int i = 0, last = -1; i < to_.scale * to_.scale; i += 4) {
+      const f4 weight[2] = {load<f4>(weight_[0] + i), load<f4>(weight_[1] + i)};
+      const auto other_is_nearer = load<f4>(coc_[1] + i) < load<f4>(coc_[0] + i);
       const f4 share = other_is_nearer ? weight[0] : weight[1], going = going_on(share), whole = share + going;
-      f4 first = share, second = share;
-      for (int lane = 0, last = -1; lane < 4; lane++) {
-        if (!(going[lane] > 0)) continue;
-        any = true;
-        const int near = other_is_nearer[lane] ? 1 : 0, k = interval[near][lane], n = interval[1 - near][lane];
-        if (!to_.needed(n) && !to_.needed(k)) continue;
-        const float of_near = behind(job_.layers[k], index_.place(coc[near][lane]), over_);
-        const float next = share[lane] + where_it_shows(going[lane], of_near);  // in layer k + 1
-        first[lane] = n == k ? share[lane] : n == k + 1 ? next : whole[lane];
-        second[lane] = n == k ? next : whole[lane];
-        if (!to_.needed(k)) continue;
-        const float of_far = to_.wanted[n] ? behind(job_.layers[n], index_.place(coc[1 - near][lane]), over_) : 0.0f;
-        const float given = first[lane] + of_far * (second[lane] - first[lane]);
-        if (k != last) lacking_.push_back({last = k, 0.0f, 0.0f});
-        lacking_.back().up_to += share[lane] - given;
-        if (to_.wanted[k] && n > k) lacking_.back().next += next - given;
-      }
+      const f4 far[2] = {load<f4>(far_[0] + i), load<f4>(far_[1] + i)}, of_near = other_is_nearer ? far[1] : far[0];
+      const i4 interval[2] = {load<i4>(interval_[0] + i), load<i4>(interval_[1] + i)};
+      const i4 k = other_is_nearer ? interval[1] : interval[0], n = other_is_nearer ? interval[0] : interval[1];
+      const f4 next = share + where_it_shows(going, of_near);  // in layer k + 1
+      const f4 first = n == k ? share : n == k + 1 ? next : whole, second = n == k ? next : whole;
       store(before_[0] + i, other_is_nearer ? first : weight[0]);
       store(after_[0] + i, other_is_nearer ? second : weight[0]);
       store(before_[1] + i, other_is_nearer ? weight[1] : first);
       store(after_[1] + i, other_is_nearer ? weight[1] : second);
+      for (int lane = 0; lane < 4; lane++) {
+        if (!(going[lane] > 0)) continue;
+        any = true;
+        const int nearer = k[lane], farther = n[lane];
+        if (!to_.needed(nearer)) continue;
+        const float of_far = to_.wanted[farther] ? far[other_is_nearer[lane] ? 0 : 1][lane] : 0.0f;
+        const float given = first[lane] + of_far * (second[lane] - first[lane]);
+        if (nearer != last) lacking_.push_back({last = nearer, 0.0f, 0.0f});
+        lacking_.back().up_to += share[lane] - given;
+        if (to_.wanted[nearer] && farther > nearer) lacking_.back().next += next[lane] - given;
+      }
     }
     return any;
   }
 
   void gather(int row, int column, bool inside) {
     const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width, C = C_;
-    const float *coc, *weight;
-    const bool two = s_.count == 2 && mixed(y0, x0) && share_out(y0, x0, inside);
+    bool there[2] = {};
     for (int i = 0; i < s_.count; i++) {
-      if (inside) {
-        if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
-        if (C == 3) {
-          const uint16_t *interval = &index_.intervals[i][(size_t)y0 * W + x0];
-          const int coc_step = i ? BLOCK : W;
-          const float *before = two ? before_[i] : weight, *after = two ? after_[i] : weight;
-          const int pitch = two ? s : BLOCK;
-          s == 2 ? sum_intervals<2>(interval, coc, coc_step, weight, before, after, pitch)
-          : s == 4 ? sum_intervals<4>(interval, coc, coc_step, weight, before, after, pitch)
-          : s == 8 ? sum_intervals<8>(interval, coc, coc_step, weight, before, after, pitch)
-                   : sum_intervals<16>(interval, coc, coc_step, weight, before, after, pitch);
-          continue;
-        }
+      there[i] = !inside ? read_beyond(i, y0, x0) : s == 2 ? read<2>(i, y0, x0) : s == 4 ? read<4>(i, y0, x0) : s == 8 ? read<8>(i, y0, x0) : read<16>(i, y0, x0);
+      if (there[i]) find_far(i);
+    }
+    const bool two = there[0] && there[1] && mixed(y0, x0) && share_out();
+    for (int i = 0; i < s_.count; i++) {
+      if (!there[i]) continue;
+      const float *before = two ? before_[i] : weight_[i], *after = two ? after_[i] : weight_[i];
+      if (inside && C == 3) {
+        const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : W;
+        s == 2 ? sum_intervals<2>(i, light_step, before, after) : s == 4 ? sum_intervals<4>(i, light_step, before, after)
+        : s == 8 ? sum_intervals<8>(i, light_step, before, after) : sum_intervals<16>(i, light_step, before, after);
+        continue;
       }
       int last = -1;
       float *one = nullptr;
-      for (int y = 0; y < s; y++) {
-        const int at_y = std::clamp(y0 + y, 0, H - 1);
-        if (inside) s_.row(i, at_y, x0, light_.data(), coc, weight);
-        for (int x = 0; x < s; x++) {
-          int at = x, at_x = x0 + x;
-          bool beyond = false;
-          if (!inside) {
-            at_x = std::clamp(at_x, 0, W - 1);
-            beyond = y0 + y != at_y || x0 + x != at_x;
-            at = 0;
-            if (!s_.row(i, at_y, at_x, light_.data(), coc, weight)) continue;
-          }
-          const float first = two ? before_[i][y * s + x] : weight ? weight[at] : 1.0f, second = two ? after_[i][y * s + x] : first;
-          if (second == 0) continue;
-          const int k = index_.intervals[i][(size_t)at_y * W + at_x];
-          if (!to_.needed(k)) continue;
-          if (k != last) {
-            last = k;
-            one = gathered_.between(to_.stands_for[k]);
-          }
-          if (!to_.wanted[k]) {
-            one[0] += first;
-            continue;
-          }
-          const Layer &l = job_.layers[k];
-          const float far = behind(l, index_.place(coc[at]), over_), part = far * second, w = first + far * (second - first);
-          float *parts = one + C + 1;
-          one[0] += w;
-          parts[0] += part;
-          for (int c = 0; c < C; c++) {
-            const float v = beyond ? border_.light(i, c, y0 + y, x0 + x, light_[c][at]) : light_[c][at];
-            one[1 + c] += v * w;
-            parts[1 + c] += v * part;
-          }
+      for (int j = 0; j < s * s; j++) {
+        const float first = before[j], second = after[j];
+        if (second == 0) continue;
+        const int k = interval_[i][j];
+        if (!to_.needed(k)) continue;
+        if (k != last) {
+          last = k;
+          one = gathered_.between(to_.stands_for[k]);
+        }
+        if (!to_.wanted[k]) {
+          one[0] += first;
+          continue;
+        }
+        const int y = y0 + j / s, x = x0 + j % s, at_y = std::clamp(y, 0, H - 1), at_x = std::clamp(x, 0, W - 1);
+        const float far = far_[i][j], part = far * second, w = first + far * (second - first);
+        const float *coc, *weight;
+        s_.row(i, at_y, at_x, light_.data(), coc, weight);
+        float *parts = one + C + 1;
+        one[0] += w;
+        parts[0] += part;
+        for (int c = 0; c < C; c++) {
+          const float v = y != at_y || x != at_x ? border_.light(i, c, y, x, *light_[c]) : *light_[c];
+          one[1 + c] += v * w;
+          parts[1 + c] += v * part;
         }
       }
     }
@@ -355,41 +371,32 @@ class Downsampling {
 
   // A block of one surface, of three channels, within the frame: the sums of each interval that occurs in it.
   template <int S>
-  void sum_intervals(const uint16_t *interval, const float *coc, int coc_step, const float *weight, const float *before,
-                     const float *after, int pitch) {
+  void sum_intervals(int surface, size_t light_step, const float *before, const float *after) {
     constexpr int AREA = S * S;
-    const size_t light_step = weight ? BLOCK : s_.width;
-    float left[AREA], left_after[AREA], interval_of[AREA], of_one[AREA], of_one_after[AREA];
-    unsigned differs = 0;
-    float any = 0;
-    for (int y = 0; y < S; y++)
-      for (int x = 0; x < S; x++) {
-        differs |= interval[(size_t)y * s_.width + x] ^ *interval;
-        left[y * S + x] = weight ? before[y * pitch + x] : 1.0f;
-        left_after[y * S + x] = weight ? after[y * pitch + x] : 1.0f;
-        any += left[y * S + x];
-      }
-    if (any == 0) return;
-    auto add = [&](int node, const float *firsts, const float *seconds, float sum) {
-      if (to_.wanted[node])
-        sum_part<3, S>(light_.data(), light_step, coc, coc_step, firsts, seconds, index_, job_.layers[node], over_, gathered_.between(to_.stands_for[node]));
-      else if (to_.needed(node))
+    const int32_t *const interval = interval_[surface];
+    int differs = 0;
+    for (int i = 0; i < AREA; i++) differs |= interval[i] ^ *interval;
+    auto add = [&](int node, const float *firsts, const float *seconds) {
+      if (to_.wanted[node]) {
+        sum_part<S>(light_of_[surface].data(), light_step, firsts, seconds, far_[surface], gathered_.between(to_.stands_for[node]));
+      } else if (to_.needed(node)) {
+        float sum = 0;
+        for (int i = 0; i < AREA; i++) sum += firsts[i];
         gathered_.between(to_.stands_for[node])[0] += sum;
+      }
     };
-    if (!differs) return add(*interval, left, left_after, any);
-    for (int y = 0; y < S; y++)
-      for (int x = 0; x < S; x++) interval_of[y * S + x] = (float)interval[(size_t)y * s_.width + x];
+    if (!differs) return add(*interval, before, after);
+    float left[AREA], of_one[AREA], of_one_after[AREA];
+    memcpy(left, before, sizeof(left));
     for (int i = 0; i < AREA; i++) {
       if (left[i] == 0) continue;
-      const float k = interval_of[i];
-      any = 0;
+      const int k = interval[i];
       for (int j = 0; j < AREA; j++) {  // the others weigh nothing
-        of_one[j] = interval_of[j] == k ? left[j] : 0.0f;
-        of_one_after[j] = interval_of[j] == k ? left_after[j] : 0.0f;
+        of_one[j] = interval[j] == k ? left[j] : 0.0f;
+        of_one_after[j] = interval[j] == k ? after[j] : 0.0f;
         left[j] -= of_one[j];
-        any += of_one[j];
       }
-      add((int)k, of_one, of_one_after, any);
+      add(k, of_one, of_one_after);
     }
   }
 
@@ -405,11 +412,17 @@ class Downsampling {
     int node;           // before a nearer surface
     float up_to, next;  // room that is to be added in the layers up to it, and in the next one
   };
-  float before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
+  // of a block's pixels, of both surfaces; far: how far between their nodes; before, after: weight in the layers there
+  float coc_[2][BLOCK_PIXELS], weight_[2][BLOCK_PIXELS], far_[2][BLOCK_PIXELS], before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
+  int32_t interval_[2][BLOCK_PIXELS];
+  struct Ramp {
+    float at, per;
+  };
+  std::vector<Ramp> ramps_;  // beyond each layer
   std::vector<Lacking> lacking_;
   Gathered gathered_;
   std::vector<float> cell_sums_;
-  std::vector<const float *> light_;
+  std::vector<const float *> light_, light_of_[2];
 };
 
 Downsampled::Downsampled(const Job &job, int scale, int margin)
