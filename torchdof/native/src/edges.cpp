@@ -3,6 +3,7 @@
 // Work is done part by part of the frame, and in a part only as far as there may be edges. Each part is copied with what
 // is around it, which beyond the frame goes on as it is at the border, so that loops run in whole vectors.
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <vector>
 
@@ -41,6 +42,13 @@ struct Part {
   Part grown(int by) const { return {y0 - by, x0 - by, height + 2 * by, width + 2 * by}; }
 };
 
+// A pixel to look at.
+struct Edge {
+  int i;
+  float near, far;  // of the two surfaces that meet there
+  uint8_t kind;
+};
+
 // Memory of a thread for what it looks at, given back in reverse order: so it stays in the processor's cache.
 class Scratch {
  public:
@@ -59,6 +67,8 @@ class Scratch {
     blocks_[block_].used -= size;
     if (blocks_[block_].used == 0 && block_ > 0) block_--;
   }
+
+  std::vector<Edge> edges;
 
   static thread_local Scratch *mine;
 
@@ -236,13 +246,6 @@ struct Around {
   float alike[8];  // how much the colours around a pixel are its own
 };
 
-// A pixel to look at.
-struct Edge {
-  int i;
-  float near, far;  // of the two surfaces that meet there
-  uint8_t kind;
-};
-
 // Edges of a part that are looked at together, in the order of rows.
 struct Group {
   Part part;
@@ -252,12 +255,15 @@ struct Group {
   Around *around = nullptr;
 };
 
+// Whether pixels are asked, by kind: those that the map gives the far surface, and those that it gives the near one.
+using Asked = std::array<bool, 2 * KINDS>;
+
 // What edges are, in sums.
 struct Found {
   double length = 0;    // of steps, in pixels
   double climbed = 0;   // of it in the middle half of steps
   double lost = 0;      // pixels that the map shows as near, less what it has of the near surface
-  int64_t middles = 0;  // pixels in the middle half of a step
+  int64_t middles = 0;  // pixels in the middle half of steps
 };
 
 class Repair {
@@ -272,12 +278,15 @@ class Repair {
     const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
     const auto is_sampled = [&](int y, int x) { return (block_of(y, height_) + block_of(x, width_)) % every == 0; };
     std::vector<Group> groups, sampled;
+    Asked all_kinds;
+    all_kinds.fill(true);
     if (spares) {
-      sampled = find_in(blocks(is_sampled), REACH, false);
+      sampled = find_in(blocks(is_sampled), REACH, false, false, all_kinds);
     } else {
-      sampled = groups = find_in(tiles(), 0, false);
+      sampled = groups = find_in(tiles(), 0, false, true, all_kinds);
     }
-    list(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
+    choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });  // what is around blocks may lie in others
+    allot(sampled);
     judge(sampled);
     decide(sampled);
     calibrate(sampled);
@@ -286,8 +295,12 @@ class Repair {
     parallel(height_, [&](int y) {
       memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
     });
-    if (spares) groups = find_in(tiles(), 0, is_soft);
-    list(groups, [&](const Edge &edge) { return !map_.automatic || (marks_[edge.i] & RAMP ? is_soft : wrong(edge) > DOUBTFUL); });
+    const Asked doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;
+    if (spares)
+      groups = find_in(tiles(), 0, is_soft, is_soft, doubtful);
+    else
+      choose_edges(groups, [&](const Edge &edge) { return doubtful[side_of(edge)]; });
+    allot(groups);
     judge(groups);
     decide(groups);
     const float sigma = blur();
@@ -308,7 +321,10 @@ class Repair {
   }
 
   float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
-  float wrong(const Edge &edge) const { return marks_[edge.i] & GIVEN_NEAR ? 1.0f - shares_[edge.kind] : shares_[edge.kind]; }
+  // A pixel's kind, and above it whether the map gives it the near surface.
+  int side_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & GIVEN_NEAR ? KINDS : 0); }
+  // Share of wrong pixels among those.
+  float wrong(int side) const { return side >= KINDS ? 1.0f - shares_[side - KINDS] : shares_[side]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
@@ -342,11 +358,14 @@ class Repair {
         const bool is_ramp = marks_[edge.i] & RAMP;
         edges++;
         ramps += is_ramp;
-        mixed += is_ramp && std::fabs(level - 0.5f) < 0.25f;
+        mixed += is_ramp && is_mixed(level);
         length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, edge.near - edge.far);
       });
     return ramps > SOFT * edges && (ramps > WIDE * length || mixed > MIXED * ramps);
   }
+
+  // Whether a place on a step is far from both of its surfaces.
+  static bool is_mixed(float level) { return std::fabs(level - 0.5f) < 0.25f; }
 
   // Part of a step that a pixel climbs, by the places of its neighbours: summed, the length of the step in pixels.
   static float climb(const float *value, int left, int right, int above, int below, float gap) {
@@ -365,7 +384,7 @@ class Repair {
     for (const Group &group : sampled)
       for (const Edge &edge : group.edges)
         if (!(marks_[edge.i] & RAMP)) {
-          found += wrong(edge);
+          found += wrong(side_of(edge));
           steps++;
         }
     return found > EXACT * steps;
@@ -404,9 +423,16 @@ class Repair {
     return parts;
   }
 
+  // What is asked of an exact map: steps of kinds that are often wrong, and ramps if it is soft.
+  Asked doubtful_kinds(bool is_soft) const {
+    Asked asked;
+    for (int side = 0; side < 2 * KINDS; side++) asked[side] = side % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(side) > DOUBTFUL;
+    return asked;
+  }
+
   // Marks chosen edges, and forgets the others.
   template <typename Chosen>
-  void list(std::vector<Group> &groups, const Chosen &chosen) {
+  void choose_edges(std::vector<Group> &groups, const Chosen &chosen) {
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
       size_t kept = 0;
@@ -418,6 +444,10 @@ class Repair {
       group.edges.resize(kept);
       group.bounds = bounds(group, [](size_t) { return true; });
     });
+  }
+
+  // Gives groups memory for what is told of their edges.
+  void allot(std::vector<Group> &groups) {
     size_t count = 0;
     for (const Group &group : groups) count += group.edges.size();
     judged_ = Buffer<Judgement>(count);
@@ -495,9 +525,16 @@ class Repair {
   }
 
   // Ramps and steps, and the two surfaces that meet there: edges of groups, and marks as far as a halo around them.
-  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps) {
+  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps, bool measures, const Asked &asked) {
     std::vector<Found> found(groups.size());
-    parallel((int)groups.size(), [&](int g) { find_in(groups[g], in_frame(groups[g].part.grown(halo)), expects_ramps, found[g]); });
+    parallel((int)groups.size(), [&](int g) {
+      Group &group = groups[g];
+      std::vector<Edge> &edges = Scratch::mine->edges;
+      edges.clear();
+      find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, asked, edges, measures ? &found[g] : nullptr);
+      group.edges.assign(edges.begin(), edges.end());
+      group.bounds = bounds(group, [](size_t) { return true; });
+    });
     found_ = {};
     for (const Found &here : found) {
       found_.length += here.length;
@@ -508,14 +545,16 @@ class Repair {
     return groups;
   }
 
-  void find_in(Group &group, const Part &part, bool expects_ramps, Found &found) {
+  void find_in(const Part &own, const Part &part, bool expects_ramps, const Asked &asked, std::vector<Edge> &edges, Found *found) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
-      for (int x = 0; x < part.width; x++) marks_[i + x] = std::fabs(map_.nearness[i + x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
+      const float *values = map_.nearness + i;
+      uint8_t *marks = marks_.data() + i;
+      for (int x = 0; x < part.width; x++) marks[x] = std::fabs(values[x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return;
-    if (expects_ramps || !find_in(group, busy, STEP_HALO, found)) find_in(group, busy, HALO, found);
+    if (expects_ramps || !find_in(own, busy, STEP_HALO, asked, edges, found)) find_in(own, busy, HALO, asked, edges, found);
   }
 
   // Where there may be edges.
@@ -562,7 +601,7 @@ class Repair {
   }
 
   // Returns whether the halo was wide enough.
-  bool find_in(Group &group, const Part &inner, int halo, Found &found) {
+  bool find_in(const Part &own, const Part &inner, int halo, const Asked &asked, std::vector<Edge> &edges, Found *found) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -643,23 +682,28 @@ class Repair {
       const size_t row = (size_t)y * width_ + inner.x0;
       uint8_t *marks = marks_.data() + row;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)mark_row[k];
-      for (int k = 0; k < inner.width; k++) {
-        const int x = inner.x0 + k;
-        if (!(marks[k] & EDGE) || !group.part.has(y, x)) continue;
+      if (y < own.y0 || y >= own.bottom()) continue;
+      for (int x = std::max(inner.x0, own.x0); x < std::min(inner.right(), own.right()); x++) {
+        const int k = x - inner.x0;
+        const uint8_t mark = marks[k];
+        if (!(mark & EDGE)) continue;
         const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
-        const bool is_ramp = marks[k] & RAMP;
-        const float climbed = climb(value, -1, 1, -raw.pitch, raw.pitch, gap);
-        const bool is_middle = std::fabs(level - 0.5f) < 0.25f;
-        found.length += climbed;
-        found.climbed += is_middle ? climbed : 0.0f;
-        found.middles += is_middle;
-        found.lost += (marks[k] & NEAR ? 1.0f : 0.0f) - clamp01(level);
+        if (found) {
+          const float climbed = climb(value, -1, 1, -raw.pitch, raw.pitch, gap);
+          const bool is_middle = is_mixed(level);
+          found->length += climbed;
+          found->climbed += is_middle ? climbed : 0.0f;
+          found->middles += is_middle;
+          found->lost += (mark & NEAR ? 1.0f : 0.0f) - clamp01(level);
+        }
         const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
         const int across = std::fabs(right) > std::fabs(below) + TIE * gap ? (right > 0 ? 1 : -1) : 0;
         const int along = std::fabs(below) > std::fabs(right) + TIE * gap ? (below > 0 ? 1 : -1) : 0;
-        const int ring = RINGS - marks[k] / UNSURE;
-        const int place = is_ramp ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + ring;
-        group.edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)(place * DIRECTIONS + 2 * along + across + DIRECTIONS / 2)});
+        const int place = mark & RAMP ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + RINGS - mark / UNSURE;
+        const int kind = place * DIRECTIONS + 2 * along + across + DIRECTIONS / 2;
+        if (!asked[kind + (mark & GIVEN_NEAR ? KINDS : 0)]) continue;
+        marks[k] = mark | LISTED;
+        edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)kind});
       }
     }
     return true;
