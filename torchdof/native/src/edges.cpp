@@ -127,6 +127,13 @@ inline void sum(const vec *v, int count, float *out) {
   }
 }
 inline vec size_of(vec v) { return most(v, -v); }
+inline float square_root(float v) { return std::sqrt(v); }
+inline vec square_root(vec v) {
+  float lanes[LANES];
+  store(lanes, v);
+  for (float &lane : lanes) lane = std::sqrt(lane);
+  return load<vec>(lanes);
+}
 
 // Calls look(n, take) for each vector of a window; take(p, pitch) has its values in a grid where p is the window's first.
 template <typename Look>
@@ -288,7 +295,7 @@ class Repair {
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });  // what is around blocks may lie in others
     allot(sampled);
     judge(sampled);
-    decide(sampled);
+    decide(sampled, [](int, size_t, const Edge &) {});
     calibrate(sampled);
     const bool is_soft = is_on_ramps(sampled);
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
@@ -302,11 +309,9 @@ class Repair {
       choose_edges(groups, [&](const Edge &edge) { return doubtful[side_of(edge)]; });
     allot(groups);
     judge(groups);
-    decide(groups);
-    const float sigma = blur();
-    const float lost_px = choose(groups);
+    const float sigma = blur(), lost_px = choose(groups);
     if (is_soft) unmix(groups, sigma, lost_px);
-    move(groups);
+    move(groups, is_soft);
     if (is_soft) lift_lamps(sigma, lost_px);
     return true;
   }
@@ -326,6 +331,7 @@ class Repair {
   // Share of wrong pixels among those.
   float wrong(int side) const { return side >= KINDS ? 1.0f - shares_[side - KINDS] : shares_[side]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
+  static vec valid(vec v) { return size_of(v) <= all(LARGEST) ? v : vec{}; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
   // Standard deviation of the map's noise: from how the middle pixel of all bends its row, or its column if that is more.
@@ -359,7 +365,7 @@ class Repair {
         edges++;
         ramps += is_ramp;
         mixed += is_ramp && is_mixed(level);
-        length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, edge.near - edge.far);
+        length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, std::max(edge.near - edge.far, 1e-12f));
       });
     return ramps > SOFT * edges && (ramps > WIDE * length || mixed > MIXED * ramps);
   }
@@ -368,14 +374,15 @@ class Repair {
   static bool is_mixed(float level) { return std::fabs(level - 0.5f) < 0.25f; }
 
   // Part of a step that a pixel climbs, by the places of its neighbours: summed, the length of the step in pixels.
-  static float climb(const float *value, int left, int right, int above, int below, float gap) {
-    float steepness = 0;
+  template <typename V>
+  static V climb(const float *value, int left, int right, int above, int below, V gap) {
+    V steepness{};
     for (const int u : {left, right})
       for (const int v : {above, below}) {
-        const float across = valid(value[u] - value[0]), along = valid(value[v] - value[0]);
-        steepness += std::sqrt(across * across + along * along);
+        const V across = valid(load<V>(value + u) - load<V>(value)), along = valid(load<V>(value + v) - load<V>(value));
+        steepness += square_root(across * across + along * along);
       }
-    return 0.25f * steepness / std::max(gap, 1e-12f);
+    return 0.25f * steepness / gap;
   }
 
   // Whether more of a sample's pixels at steps are wrong than exact maps have.
@@ -683,27 +690,39 @@ class Repair {
       uint8_t *marks = marks_.data() + row;
       for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)mark_row[k];
       if (y < own.y0 || y >= own.bottom()) continue;
-      for (int x = std::max(inner.x0, own.x0); x < std::min(inner.right(), own.right()); x++) {
-        const int k = x - inner.x0;
-        const uint8_t mark = marks[k];
-        if (!(mark & EDGE)) continue;
-        const float *value = raw.at(y, x), gap = std::max(near_row[k] - far_row[k], 1e-12f), level = (*value - far_row[k]) / gap;
-        if (found) {
-          const float climbed = climb(value, -1, 1, -raw.pitch, raw.pitch, gap);
-          const bool is_middle = is_mixed(level);
-          found->length += climbed;
-          found->climbed += is_middle ? climbed : 0.0f;
-          found->middles += is_middle;
-          found->lost += (mark & NEAR ? 1.0f : 0.0f) - clamp01(level);
+      const int last = std::min(inner.right(), own.right());
+      for (int x = std::max(inner.x0, own.x0); x < last; x += LANES) {
+        const int k = x - inner.x0, count = std::min(LANES, last - x);
+        int edges_here = 0;
+        for (int i = 0; i < count; i++) edges_here |= (marks[k + i] & EDGE) << i;
+        if (!edges_here) continue;
+        const vec near = load<vec>(near_row + k), far = load<vec>(far_row + k), gap = most(near - far, all(1e-12f)), value = load<vec>(raw.at(y, x));
+        const vec level = (value - far) / gap;
+        const vec right = load<vec>(high.at(y, x + 2)) - load<vec>(high.at(y, x - 2)), below = load<vec>(high.at(y + 2, x)) - load<vec>(high.at(y - 2, x));
+        const vec none = {}, one = all(1.0f);
+        const vec across = size_of(right) > size_of(below) + TIE * gap ? (right > none ? one : -one) : none;
+        const vec along = size_of(below) > size_of(right) + TIE * gap ? (below > none ? one : -one) : none;
+        float levels[LANES], directions[LANES], climbed[LANES];
+        store(levels, level);
+        store(directions, 2.0f * along + across + (float)(DIRECTIONS / 2));
+        if (found) store(climbed, climb(raw.at(y, x), -1, 1, -raw.pitch, raw.pitch, gap));
+        for (; edges_here; edges_here &= edges_here - 1) {
+          const int i = __builtin_ctz(edges_here);
+          const float level = levels[i];
+          uint8_t &mark = marks[k + i];
+          if (found) {
+            const bool is_middle = is_mixed(level);
+            found->length += climbed[i];
+            found->climbed += is_middle ? climbed[i] : 0.0f;
+            found->middles += is_middle;
+            found->lost += (mark & NEAR ? 1.0f : 0.0f) - clamp01(level);
+          }
+          const int place = mark & RAMP ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + RINGS - mark / UNSURE;
+          const int kind = place * DIRECTIONS + (int)directions[i];
+          if (!asked[kind + (mark & GIVEN_NEAR ? KINDS : 0)]) continue;
+          mark |= LISTED;
+          edges.push_back({(int)row + k + i, near_row[k + i], far_row[k + i], (uint8_t)kind});
         }
-        const float right = *high.at(y, x + 2) - *high.at(y, x - 2), below = *high.at(y + 2, x) - *high.at(y - 2, x);
-        const int across = std::fabs(right) > std::fabs(below) + TIE * gap ? (right > 0 ? 1 : -1) : 0;
-        const int along = std::fabs(below) > std::fabs(right) + TIE * gap ? (below > 0 ? 1 : -1) : 0;
-        const int place = mark & RAMP ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + RINGS - mark / UNSURE;
-        const int kind = place * DIRECTIONS + 2 * along + across + DIRECTIONS / 2;
-        if (!asked[kind + (mark & GIVEN_NEAR ? KINDS : 0)]) continue;
-        marks[k] = mark | LISTED;
-        edges.push_back({(int)row + k, near_row[k], far_row[k], (uint8_t)kind});
       }
     }
     return true;
@@ -795,7 +814,7 @@ class Repair {
     const Part around = group.bounds.grown(REACH);
     const Grid given(around), witness(around), colour(around, channels);
     for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
-    fetch(map_.nearness, given, valid);
+    fetch(map_.nearness, given, [](float v) { return valid(v); });
     fetch(marks_.data(), witness, [](uint8_t marks) { return SURE[marks / UNSURE]; });
     struct Lanes {
       vec lanes;
@@ -877,8 +896,9 @@ class Repair {
     });
   }
 
-  // Neighbours of like colour decide together.
-  void decide(const std::vector<Group> &groups) const {
+  // Neighbours of like colour decide together: calls body(g, k, edge) for each of all groups' edges that has its score.
+  template <typename Body>
+  void decide(const std::vector<Group> &groups, const Body &body) const {
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
       if (group.edges.empty()) return;
@@ -896,6 +916,7 @@ class Repair {
         const float tells = group.judged[k].tells;
         group.judged[k].score = clamp(SHARPNESS * tells * (score / total), -6.0f, 6.0f);
         evidence_[edge.i] = clamp01(2.0f * tells * strongest - 1.0f);
+        body(g, k, edge);
       });
     });
   }
@@ -985,15 +1006,12 @@ class Repair {
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<int64_t> lost(groups.size(), 0);
-    parallel((int)groups.size(), [&](int g) {
-      const Group &group = groups[g];
-      uint8_t *marks = marks_.data();
-      for (size_t k = 0; k < group.edges.size(); k++) {
-        const float score = group.judged[k].score;
-        const int i = group.edges[k].i, shows_near = score + prior[group.edges[k].kind] > -lean * clamp01(std::fabs(score) - 1.0f);
-        lost[g] += shows_near - (marks[i] & NEAR) / NEAR;
-        marks[i] = (uint8_t)((marks[i] & ~NEAR) | shows_near * NEAR);
-      }
+    decide(groups, [&](int g, size_t k, const Edge &edge) {
+      const float score = groups[g].judged[k].score;
+      const bool shows_near = score + prior[edge.kind] > -lean * clamp01(std::fabs(score) - 1.0f);
+      uint8_t &marks = marks_[edge.i];
+      lost[g] += shows_near - (marks & NEAR) / NEAR;
+      marks = (uint8_t)((marks & ~NEAR) | shows_near * NEAR);
     });
     double total = found_.lost;
     for (const int64_t here : lost) total += (double)here;
@@ -1004,21 +1022,24 @@ class Repair {
   static float is_lost(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
 
   // Gives pixels the depth of the surface that they show; on ramps as far as there is evidence.
-  void move(const std::vector<Group> &groups) const {
+  void move(const std::vector<Group> &groups, bool is_soft) const {
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
       if (group.edges.empty()) return;
       // from the ends of a wide ramp only one of the surfaces is in sight: what is three pixels away tells
       const Part around = group.bounds.grown(3);
       const Grid evidence(around), strongest(group.bounds), rows(around);
-      take_listed(evidence_.data(), evidence, 0.0f);
-      highest<3>(evidence, strongest, rows, group.bounds);
+      if (is_soft || !map_.automatic) {  // else no ramp is asked
+        take_listed(evidence_.data(), evidence, 0.0f);
+        highest<3>(evidence, strongest, rows, group.bounds);
+      }
       each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
         const uint8_t marks = marks_[edge.i];
         const bool shows_near = marks & NEAR, given_near = marks & GIVEN_NEAR;
         const float moved = marks & RAMP ? *strongest.at(y, x) : (float)(shows_near != given_near);
-        const float out = map_.out[edge.i], to = shows_near ? group.judged[k].near : group.judged[k].far;
-        map_.out[edge.i] = moved > 0 ? out + moved * (to - out) : out;
+        if (!(moved > 0)) return;
+        float &out = map_.out[edge.i];
+        out += moved * ((shows_near ? group.judged[k].near : group.judged[k].far) - out);
       });
     });
   }
@@ -1080,8 +1101,8 @@ class Repair {
     if (part.height <= 0 || part.width <= 0) return;
     const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
     const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
-    fetch(map_.nearness, up, valid);
-    fetch(map_.nearness, given, valid);
+    fetch(map_.nearness, up, [](float v) { return valid(v); });
+    fetch(map_.nearness, given, [](float v) { return valid(v); });
     for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
     highest<SIDE_REACH>(up, high, rows, labelled);
     highest<SIDE_REACH>(down, low, rows, labelled);
@@ -1164,7 +1185,7 @@ class Repair {
     parallel((int)all_parts.size(), [&](int g) {
       const Part &inner = all_parts[g].part, part = in_frame(inner.grown(LAMP_REACH));
       const Grid near(part.grown(REACH));
-      fetch(map_.nearness, near, valid);
+      fetch(map_.nearness, near, [](float v) { return valid(v); });
       vec high = all(-NONE), low = all(NONE);
       each_vector(near, [&](int y, int x) {
         high = most(high, load<vec>(near.at(y, x)));
@@ -1183,7 +1204,7 @@ class Repair {
       });
       go_on(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
-      fetch(map_.nearness, given, valid);
+      fetch(map_.nearness, given, [](float v) { return valid(v); });
       const Grid lamps(part.grown(LAMP_REACH), 3);  // weights, and by these nearness and how well it fits
       std::fill(lamps.at(lamps.y0, lamps.x0), lamps.at(lamps.y0, lamps.x0) + 3 * lamps.size, 0.0f);
       each_edge(group, [&](size_t, const Edge &, int y, int x) {
