@@ -141,16 +141,16 @@ inline void each_of_window(const Look &look) {
   int n = 0;
   for (int v = 0; v < SIDE; v++)
     for (int u = 0; u < WHOLE; u += LANES) look(n++, [v, u](const float *p, int pitch) { return load<vec>(p + v * pitch + u); });
-  for (int v = 0; v < SIDE; v += ROWS_AT_ONCE)
+  for (int v = 0; v + ROWS_AT_ONCE <= SIDE; v += ROWS_AT_ONCE)
     look(n++, [v](const float *p, int pitch) {
       p += v * pitch + WHOLE;
 #if defined(__AVX2__)
-      const quad a = load<quad>(p), b = load<quad>(v + 1 < SIDE ? p + pitch : p);
-      return vec{a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]};
+      return (vec)__builtin_ia32_vinsertf128_ps256(load<vec>(p), load<quad>(p + pitch), 1);
 #else
       return load<vec>(p);
 #endif
     });
+  if (SIDE % ROWS_AT_ONCE) look(n, [](const float *p, int pitch) { return load<vec>(p + (SIDE - 1) * pitch + WHOLE); });
 }
 
 // What a function of the square of the distance says, for each place of a window.
@@ -276,7 +276,7 @@ struct Found {
 class Repair {
  public:
   explicit Repair(const torchdof_map &map)
-      : map_(map), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
+      : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
 
   bool run() {
     allocate();
@@ -326,6 +326,7 @@ class Repair {
   }
 
   float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
+  float nearness(size_t i) const { return sign_ * map_.nearness[i]; }
   // A pixel's kind, and above it whether the map gives it the near surface.
   int side_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & GIVEN_NEAR ? KINDS : 0); }
   // Share of wrong pixels among those.
@@ -360,7 +361,7 @@ class Repair {
     double edges = 0, ramps = 0, mixed = 0, length = 0;
     for (const Group &group : sampled)
       each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
-        const float *value = map_.nearness + edge.i, level = (*value - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        const float *value = map_.nearness + edge.i, level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
         const bool is_ramp = marks_[edge.i] & RAMP;
         edges++;
         ramps += is_ramp;
@@ -612,7 +613,7 @@ class Repair {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
-    fetch(map_.nearness, raw, [](float v) { return std::fabs(v) <= LARGEST ? v : NAN; });
+    fetch(map_.nearness, raw, [this](float v) { return std::fabs(v) <= LARGEST ? sign_ * v : NAN; });
     each_vector(whole, [&](int y, int x) {
       const vec v = load<vec>(raw.at(y, x));
       const auto is_valid = size_of(v) <= all(LARGEST);
@@ -814,7 +815,7 @@ class Repair {
     const Part around = group.bounds.grown(REACH);
     const Grid given(around), witness(around), colour(around, channels);
     for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
-    fetch(map_.nearness, given, [](float v) { return valid(v); });
+    fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
     fetch(marks_.data(), witness, [](uint8_t marks) { return SURE[marks / UNSURE]; });
     struct Lanes {
       vec lanes;
@@ -939,7 +940,7 @@ class Repair {
     for (const Group &group : groups)
       for (size_t k = 0; k < group.edges.size(); k++) {
         const Edge &edge = group.edges[k];
-        const float score = group.judged[k].score, level = (map_.nearness[edge.i] - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+        const float score = group.judged[k].score, level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
         if (marks_[edge.i] & RAMP ? std::fabs(level - 0.5f) <= 0.3f : edge.kind / DIRECTIONS % RINGS != RINGS - 1) continue;
         const float weight = std::min(0.5f * std::fabs(score), 1.0f);
         total += weight;
@@ -1038,8 +1039,8 @@ class Repair {
         const bool shows_near = marks & NEAR, given_near = marks & GIVEN_NEAR;
         const float moved = marks & RAMP ? *strongest.at(y, x) : (float)(shows_near != given_near);
         if (!(moved > 0)) return;
-        float &out = map_.out[edge.i];
-        out += moved * ((shows_near ? group.judged[k].near : group.judged[k].far) - out);
+        const float own = nearness(edge.i), surface = shows_near ? group.judged[k].near : group.judged[k].far;
+        map_.out[edge.i] = sign_ * (own + moved * (surface - own));
       });
     });
   }
@@ -1101,8 +1102,8 @@ class Repair {
     if (part.height <= 0 || part.width <= 0) return;
     const Part around = part.grown(REACH), labelled = around.grown(reach), whole = labelled.grown(SIDE_REACH);
     const Grid up(whole), down(whole), rows(whole), high(labelled), low(labelled), blurred(around), given(around);
-    fetch(map_.nearness, up, [](float v) { return valid(v); });
-    fetch(map_.nearness, given, [](float v) { return valid(v); });
+    fetch(map_.nearness, up, [this](float v) { return sign_ * valid(v); });
+    fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
     for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
     highest<SIDE_REACH>(up, high, rows, labelled);
     highest<SIDE_REACH>(down, low, rows, labelled);
@@ -1185,7 +1186,7 @@ class Repair {
     parallel((int)all_parts.size(), [&](int g) {
       const Part &inner = all_parts[g].part, part = in_frame(inner.grown(LAMP_REACH));
       const Grid near(part.grown(REACH));
-      fetch(map_.nearness, near, [](float v) { return valid(v); });
+      fetch(map_.nearness, near, [this](float v) { return sign_ * valid(v); });
       vec high = all(-NONE), low = all(NONE);
       each_vector(near, [&](int y, int x) {
         high = most(high, load<vec>(near.at(y, x)));
@@ -1204,7 +1205,7 @@ class Repair {
       });
       go_on(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
-      fetch(map_.nearness, given, [](float v) { return valid(v); });
+      fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
       const Grid lamps(part.grown(LAMP_REACH), 3);  // weights, and by these nearness and how well it fits
       std::fill(lamps.at(lamps.y0, lamps.x0), lamps.at(lamps.y0, lamps.x0) + 3 * lamps.size, 0.0f);
       each_edge(group, [&](size_t, const Edge &, int y, int x) {
@@ -1223,8 +1224,8 @@ class Repair {
           for (int u = x - LAMP_REACH; u <= x + LAMP_REACH; u++)
             for (int n = 0; n < 3; n++) sums[n] += lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
         const float per_weight = 1.0f / std::max(sums[0], 1e-9f);
-        float &out = map_.out[lamp.i];
-        out += sums[2] * per_weight * is_lost(lost_px) * std::max(sums[1] * per_weight - out, 0.0f);
+        const float repaired = sign_ * map_.out[lamp.i];
+        map_.out[lamp.i] = sign_ * (repaired + sums[2] * per_weight * is_lost(lost_px) * std::max(sums[1] * per_weight - repaired, 0.0f));
       });
     });
   }
@@ -1259,7 +1260,7 @@ class Repair {
     if (!(largest(any) > 0)) return found;
     const Part &around = up;
     const Grid down(around), high(part), low(part), peak(part);
-    fetch(map_.nearness, down, [](float v) { return -valid(v); });
+    fetch(map_.nearness, down, [this](float v) { return -sign_ * valid(v); });
     highest<REACH>(up, high, rows, part);
     highest<REACH>(down, low, rows, part);
     highest<2>(bright, peak, rows, part);
@@ -1299,6 +1300,7 @@ class Repair {
   }
 
   const torchdof_map &map_;
+  const float sign_;  // of nearness in the map
   const int height_, width_, channels_;
   const size_t area_;
   float noise_step_ = 0.0f;  // of a map's noise
@@ -1313,21 +1315,7 @@ class Repair {
 
 }  // namespace
 
-bool repair_edges(const torchdof_map &map) {
-  if (!map.of_coc) return Repair(map).run();
-  const Buffer<float> nearness((size_t)map.height * map.width);
-  auto negate = [&](const float *from, float *to) {
-    torchdof::parallel(map.threads, map.height, map.cancelled, [&](int y, int) {
-      for (size_t i = (size_t)y * map.width; i < (size_t)(y + 1) * map.width; i++) to[i] = -from[i];
-    });
-  };
-  negate(map.nearness, nearness.data());
-  torchdof_map negative = map;
-  negative.nearness = nearness.data();
-  const bool changed = Repair(negative).run();
-  if (changed) negate(map.out, map.out);
-  return changed;
-}
+bool repair_edges(const torchdof_map &map) { return Repair(map).run(); }
 
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof
