@@ -16,7 +16,8 @@ constexpr int PART = 16;  // pixels a side of what is known to be empty in a coa
 
 constexpr float EVEN = 1e-12f;  // square of what a weight of 1 may lack
 
-// Neighbouring layers of one resolution and, if it is a coarser one, one side of the focus.
+// Layers of one resolution that are composited before others. Under occlusion these are neighbours and, if it is a coarser
+// resolution, on one side of the focus; light that only accumulates does so in any order.
 struct Run {
   int scale, first, last, half;
   int tile_rows = 0, tile_columns = 0, rows = 0, columns = 0;  // of its canvas, one pixel more on each side
@@ -106,22 +107,26 @@ class Composite {
     for (int k = 0; k < N_; k++) {
       const Layer &l = layers_[k];
       half = std::max(half, l.half);
-      const bool near = l.node < 0;
-      if (!runs_.empty() && runs_.back().scale == l.scale && (l.scale == 1 || (layers_[runs_.back().first].node < 0) == near)) {
-        runs_.back().last = k;
-        runs_.back().half = std::max(runs_.back().half, l.half);
-      } else {
-        Run run;
-        run.scale = l.scale;
-        run.first = run.last = k;
-        run.half = l.half;
-        runs_.push_back(std::move(run));
+      auto run = std::find_if(runs_.begin(), runs_.end(), [&](const Run &r) {
+        const bool follows = &r == &runs_.back() && (l.scale == 1 || (layers_[r.first].node < 0) == (l.node < 0));
+        return r.scale == l.scale && (follows || !over_);
+      });
+      if (run == runs_.end()) {
+        run = runs_.emplace(run);
+        run->scale = l.scale;
+        run->first = k;
+        run->half = 0;
       }
+      run->last = k;
+      run->half = std::max(run->half, l.half);
     }
     window_ = TILE + 2 * half;
     pitch_ = (window_ + 15) / 16 * 16 + 3 * BLOCK;  // rows are read in whole blocks
     scratches_.resize(std::max(1, job_.scene.threads));
     index();
+    fine_.assign(index_.words, 0);
+    for (int k = 0; k < N_; k++)
+      if (layers_[k].scale == 1) fine_[k / 64] |= 1ull << k % 64;
     int farthest = 0;  // beyond the frame
     for (const Layer &l : layers_) farthest = std::max(farthest, l.scale * (l.half + 2) + 2 * BLOCK);
     border_ = border_of(job_, farthest);
@@ -317,7 +322,8 @@ class Composite {
     around(floor_div(top * s, CELL), floor_div((top + height) * s - 1, CELL), floor_div(left * s, CELL),
            floor_div((left + width) * s - 1, CELL), b.layers.data());
     bool any = false;
-    for (int k = run.first; k <= run.last; k++) any |= has(b.layers.data(), k);
+    auto reaches = [&](int k) { return layers_[k].scale == s && has(b.layers.data(), k); };
+    for (int k = run.first; k <= run.last; k++) any |= reaches(k);
     if (!any) {
       for (int c = 0; c < C_ + E_; c++)
         for (int y = 0; y < rows; y++)
@@ -328,7 +334,7 @@ class Composite {
     const Downsampled *d = downsampled(s);
     if (d) find_pieces(run, *d, top, left, height, width, b);
     for (int k = run.last; k >= run.first; k--) {
-      if (!has(b.layers.data(), k)) continue;
+      if (!reaches(k)) continue;
       const Layer &l = layers_[k];
       const int spare = half - l.half;
       if (d)
@@ -612,6 +618,7 @@ class Composite {
         of.light_pitch = in_block ? BLOCK : W_;
         of.weight_pitch = BLOCK;
         if (single) of.weight = nullptr;
+        if (!over_ && !has_fine(layers)) continue;  // nobody asks for its places
         for (int y = w.top; y < w.top + w.rows; y++, from += j ? BLOCK : W_)
           for (int x = 0; x < BLOCK; x += LANES) store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
       }
@@ -629,6 +636,13 @@ class Composite {
       }
       b.blocks.push_back(w);
     }
+  }
+
+  // Whether layers of full resolution are among some.
+  bool has_fine(const uint64_t *layers) const {
+    for (int i = 0; i < index_.words; i++)
+      if (layers[i] & fine_[i]) return true;
+    return false;
   }
 
   // What layer k spreads of a window, rows from `first` on and columns from `from` on. Nothing is written again that
@@ -818,6 +832,14 @@ class Composite {
     float spread_of[STRIP];
     for (int v = 0; v < C_ + E_; v++) {
       const Kernel &kernel = kernels[E_ == 1 ? 0 : v < C_ ? v : v - C_];
+      if (!kernel.half) {  // one tap
+        const float *term = b.term[std::min(v, C_)] + from;
+        for (int i = 0; i < STRIP; i += LANES) {
+          float *to = b.canvas[v] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
+          store(to, load<vec>(to) + load<vec>(term + i / STRIP_COLUMNS * pitch_ + i % STRIP_COLUMNS) * kernel.sum);
+        }
+        continue;
+      }
       spread(b, std::min(v, C_), from, &b.occupied[y], within, kernel, spread_of);
       for (int i = 0; i < STRIP; i += LANES) {
         float *to = b.canvas[v] + at + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
@@ -1011,24 +1033,28 @@ class Composite {
     const bool normalize = over_ ? job_.behind.empty() : (bool)job_.scene.normalize;
     if (has_rays && !over_)
       for (int i = 0; i < C * TILE_PIXELS; i++) b.canvas[0][i] += traced[i];
-    if (normalize)
-      for (int c = 0; c < C; c++) {
-        const float *cover = b.canvas[C + (E > 1 ? c : 0)];
-        for (int i = 0; i < TILE_PIXELS; i++) b.canvas[c][i] = cover[i] > LEAST ? b.canvas[c][i] / cover[i] : 0.0f;
-      }
-    else if (over_)
-      lay_over_behind(y0, x0, rows, columns, b);
-    if (has_rays && over_)
-      for (int i = 0; i < C * TILE_PIXELS; i++) b.canvas[0][i] += traced[i];
-    for (int c = 0; c < C; c++)
-      for (int y = 0; y < rows; y++) {
+    if (over_ && !normalize) lay_over_behind(y0, x0, rows, columns, b);
+    for (int c = 0; c < C; c++) {
+      const float *cover = b.canvas[C + (E > 1 ? c : 0)], *canvas = b.canvas[c];
+      const float *added = has_rays && over_ ? traced + (size_t)c * TILE_PIXELS : nullptr;
+      for (int y = 0; y < rows; y++, canvas += TILE, cover += TILE) {
         const size_t at = ((size_t)c * H_ + y0 + y) * W_ + x0;
-        memcpy(out_ + at, b.canvas[c] + y * TILE, columns * sizeof(float));
+        float *const to = out_ + at;
+        for (int x = 0; x < columns; x += LANES) {
+          vec v = load<vec>(canvas + x);
+          if (normalize) v = load<vec>(cover + x) > all(LEAST) ? v / load<vec>(cover + x) : vec{};
+          if (added) v += load<vec>(added + y * TILE + x);
+          if (x + LANES <= columns)
+            store(to + x, v);
+          else
+            memcpy(to + x, &v, (columns - x) * sizeof(float));
+        }
         if (!s_.valid) continue;
         const float *valid = s_.valid + (size_t)(y0 + y) * W_ + x0;
         for (int x = 0; x < columns; x++)
-          if (!(valid[x] > 0)) out_[at + x] = job_.scene.light[0][at + x];
+          if (!(valid[x] > 0)) to[x] = job_.scene.light[0][at + x];
       }
+    }
   }
 
   void lay_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
@@ -1089,6 +1115,7 @@ class Composite {
   int H_, W_, C_, E_, N_;
   bool over_;
   std::vector<Run> runs_;
+  std::vector<uint64_t> fine_;  // layers of full resolution, a bit each
   int window_, pitch_;
   std::vector<std::unique_ptr<Scratch>> scratches_;
   LayerIndex index_;
