@@ -129,6 +129,31 @@ def test_rays_begin_with_a_blur_of_one_pixel_and_take_all_from_two_on(coc_px: fl
     assert extracted == pytest.approx(share * (100.0 - float(limit[..., 20, 20])), rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("cover", "nearer_px", "beside_light", "sent"),
+    [
+        (0.4, 3.0, 0.1, 1.0),  # of nearer surfaces by as much as they are in the way of rays,
+        (0.4, 1.5, 0.1, 0.7),
+        (0.4, 1.0, 0.1, 0.4),
+        (0.4, -3.0, 0.1, 0.4),
+        (0.4, 3.0, 1.2, 0.7),  # if they are no highlights,
+        (0.4, 3.0, 1.6, 0.4),
+        (0.053, 3.0, 0.1, 0.5265),  # and by as much as layers count of what goes on behind them
+        (0.003, 3.0, 0.1, 0.003),
+    ],
+)
+def test_highlights_behind_a_part_of_a_nearer_surface_send_the_light_of_a_whole_pixel(
+    cover: float, nearer_px: float, beside_light: float, sent: float
+) -> None:
+    image = torch.full((1, 1, 40, 40), 0.1)
+    image[..., 20, 20] = 100.0
+    coc, limit = torch.full_like(image, 6.0), highlights.threshold(image)  # 0.8
+    beside = Surface(torch.full_like(image, beside_light), coc - nearer_px, torch.full_like(image, 1.0 - cover))
+    _, rays = highlights.extract(Surface(image, coc, torch.full_like(image, cover)), limit, beside=beside)
+    assert rays is not None
+    assert float(rays.light) == pytest.approx(sent * (100.0 - 0.8), rel=1e-5)
+
+
 def test_where_a_surface_is_not_it_has_no_rays() -> None:
     image, coc, _ = street()
     surface = Surface(image, coc, torch.zeros_like(coc))

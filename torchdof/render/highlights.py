@@ -26,7 +26,7 @@ from ..optics.placed_kernels import Shares, placed_between, ray_shares
 from ..validation import is_traced
 from .disocclusion import HIDDEN_WEIGHT
 from .plan import KERNELS_PER_PX, kernels_for
-from .surfaces import Surface
+from .surfaces import Surface, going_on
 
 __all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "Highlights", "extract", "obstacles", "splat", "threshold"]
 
@@ -85,13 +85,20 @@ def _cells(size: int, side: int, device: torch.device) -> tuple[int, Tensor]:
     return before, torch.minimum(place, 2 * size - 1 - place)
 
 
-def extract(surface: Surface, limit: Tensor, from_px: float = _LEAST_PX) -> tuple[Surface, Highlights | None]:
+def extract(
+    surface: Surface, limit: Tensor, from_px: float = _LEAST_PX, beside: Surface | None = None
+) -> tuple[Surface, Highlights | None]:
     """Take the light above a limit out of a surface of an image, to be splatted ray by ray.
+
+    A highlight behind part of a nearer surface sends the light of its whole pixel: that surface stands in the way of
+    these rays, and what it takes would be taken twice. Beside a highlight what is behind keeps its share, for it is
+    bright only by what the two mean colours of a mixed pixel do not explain.
 
     Args:
         surface: Of an image.
         limit: As :func:`threshold` gives it, ``[B, 1, H, W]``.
         from_px: Blur from which on there are rays; all of the light above the limit is theirs at 1 px more.
+        beside: The other surface of each pixel.
 
     Returns:
         The surface with what is left of its light, and the highlights if there are any.
@@ -109,13 +116,20 @@ def extract(surface: Surface, limit: Tensor, from_px: float = _LEAST_PX) -> tupl
     if not is_traced() and len(kept) == 0:
         return surface, None
     bright, peak, fades, coc, most = (t.index_select(0, kept) for t in (bright, peak, fades, coc, most))
-    most = torch.maximum(most, least)
-    taken_from, ordinary = pixels.pick(light, bright), most / peak
+    taken_from, ordinary = pixels.pick(light, bright), torch.maximum(most, least) / peak
     excess = taken_from * ((1.0 - ordinary) * fades)
     # not what the excess leaves: its rounding is brighter than a dark scene
     left = pixels.put(light, bright, taken_from * ((1.0 - fades) + fades * ordinary))
     left = where_needed(lambda: is_bright.any(), left, light)
-    highlights = Highlights(bright, excess if weight is None else excess * pixels.pick(weight, bright), coc)
+    if weight is not None:
+        cover = pixels.pick(weight, bright)
+        if beside is not None:
+            stopped = (coc - pixels.pick(beside.coc_px, bright)[0] - NEARER_PX).clamp(0.0, 1.0)
+            beside_peak = pixels.pick(beside.light, bright).amax(0)
+            is_dark = (2.0 - beside_peak / most.clamp_min(torch.finfo(most.dtype).tiny)).clamp(0.0, 1.0)
+            cover = cover + going_on(cover) * (stopped * is_dark)
+        excess = excess * cover
+    highlights = Highlights(bright, excess, coc)
     return surface._replace(light=left), highlights
 
 

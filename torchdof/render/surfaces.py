@@ -15,7 +15,7 @@ from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 from .matting import emitters_behind, matte
 from .plan import Blur
 
-__all__ = ["Frame", "Placed", "Surface", "framed", "surfaces_of_image"]
+__all__ = ["Frame", "Placed", "Surface", "framed", "going_on", "surfaces_of_image"]
 
 
 _HAIR = 0.06
@@ -123,6 +123,11 @@ class Frame:
         return (_stacked if self.stacked else _mixed)(surfaces, pairs)
 
 
+def going_on(cover: Tensor) -> Tensor:
+    """What the farther surface of a mixed pixel, of which it covers so much, may count more: behind the nearer one."""
+    return (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _GOES_ON).clamp(0.0, 1.0)
+
+
 def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
     """``m_k I``, ``m_k`` and ``M_k - m_k`` of one surface, or of two that share their pixels, near to far.
 
@@ -138,8 +143,7 @@ def _mixed(surfaces: Sequence[Placed], pairs: Sequence[tuple[Tensor, Tensor]]) -
         own = behind - beyond
         if cover is not None:
             if nearer is not None:
-                goes_on = (1.0 - cover) * ((cover - HIDDEN_WEIGHT) / _GOES_ON).clamp(0.0, 1.0)
-                cover = cover + goes_on * (1.0 - (nearer / _HAIR).clamp(0.0, 1.0))
+                cover = cover + going_on(cover) * (1.0 - (nearer / _HAIR).clamp(0.0, 1.0))
             beyond, own = beyond * cover, own * cover
         terms = [light * own, own, beyond]
         sums = [a + b for a, b in zip(sums, terms, strict=True)] if sums else terms

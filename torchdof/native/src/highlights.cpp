@@ -20,6 +20,7 @@ constexpr int PATCH = 16;               // rays a side that are looked at togeth
 struct Candidate {
   int row, column;
   float peak, coc, limit;
+  float weight;  // part of the pixel whose light it sends
 };
 
 // Cells along an axis, and pixels of the first before the image: as many as there are behind the last.
@@ -104,6 +105,18 @@ void Job::find_threshold() {
   });
 }
 
+// Of a bright pixel of the first or the second surface, in a block, the part whose light goes out as rays. Behind a nearer, dark
+// surface it is the whole: that one is in the way of the rays.
+static float part_sent(const Block &block, int channels, int second, int within, float coc, float image_coc, float limit) {
+  const float cover = (second ? block.weight : block.seen)[within];
+  const float stopped = clamp(coc - (second ? image_coc : block.coc[within]) - NEARER_PX, 0.0f, 1.0f);
+  if (!(stopped > 0)) return cover;
+  const float *beside = (second ? block.own : block.other) + within;
+  float peak = beside[0];
+  for (int c = 1; c < channels; c++) peak = std::max(peak, beside[c * BLOCK_PIXELS]);
+  return cover + going_on(cover) * stopped * clamp(2.0f - peak / std::max(limit, 1.17549435e-38f), 0.0f, 1.0f);
+}
+
 void Job::extract_highlights() {
   const size_t area = surfaces.area();
   const float from_px = scene.occlusion ? LEAST_PX : std::max(scene.crisp_px - 1.0f, LEAST_PX);
@@ -131,7 +144,12 @@ void Job::extract_highlights() {
             if (!(brightest > least_limit) || (weight && !(weight[x] > 0)) || !(std::fabs(coc[x]) > from_px)) continue;
             const float limit = threshold_at(*this, y, x0 + x);
             if (!(brightest > limit)) continue;
-            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit});
+            float part = weight ? weight[x] : 1.0f;
+            if (!surfaces.whole() && surfaces.has_block(block)) {
+              const int within = y % BLOCK * BLOCK + x;
+              part = part_sent(surfaces.block(block), channels, i, within, coc[x], surfaces.coc[(size_t)y * width + x0 + x], limit);
+            }
+            bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit, part});
           }
         }
       }
@@ -170,25 +188,23 @@ void Job::extract_highlights() {
       const float share = (1.0f - p.limit / p.peak) * fades(p);
       const float left = (1.0f - fades(p)) + fades(p) * (p.limit / p.peak);  // 1 - share, whose rounding is seen beside it
       const size_t at = (size_t)p.row * width + p.column;
-      float weight = 1.0f, *light;
+      float *light;
       size_t step;
       if (surfaces.whole()) {
         light = const_cast<float *>(surfaces.lights[i]) + at;  // of our own copy
         step = area;
-        if (surfaces.weights[i]) weight = surfaces.weights[i][at];
       } else {
         const Block b = surfaces.make_block(p.row / BLOCK * surfaces.block_columns + p.column / BLOCK);
         const int within = p.row % BLOCK * BLOCK + p.column % BLOCK;
         light = (i ? b.other : b.own) + within;
         step = BLOCK_PIXELS;
-        weight = (i ? b.weight : b.seen)[within];
       }
       const double steps = (double)p.coc * STEPS_PER_PX, below = std::floor(steps);
       rays.push_back({p.row, p.column, (int)below, (float)(steps - below), p.coc});
       for (int c = 0; c < channels; c++) {
         const float excess = light[c * step] * share;
         light[c * step] *= left;
-        ray_light.push_back(excess * weight);
+        ray_light.push_back(excess * p.weight);
       }
     }
   }
