@@ -116,6 +116,10 @@ def _all_pass(rays: Any, shown: Any, table: Any, occlusion: bool, kernels_per_px
     return SPLAT(rays, shown, table, False, kernels_per_px)
 
 
+def _by_share(cover: Tensor) -> Tensor:
+    return torch.zeros_like(cover)
+
+
 def _drawn_out(light: Tensor, weight: Any, limit: Any, ends: tuple[int, int, int, int], farthest: int) -> Tensor:
     return functional.pad(light, ends, mode="replicate")
 
@@ -134,6 +138,7 @@ PARTS: dict[str, list[tuple[Any, str, Any]]] = {
     "highlights left in their layers": RAYS,
     "highlights left in their layers, and let into what is filled in": [(highlights, "threshold", _no_highlight)],
     "nothing stands in the way of highlights' rays": [(highlights, "splat", _all_pass)],
+    "highlights of mixed pixels by their share alone": [(highlights, "going_on", _by_share)],
     "the border's pixels drawn outwards": [(surfaces, "continued", _drawn_out)],
     "no coarse layers": [(Plan, "_scale", lambda *_: 1)],
     "none of matting, filling in and rays": MATTING + FILL + RAYS,
