@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from ..io.atomic import whole_file
+from ..io.columns import print_columns
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -90,13 +89,8 @@ class ReportTable:
 
     def show(self) -> None:
         """Prints it."""
-        head, *body = self.lines
-        table = Table(title=self.title, box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title_justify="left")
-        for column in head:
-            table.add_column(column, justify="left" if column in self.words else "right")
-        for line in body:
-            table.add_row(*line)
-        Console().print(table)
+        columns = {name: cells for name, *cells in zip(*self.lines, strict=True)}
+        print_columns(Console(), self.title, columns, self.words)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.arguments import AsJson
-from torchdof.cli.printed import json_line, print_columns
+from torchdof.cli.printed import json_line
 from torchdof.fit.photo.across import table_of_dots
 from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
 from torchdof.fit.photo.photographs import Photographs, read_photographs
@@ -24,6 +24,7 @@ from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.photo.target import SQUARE_MM, Paper, write_target
 from torchdof.fit.problems import FitError, FitWarning
 from torchdof.io.atomic import whole_file
+from torchdof.io.columns import print_columns
 from torchdof.validation import number
 
 __all__ = ["fit"]

@@ -6,7 +6,8 @@ import re
 import pytest
 from rich.console import Console
 
-from torchdof.cli.printed import print_columns
+from torchdof.bench.report import ReportTable
+from torchdof.io.columns import print_columns
 
 COLUMNS = {
     "distance m": ["0.7", "1.5"],
@@ -25,9 +26,22 @@ def printed(width: int) -> list[str]:
 def test_columns_that_have_no_room_are_folded_and_none_is_cut(width: int) -> None:
     lines = printed(width)
     assert max(map(len, lines)) <= width
-    cells = [cell.strip() for line in lines for cell in re.split("[│┃]", line)]
+    cells = [cell.strip() for line in lines for cell in re.split("  +", line)]
     for name, values in COLUMNS.items():
         assert name in cells and all(value in cells for value in values)
     # the first column stands before each part, and the title above the first alone
-    assert cells.count("distance m") == sum("┏" in line for line in lines) == {40: 6, 80: 2, 200: 1}[width]
+    assert cells.count("distance m") == sum("──" in line for line in lines) == {40: 6, 80: 2, 200: 1}[width]
     assert sum("colours" in line for line in lines) == 1
+
+
+def test_a_benchmark_s_table_is_whole_at_80_columns(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    scenes = [f"scene/{k}" for k in range(9)]
+    ReportTable(
+        "losses", [["depth", *scenes], ["half-res", *("32.90 / 31.70 / 24.25" for _ in scenes)]], ("depth",)
+    ).show()
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80 and sum(line.count("32.90 / 31.70 / 24.25") for line in lines) == len(scenes)
+    assert sum(line.startswith("half-res") for line in lines) == 3
