@@ -628,25 +628,33 @@ class Repair {
       return most(steps, all(noise_step_));
     };
     slopes(raw, slope, jump, is_wide ? ramps.grown(FLAT_REACH + 2) : beside);
-    highest<REACH>(up, high, rows, ramps);
-    highest<REACH>(down, low, rows, ramps);
-    each_vector(ramps, [&](int y, int x) {
-      const vec rise = load<vec>(slope.at(y, x)), span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x)), s = step_at(y, x);
-      const auto is_ramp = (rise > 0.1f * s) & (rise > SHALLOW * span) & (span > s) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
-      store(ramp.at(y, x), is_ramp ? all(1.0f) : vec{});
-    });
+    ramp.clear();
     // ramps no farther away than this reach into the inner part
-    vec any{};
-    each_vector(beside, [&](int y, int x) { any = most(any, load<vec>(ramp.at(y, x))); });
-    if (largest(any) > 0) {
+    const auto any_beside = [&](const auto &is) {
+      vec any{};
+      each_vector(beside, [&](int y, int x) { any = is(y, x) ? all(1.0f) : any; });
+      return any_positive(any);
+    };
+    const auto is_steep = [&](int y, int x) { return load<vec>(slope.at(y, x)) > 0.1f * step_at(y, x); };
+    const auto is_ramp = [&](int y, int x) { return load<vec>(ramp.at(y, x)) > vec{}; };
+    if (any_beside(is_steep)) {
+      highest<REACH>(up, high, rows, ramps);
+      highest<REACH>(down, low, rows, ramps);
+      each_vector(ramps, [&](int y, int x) {
+        const vec span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x));
+        const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) & (span > step_at(y, x)) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
+        store(ramp.at(y, x), is_candidate ? all(1.0f) : vec{});
+      });
+    }
+    if (any_beside(is_ramp)) {
       if (!is_wide) return false;
       end_ramps(up, down, slope, high, low, rows, ramp, ramps);
       each_vector(beside, [&](int y, int x) {
         const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
-        const auto is_ramp = (load<vec>(ramp.at(y, x)) > vec{}) & (near + far > step_at(y, x));
-        store(ramp.at(y, x), is_ramp ? all(1.0f) : vec{});
-        store(up.at(y, x), is_ramp ? near : load<vec>(up.at(y, x)));
-        store(down.at(y, x), is_ramp ? far : load<vec>(down.at(y, x)));
+        const auto is_one = is_ramp(y, x) & (near + far > step_at(y, x));
+        store(ramp.at(y, x), is_one ? all(1.0f) : vec{});
+        store(up.at(y, x), is_one ? near : load<vec>(up.at(y, x)));
+        store(down.at(y, x), is_one ? far : load<vec>(down.at(y, x)));
       });
     }
     // the surfaces at both sides of a step
