@@ -718,12 +718,14 @@ class Composite {
           room += h[j] * weight[j];
         }
         const bool some = any_positive(share);
+        bool has_light[COUNT];
+        for (int j = 0; j < COUNT; j++) has_light[j] = COUNT == 1 ? some : any_positive(mine[j]);
         const uint32_t bit = mark(w.column + x);
         store(b.term[C] + at + x, share);
         for (int c = 0; c < C; c++) {
           vec sum = {};
-          for (int j = 0; some && j < COUNT; j++)
-            sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * mine[j];
+          for (int j = 0; j < COUNT; j++)
+            if (has_light[j]) sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * mine[j];
           store(b.term[c] + at + x, sum);
         }
         b.occupied[y] |= some ? bit : 0;
@@ -1063,6 +1065,18 @@ class Composite {
       for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = least(least_cover, load<vec>(b.canvas[C_ + e] + i));
     if (!any_of(least_cover < all(1.0f - COVERED))) return;
     const int h = job_.behind_height, w = job_.behind_width;
+    // where the tile's columns lie: the samples beside each, from the first of its vector on, and how far between them
+    int first[TILE / LANES];
+    ivec left[TILE / LANES], right[TILE / LANES];
+    vec across[TILE / LANES];
+    for (int x = 0; x < TILE; x++) {
+      const float at_x = (x0 + x - 0.5f * (W_ - 1)) / BEHIND_STEP + 0.5f * (w - 1);
+      const int v = x / LANES, lane = x % LANES, before = std::min((int)at_x, w - 1);
+      if (!lane) first[v] = before;
+      left[v][lane] = before - first[v];
+      right[v][lane] = std::min(before + 1, w - 1) - first[v];
+      across[v][lane] = at_x - before;
+    }
     for (int y = 0; y < rows; y++) {
       const float at_y = (y0 + y - 0.5f * (H_ - 1)) / BEHIND_STEP + 0.5f * (h - 1);  // both have one centre
       const int top = std::min((int)at_y, h - 1), bottom = std::min(top + 1, h - 1);
@@ -1071,14 +1085,16 @@ class Composite {
         const float *cover = b.canvas[C_ + (E_ > 1 ? c : 0)] + y * TILE;
         float *canvas = b.canvas[c] + y * TILE;
         const float *upper = &job_.behind[((size_t)c * h + top) * w], *lower = &job_.behind[((size_t)c * h + bottom) * w];
-        for (int x = 0; x < columns; x++) {
-          const float uncovered = 1.0f - cover[x];
-          if (!(uncovered > COVERED)) continue;
-          const float at_x = (x0 + x - 0.5f * (W_ - 1)) / BEHIND_STEP + 0.5f * (w - 1);
-          const int left = std::min((int)at_x, w - 1), right = std::min(left + 1, w - 1);
-          const float across = at_x - left;
-          const float u = upper[left] + across * (upper[right] - upper[left]), v = lower[left] + across * (lower[right] - lower[left]);
-          canvas[x] += uncovered * (u + down * (v - u));
+        for (int v = 0; v * LANES < columns; v++) {
+          const vec uncovered = all(1.0f) - load<vec>(cover + v * LANES);
+          const auto open = uncovered > all(COVERED);
+          if (!any_of(open)) continue;
+          auto between = [&](const float *row) {
+            const vec before = pick(row + first[v], left[v]);
+            return before + across[v] * (pick(row + first[v], right[v]) - before);
+          };
+          const vec above = between(upper), light = above + down * (between(lower) - above), old = load<vec>(canvas + v * LANES);
+          store(canvas + v * LANES, open ? old + uncovered * light : old);
         }
       }
     }

@@ -376,7 +376,7 @@ class Filling {
     const int first_y = first_pixel(H, rows, STEP), first_x = first_pixel(W, columns, STEP);
     job_.behind_height = rows;
     job_.behind_width = columns;
-    job_.behind.resize((size_t)C * rows * columns);
+    job_.behind.resize((size_t)C * rows * columns + 8);  // eight are read from any of them on
     Level together;  // what coarse levels show behind cells of STEP pixels
     together.height = rows;
     together.width = columns;

@@ -55,19 +55,20 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
   for (int i = 0; i < EDGES; i++) {
     // a pixel outside the frame is the nearest one inside
     const int y = std::clamp(y0 - REACH + i, 0, H - 1) - y0 + MARGIN;
-    float least_of[PITCH], most_of[PITCH];
-    for (int j = 0; j < PITCH; j++) {
-      const float *l = low + (y - 1) * PITCH + j, *h = high + (y - 1) * PITCH + j;
-      least_of[j] = std::min(std::min(l[0], l[PITCH]), l[2 * PITCH]);
-      most_of[j] = std::max(std::max(h[0], h[PITCH]), h[2 * PITCH]);
+    float least_of[PITCH + LANES], most_of[PITCH + LANES];
+    for (int j = 0; j < PITCH; j += LANES) {
+      auto row = [&](const float *values, int k) { return load<vec>(values + (y - 1 + k) * PITCH + j); };
+      store(least_of + j, least(least(row(low, 0), row(low, 1)), row(low, 2)));
+      store(most_of + j, most(most(row(high, 0), row(high, 1)), row(high, 2)));
     }
     if (inside && !valid) {
-      for (int j = 0; j < EDGES; j++) {
-        const float gap = std::max(std::max(most_of[j], most_of[j + 1]), most_of[j + 2]) -
-                          std::min(std::min(least_of[j], least_of[j + 1]), least_of[j + 2]);
-        w.edge[i * PITCH + j] = clamp01(gap / EDGE_PX - 1.0f);
-      }
       vec most_edge = {};
+      for (int j = 0; j < PITCH; j += LANES) {
+        auto high_of = [&](int k) { return load<vec>(most_of + j + k); };
+        auto low_of = [&](int k) { return load<vec>(least_of + j + k); };
+        const vec gap = most(most(high_of(0), high_of(1)), high_of(2)) - least(least(low_of(0), low_of(1)), low_of(2));
+        store(w.edge + i * PITCH + j, clamp01(gap * (1.0f / EDGE_PX) - all(1.0f)));
+      }
       for (int j = REACH; j < REACH + BLOCK; j += LANES) most_edge = most(most_edge, load<vec>(w.edge + i * PITCH + j));
       any |= i >= REACH && i < REACH + BLOCK && any_positive(most_edge);
       continue;
