@@ -95,11 +95,13 @@ class Plan:
         such a frame is planned for less. For a plan that is to be ``still`` it is a whole power of 1/2 of the
         tolerance, lest layers move with the scene.
         """
-        low, high = (from_blur_axis(end) for end in layer_cocs.ends(coc_px.detach()))
+        coc_px = coc_px.detach()
+        ends = layer_cocs.ends(coc_px)
+        low, high = (from_blur_axis(end) for end in ends)
         part = min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * max(-low, high, 1.0)))
         if still:
             return cls.still(coc_px, tolerance * 2.0 ** math.floor(math.log2(part)))
-        return cls.of_scene(coc_px, tolerance * part)
+        return cls._between(*ends, coc_px, tolerance * part)
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
@@ -108,7 +110,11 @@ class Plan:
         A scene ``[B, 1, H, W]`` of one plane gets one layer, and its kernel is exact. NaN is left out.
         """
         coc_px = coc_px.detach()
-        low, high = layer_cocs.ends(coc_px)
+        return cls._between(*layer_cocs.ends(coc_px), coc_px, tolerance)
+
+    @classmethod
+    def _between(cls, low: float, high: float, coc_px: Tensor, tolerance: float) -> "Plan":
+        """The same, of a scene whose ends on the blur axis are known."""
         if high <= low:
             return cls((low,), tolerance)
         fixed = [low, high]
@@ -251,12 +257,12 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_
 def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, window: int | None) -> Tensor:
     """Kernel ``[1 or C, k, k]`` of a coc at every ``scale``-th pixel; ``lens`` is the table's fingerprint."""
 
-    @torch.inference_mode(False)  # what is kept must serve autograd as well
     def made() -> Tensor:
-        coc = coc_px / scale
-        if scale > 1 and table.field is None:  # averaging and interpolation blur as well
-            coc *= shrink(table, coc, width / scale, scale)
-        return own_kernels(table, torch.tensor([coc], dtype=torch.float64), width / scale, window)[0].clone()
+        with torch.inference_mode(False):  # what is kept must serve autograd as well
+            coc = coc_px / scale
+            if scale > 1 and table.field is None:  # averaging and interpolation blur as well
+                coc *= shrink(table, coc, width / scale, scale)
+            return own_kernels(table, torch.tensor([coc], dtype=torch.float64), width / scale, window)[0].clone()
 
     if torch.is_grad_enabled() and table.requires_grad:
         return made()

@@ -73,7 +73,7 @@ class Downsampling {
  public:
   Downsampling(const Job &job, const LayerIndex &index, const Border &border, Downsampled &to)
       : job_(job), s_(job.surfaces), index_(index), border_(border), over_(job.scene.occlusion), to_(to), C_(job.channels), stride_(to.stride()), each_(1.0f / (to.scale * to.scale)),
-        gathered_(stride_), cell_sums_(2 * stride_ * (CELL / 2)), light_(C_), light_of_{light_, light_} {
+        gathered_(stride_), light_(C_), light_of_{light_, light_} {
     for (const Layer &l : job.layers) ramps_.push_back({l.at, l.per_after});
   }
 
@@ -123,74 +123,95 @@ class Downsampling {
       std::fill(to_.row(1, row) + column, to_.row(1, row) + column + count, 1.0f);
       return count;
     }
-    const bool whole = count * s == CELL && !index_.mixed[cell];
-    const bool summed = whole && (s == 2 ? cell_sums<2>(row, column, pieces) : s == 4 ? cell_sums<4>(row, column, pieces) : cell_sums<8>(row, column, pieces));
-    for (int i = 0; i < count && !summed; i++) block(row, column + i, true, pieces);
+    if (count * s == CELL && !index_.mixed[cell])
+      s == 2 ? cell_sums<2>(row, column, pieces) : s == 4 ? cell_sums<4>(row, column, pieces) : cell_sums<8>(row, column, pieces);
+    else
+      for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
     return count;
   }
 
-  // Blocks in a row of a cell whose surfaces, not mixed, lie between two nodes each; false if they do not.
+  // Blocks in a row of a cell whose surfaces are not mixed: interval by interval, a row of the cell at once.
   template <int S>
-  bool cell_sums(int row, int column, Pieces &pieces) {
-    constexpr int PARTS = CELL / LANES, COUNT = CELL / S;
+  void cell_sums(int row, int column, Pieces &pieces) {
+    constexpr int PARTS = CELL / LANES, COUNT = CELL / S, DONE = -1;
+    typedef uint16_t halves __attribute__((vector_size(LANES * 2)));
     const int C = C_, y0 = row * S, x0 = column * S;
-    float *sums[2];  // of each surface, values as those of pieces, [stride, COUNT]
-    int nodes[2] = {-1, -1};
+    cell_nodes_.clear();
     for (int i = 0; i < s_.count; i++) {
       const float *coc, *weight;
       if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
-      const uint16_t *intervals = &index_.intervals[i][(size_t)y0 * s_.width + x0], k = *intervals;
-      unsigned differs = 0;
-      for (int y = 0; y < S; y++)
-        for (int x = 0; x < CELL; x++) differs |= intervals[(size_t)y * s_.width + x] ^ k;
-      if (differs) return false;
-      if (!to_.needed(k)) continue;
-      nodes[i] = to_.stands_for[k];
-      sums[i] = cell_sums_.data() + (size_t)i * stride_ * COUNT;
-      auto put = [&](int value, const vec *sum) {  // sums of S neighbours
-        float columns_of[CELL], *to = sums[i] + value * COUNT;
-        for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
-        for (int j = 0; j < COUNT; j++) {
-          to[j] = 0;
-          for (int x = 0; x < S; x++) to[j] += columns_of[j * S + x];
-        }
-      };
+      const uint16_t *intervals = &index_.intervals[i][(size_t)y0 * s_.width + x0];
       const size_t light_step = weight ? BLOCK : s_.width, coc_step = i ? BLOCK : s_.width;
-      vec whole[S][PARTS], far[S][PARTS], one[PARTS] = {}, two[PARTS] = {};
+      vec weighs[S][PARTS], place[S][PARTS], whole[S][PARTS], far[S][PARTS];
+      ivec interval[S][PARTS];
       for (int y = 0; y < S; y++)
         for (int p = 0; p < PARTS; p++) {
-          const vec place = index_.place(load<vec>(coc + y * coc_step + p * LANES));
-          one[p] += whole[y][p] = weight ? load<vec>(weight + y * BLOCK + p * LANES) : all(1.0f);
-          two[p] += far[y][p] = to_.wanted[k] ? whole[y][p] * behind(job_.layers[k], place, over_) : vec{};
+          halves of_row;
+          memcpy(&of_row, intervals + (size_t)y * s_.width + p * LANES, sizeof(of_row));
+          interval[y][p] = __builtin_convertvector(of_row, ivec);
+          weighs[y][p] = weight ? load<vec>(weight + y * BLOCK + p * LANES) : all(1.0f);
+          place[y][p] = index_.place(load<vec>(coc + y * coc_step + p * LANES));
         }
-      put(0, one);
-      put(C + 1, two);
-      for (int c = 0; c < C; c++) {
-        for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
-        for (int y = 0; y < S && to_.wanted[k]; y++)
+      for (int k = *intervals; k != DONE;) {
+        vec one[PARTS] = {}, two[PARTS] = {};
+        ivec left = ivec{} + DONE;  // intervals still to come
+        for (int y = 0; y < S; y++)
           for (int p = 0; p < PARTS; p++) {
-            const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
-            one[p] += v * whole[y][p];
-            two[p] += v * far[y][p];
+            const auto its = interval[y][p] == k;
+            one[p] += whole[y][p] = its ? weighs[y][p] : vec{};
+            interval[y][p] = its ? ivec{} + DONE : interval[y][p];
+            left = most(left, interval[y][p]);
           }
-        put(1 + c, one);
-        put(C + 2 + c, two);
+        if (to_.needed(k)) {
+          const size_t sums = cell_sums_of(to_.stands_for[k], COUNT);
+          auto put = [&](int value, const vec *sum) {  // sums of S neighbours
+            float columns_of[CELL], *to = cell_sums_.data() + sums + value * COUNT;
+            for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
+            for (int x = 0; x < CELL; x++) to[x / S] += columns_of[x];
+          };
+          put(0, one);
+          for (int y = 0; y < S && to_.wanted[k]; y++)
+            for (int p = 0; p < PARTS; p++) two[p] += far[y][p] = whole[y][p] * behind(job_.layers[k], place[y][p], over_);
+          put(C + 1, two);
+          for (int c = 0; c < C && to_.wanted[k]; c++) {
+            for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
+            for (int y = 0; y < S; y++)
+              for (int p = 0; p < PARTS; p++) {
+                const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
+                one[p] += v * whole[y][p];
+                two[p] += v * far[y][p];
+              }
+            put(1 + c, one);
+            put(C + 2 + c, two);
+          }
+        }
+        k = DONE;
+        for (int lane = 0; lane < LANES; lane++) k = std::max(k, (int)left[lane]);
       }
     }
     for (int j = 0; j < COUNT; j++) {
-      int first = -1;
-      for (int i = 0; i < 2; i++) {
-        if (nodes[i] < 0 || sums[i][j] == 0) continue;
-        if (first < 0)
-          first = i;
-        else if (nodes[i] == nodes[first])
-          for (int v = 0; v < stride_; v++) sums[first][v * COUNT + j] += sums[i][v * COUNT + j];
+      float first = NOWHERE;
+      const float *values_of_first = nullptr;
+      for (size_t i = 0; i < cell_nodes_.size(); i++) {
+        const float *values = &cell_sums_[i * stride_ * COUNT] + j;
+        if (*values == 0) continue;
+        if (values_of_first)
+          add_piece(pieces, column + j, cell_nodes_[i], values, COUNT, 1.0f);
         else
-          add_piece(pieces, column + j, nodes[i], sums[i] + j, COUNT, 1.0f);
+          first = (float)cell_nodes_[i], values_of_first = values;
       }
-      put_in_planes(row, column + j, first < 0 ? NOWHERE : (float)nodes[first], first < 0 ? nullptr : sums[first] + j, COUNT, 1.0f);
+      put_in_planes(row, column + j, first, values_of_first, COUNT, 1.0f);
     }
-    return true;
+  }
+  // Where the sums of a node begin, [stride, count].
+  size_t cell_sums_of(int node, int count) {
+    const size_t size = (size_t)stride_ * count, i = std::find(cell_nodes_.begin(), cell_nodes_.end(), node) - cell_nodes_.begin();
+    if (i == cell_nodes_.size()) {
+      cell_nodes_.push_back(node);
+      cell_sums_.resize(std::max(cell_sums_.size(), (i + 1) * size));
+      std::fill(&cell_sums_[i * size], &cell_sums_[i * size] + size, 0.0f);
+    }
+    return i * size;
   }
 
   // Values of a piece, so far apart, times a factor: among the pieces, or in the planes.
@@ -421,7 +442,8 @@ class Downsampling {
   std::vector<Ramp> ramps_;  // beyond each layer
   std::vector<Lacking> lacking_;
   Gathered gathered_;
-  std::vector<float> cell_sums_;
+  std::vector<int> cell_nodes_;    // in a row of blocks of a cell,
+  std::vector<float> cell_sums_;  // and values as those of pieces, [nodes, stride, blocks]
   std::vector<const float *> light_, light_of_[2];
 };
 

@@ -84,24 +84,24 @@ void Job::find_threshold() {
   threshold.resize((size_t)threshold_rows * threshold_columns);
   const float *light = surfaces.light, *valid = surfaces.valid;
   const size_t area = surfaces.area();
+  std::vector<int> xs(threshold_columns * CELL_STEPS);
+  for (int j = 0; j < (int)xs.size(); j++) xs[j] = mirrored(j * STEP + STEP / 2 - threshold_left, width);
   parallel(threshold_rows, [&](int row, int) {
-    float brightest[VECTORS * LANES];
-    std::fill(brightest + COUNT, std::end(brightest), -1.0f);
-    for (int column = 0; column < threshold_columns; column++) {
-      int xs[CELL_STEPS];
-      for (int j = 0; j < CELL_STEPS; j++) xs[j] = mirrored(column * THRESHOLD_CELL + j * STEP + STEP / 2 - threshold_left, width);
-      for (int i = 0; i < CELL_STEPS; i++) {
-        const int y = mirrored(row * THRESHOLD_CELL + i * STEP + STEP / 2 - threshold_top, height);
+    std::vector<float> brightest((size_t)threshold_columns * VECTORS * LANES, -1.0f);  // of each cell
+    for (int i = 0; i < CELL_STEPS; i++) {
+      const int y = mirrored(row * THRESHOLD_CELL + i * STEP + STEP / 2 - threshold_top, height);
+      for (int column = 0; column < threshold_columns; column++)
         for (int j = 0; j < CELL_STEPS; j++) {
-          const size_t at = (size_t)y * width + xs[j];
+          const size_t at = (size_t)y * width + xs[column * CELL_STEPS + j];
           float most = light[at];
           for (int c = 1; c < channels; c++) most = std::max(most, light[c * area + at]);
-          brightest[i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : most;
+          brightest[(size_t)column * VECTORS * LANES + i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : most;
         }
-      }
-      const float largest = 3.4028234663852886e38f;
-      threshold[(size_t)row * threshold_columns + column] = FACTOR * std::min(ranked(COUNT / 5, brightest, VECTORS), largest / FACTOR);
     }
+    const float largest = 3.4028234663852886e38f;
+    for (int column = 0; column < threshold_columns; column++)
+      threshold[(size_t)row * threshold_columns + column] =
+          FACTOR * std::min(ranked(COUNT / 5, &brightest[(size_t)column * VECTORS * LANES], VECTORS), largest / FACTOR);
   });
 }
 
