@@ -77,6 +77,29 @@ def test_a_lamp_seen_through_strands_is_given_back_to_its_surface() -> None:
     assert float(sharp.max()) < 8.0, "no pixel of the lamp, 20 or more, stays in focus"
 
 
+def test_the_rim_of_a_lamp_is_not_given_to_hair_that_is_dim_beside_it() -> None:
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
+    across = (columns - 40).abs() <= 2
+    is_rim, is_hair = across & ((rows == 29) | (rows == 34)), columns == 40
+    light = torch.where(is_rim, 16.0, torch.where(across & (rows >= 30) & (rows < 34), 50.0, 0.1))
+    light = torch.where(is_hair, 0.5 * light + 0.02, light).expand(1, 3, -1, -1).clone()
+    coc = torch.where(is_hair, 1.0, 12.0).expand(1, 1, -1, -1)
+    found = matte(light, coc)
+    beside_hair = is_rim & ((columns - 40).abs() == 1)
+    assert float(found.other_weight[0, 0][beside_hair].min()) > 0.03
+    assert float(found.other[..., beside_hair].min()) > 2.0, "the hair, 0.02, gets some of the lamp"
+    own, other, _, weight = emitters_behind(light, coc, threshold(light), None, found)
+    assert float(weight[0, 0][beside_hair].max()) < 1e-6
+    torch.testing.assert_close((1 - weight) * own + weight * other, light, rtol=1e-5, atol=1e-5)
+    # hair that shines as much itself keeps what it gets of the lamp
+    beside_hair = (rows >= 29) & (rows < 35) & ((columns - 40).abs() == 1)
+    light[..., 28:36, 40] = 50.0
+    found = matte(light, coc)
+    assert float(found.other_weight[0, 0][beside_hair].max()) > 0.03
+    for before, after in zip(found, emitters_behind(light, coc, threshold(light), None, found), strict=True):
+        torch.testing.assert_close(before[..., beside_hair], after[..., beside_hair], rtol=1e-6, atol=1e-6)
+
+
 def test_a_lamp_on_a_near_surface_stays_there() -> None:
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
     is_post = (columns >= 30) & (columns < 42)

@@ -131,7 +131,8 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
 
     An emitter seen through hair or twigs shines into pixels whose depth is that of a strand. A highlight's pixel is
     such a one where its own surface is dim beside it and farther pixels around are about as bright. Of its light what
-    exceeds the own surface's is then the farther surface's, which may cover more than half of the pixel.
+    exceeds the own surface's is then the farther surface's, which may cover more than half of the pixel. In turn the
+    emitter's own pixels keep what a nearer surface would get of them that is dim beside it and nowhere as bright.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -151,29 +152,41 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
     peaks, own_peak = pixels.pick(brightest, window)[0], pixels.pick(brightest, bright)[0]
     excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
     scale = peaks.detach().amax(0)
-    colour, seen, peaks, own_peak = pixels.pick(light, window) / scale, seen / scale, peaks / scale, own_peak / scale
-    farther_by = pixels.pick(coc_px, window)[0] - own_coc
-    falloff = _falloff(light, _EMITTER_REACH)
+    colour, peaks, own_peak = pixels.pick(light, window) / scale, peaks / scale, own_peak / scale
+    window_coc, falloff = pixels.pick(coc_px, window)[0], _falloff(light, _EMITTER_REACH)
     counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
-    farther, same = counted * (farther_by - 1.0).clamp(0.0, 1.0), counted * (2.0 - farther_by.abs()).clamp(0.0, 1.0)
 
-    # the own surface where it is dim, and how surely the emitter is the farther one
-    dim = same * falloff * (2.5 - 5.0 * peaks / own_peak.clamp_min(1e-12)).clamp(0.0, 1.0)
-    lit = farther * falloff * peaks**2
-    far_peak, same_peak = (farther * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
-    sureness = excess * (10.0 * far_peak / same_peak - 5.0).clamp(0.0, 1.0) * (10.0 * dim.sum(0)).clamp(max=1.0)
+    def behind(front_coc: Tensor, share: float) -> tuple[Tensor, ...]:
+        """How surely the emitter lies behind surfaces of a coc, if what is farther has more than a share of their peak.
 
-    front = (colour * dim).sum(1) / dim.sum(0).clamp_min(1e-12)
-    floor, top = front.amax(0), torch.maximum(far_peak, same_peak)
+        And light of these where they are dim, the largest light, and how far behind them the emitter lies.
+        """
+        farther_by = window_coc - front_coc
+        farther, same = counted * (farther_by - 1.0).clamp(0.0, 1.0), counted * (2.0 - farther_by.abs()).clamp(0.0, 1.0)
+        dim = same * falloff * (2.5 - 5.0 * peaks / own_peak.clamp_min(1e-12)).clamp(0.0, 1.0)
+        far_peak, same_peak = (farther * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
+        sureness = excess * (10.0 * (far_peak / same_peak - share)).clamp(0.0, 1.0) * (10.0 * dim.sum(0)).clamp(max=1.0)
+        lit = farther * falloff * peaks**2
+        distance = (farther_by * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
+        front = (colour * dim).sum(1) / dim.sum(0).clamp_min(1e-12)
+        return sureness, front, torch.maximum(far_peak, same_peak), distance
+
+    # light of pixels of the nearer surface
+    sureness, front, top, distance = behind(own_coc, 0.5)
+    floor = front.amax(0)
     weight = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
-    emitter = ((seen - (1.0 - weight) * front) / weight).clamp_min(0.0)
-    emitter_coc = own_coc + (farther_by * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
+    emitter = ((seen / scale - (1.0 - weight) * front) / weight).clamp_min(0.0) * scale
     # what was found without it fades out first
     _, other, other_coc, other_weight = (pixels.pick(t, bright) for t in surfaces)
     is_emitter = sureness > 0.5
-    other, other_coc = torch.where(is_emitter, emitter * scale, other), torch.where(is_emitter, emitter_coc, other_coc)
+    other, other_coc = torch.where(is_emitter, emitter, other), torch.where(is_emitter, own_coc + distance, other_coc)
     weight = torch.where(is_emitter, weight, other_weight) * (2.0 * sureness - 1.0).abs()
-    own = (seen * scale - weight * other) / (1.0 - weight)
+
+    # and of pixels of the farther one, of which a nearer one would get some
+    bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
+    nearer = (own_coc - other_coc[0] - 1.0).clamp(0.0, 1.0)
+    weight = weight * (1.0 - nearer * bright_other * behind(other_coc[0], 1.0)[0])
+    own = (seen - weight * other) / (1.0 - weight)
     changed = zip(surfaces, (own, other, other_coc, weight), strict=True)
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
 

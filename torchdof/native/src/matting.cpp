@@ -214,64 +214,97 @@ void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
     }
 }
 
+// What the pixels around a highlight's tell of where its emitter lies.
+class Around {
+ public:
+  Around(const Surfaces &s, int y, int x, const float *falloff) : s_(s), falloff_(falloff), front(s.channels) {
+    for (int i = 0, dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
+      for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++)
+        at_[i] = (size_t)std::clamp(y + dy, 0, s.height - 1) * s.width + std::clamp(x + dx, 0, s.width - 1);
+  }
+
+  // How surely it lies behind surfaces of a coc, for a pixel of so much light and a threshold, if what is farther has more
+  // than a share of their largest light.
+  float behind(float front_coc, float share, float light, float limit) {
+    bool any = false;
+    for (int i = 0; i < COUNT; i++) any |= s_.coc[at_[i]] - front_coc > 1;
+    if (!any) return 0.0f;
+    if (!scale)
+      for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks_[i] = peak_at(at_[i]));
+    const float own_peak = light / scale;
+    float dim_sum = 0, lit_sum = 0, lit_coc = 0, far_peak = 0, same_peak = 1e-12f;
+    front.assign(front.size(), 0.0f);
+    for (int i = 0; i < COUNT; i++) {
+      const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, farther_by = s_.coc[at_[i]] - front_coc;
+      const float farther = counted * clamp01(farther_by - 1.0f), same = counted * clamp01(2.0f - std::fabs(farther_by));
+      const float dim = same * falloff_[i] * clamp01(2.5f - 5.0f * peak / std::max(own_peak, 1e-12f)), lit = farther * falloff_[i] * peak * peak;
+      dim_sum += dim;
+      for (size_t c = 0; c < front.size(); c++) front[c] += s_.light[c * s_.area() + at_[i]] / scale * dim;
+      lit_sum += lit;
+      lit_coc += farther_by * lit;
+      far_peak = std::max(far_peak, farther * peak);
+      same_peak = std::max(same_peak, same * peak);
+    }
+    for (float &colour : front) colour /= std::max(dim_sum, 1e-12f);
+    top = std::max(far_peak, same_peak);
+    distance = lit_coc / std::max(lit_sum, 1e-12f);
+    return clamp01(light / limit - 1.0f) * clamp01(10.0f * (far_peak / same_peak - share)) * std::min(10.0f * dim_sum, 1.0f);
+  }
+
+  float peak_at(size_t i) const {
+    float peak = s_.light[i];
+    for (size_t c = 1; c < front.size(); c++) peak = std::max(peak, s_.light[c * s_.area() + i]);
+    return peak;
+  }
+
+ private:
+  static constexpr int COUNT = (2 * EMITTER_REACH + 1) * (2 * EMITTER_REACH + 1);
+  const Surfaces &s_;
+  const float *falloff_;
+  size_t at_[COUNT];
+  float peaks_[COUNT];
+
+ public:
+  // of what was asked last: light of these surfaces where they are dim, the largest light, how far behind them it lies
+  std::vector<float> front;
+  float scale = 0, top = 0, distance = 0;
+};
+
 // Gives the light of a highlight's pixel to the farther surface on which the emitter lies.
 void find_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
-  constexpr int COUNT = (2 * EMITTER_REACH + 1) * (2 * EMITTER_REACH + 1);
   Surfaces &s = job.surfaces;
   const int channels = job.channels;
   const size_t at = (size_t)y * s.width + x, area = s.area();
-  auto peak_at = [&](size_t i) {
-    float peak = s.light[i];
-    for (int c = 1; c < channels; c++) peak = std::max(peak, s.light[c * area + i]);
-    return peak;
-  };
-  const float own_light = peak_at(at), own_coc = s.coc[at];
-  if (!(own_light > least_limit) || (s.valid && !(s.valid[at] > 0))) return;
+  if (s.valid && !(s.valid[at] > 0)) return;
+  Around around(s, y, x, falloff);
+  const float light = around.peak_at(at), own_coc = s.coc[at];
+  if (!(light > least_limit)) return;
   const float limit = threshold_at(job, y, x);
-  if (!(own_light > limit)) return;
-  float farther_by[COUNT], peaks[COUNT], scale = 0;
-  size_t around[COUNT];
-  bool any = false;
-  for (int i = 0, dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
-    for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++) {
-      around[i] = (size_t)std::clamp(y + dy, 0, s.height - 1) * s.width + std::clamp(x + dx, 0, s.width - 1);
-      farther_by[i] = s.coc[around[i]] - own_coc;
-      any |= farther_by[i] > 1;
-    }
-  if (!any) return;
-  for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks[i] = peak_at(around[i]));
-  const float own_peak = own_light / scale;
-  std::vector<float> front(channels, 0.0f);
-  float dim_sum = 0, lit_sum = 0, lit_coc = 0, far_peak = 0, same_peak = 1e-12f;
-  for (int i = 0; i < COUNT; i++) {
-    const float counted = s.valid ? s.valid[around[i]] : 1.0f, peak = peaks[i] / scale;
-    const float farther = counted * clamp01(farther_by[i] - 1.0f), same = counted * clamp01(2.0f - std::fabs(farther_by[i]));
-    const float dim = same * falloff[i] * clamp01(2.5f - 5.0f * peak / std::max(own_peak, 1e-12f)), lit = farther * falloff[i] * peak * peak;
-    dim_sum += dim;
-    for (int c = 0; c < channels; c++) front[c] += s.light[c * area + around[i]] / scale * dim;
-    lit_sum += lit;
-    lit_coc += farther_by[i] * lit;
-    far_peak = std::max(far_peak, farther * peak);
-    same_peak = std::max(same_peak, same * peak);
-  }
-  const float sureness = clamp01(own_light / limit - 1.0f) * clamp01(10.0f * far_peak / same_peak - 5.0f) * std::min(10.0f * dim_sum, 1.0f);
-  if (!(sureness > 0)) return;
-  const Block block = s.make_block(y / BLOCK * s.block_columns + x / BLOCK);
-  const int within = y % BLOCK * BLOCK + x % BLOCK;
-  float floor = -INFINITY;
-  for (int c = 0; c < channels; c++) floor = std::max(floor, front[c] /= std::max(dim_sum, 1e-12f));
-  const bool is_emitter = sureness > 0.5f;
+  if (!(light > limit)) return;
+  const int i = y / BLOCK * s.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
+  const float sureness = around.behind(own_coc, 0.5f, light, limit);
+  if (!(sureness > 0) && !s.has_block(i)) return;
+  const Block block = s.make_block(i);
   float weight = block.weight[within];
-  if (is_emitter) {
-    weight = clamp((own_peak - floor) / std::max(std::max(far_peak, same_peak) - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
+  if (sureness > 0.5f) {
+    const float floor = *std::max_element(around.front.begin(), around.front.end());
+    weight = clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
     for (int c = 0; c < channels; c++) {
-      const float seen = s.light[c * area + at] / scale;
-      block.other[c * BLOCK_PIXELS + within] = std::max((seen - (1.0f - weight) * front[c]) / weight, 0.0f) * scale;
+      const float seen = s.light[c * area + at] / around.scale;
+      block.other[c * BLOCK_PIXELS + within] = std::max((seen - (1.0f - weight) * around.front[c]) / weight, 0.0f) * around.scale;
     }
-    block.coc[within] = own_coc + lit_coc / std::max(lit_sum, 1e-12f);
+    block.coc[within] = own_coc + around.distance;
   }
   // what was found without it fades out first
-  weight *= std::fabs(2.0f * sureness - 1.0f);
+  if (sureness > 0) weight *= std::fabs(2.0f * sureness - 1.0f);
+
+  // of the farther surface's pixel a nearer one, dim around, gets nothing
+  float other_light = 0;
+  for (int c = 0; c < channels; c++) other_light = std::max(other_light, block.other[c * BLOCK_PIXELS + within]);
+  const float taken = clamp01(own_coc - block.coc[within] - 1.0f) * clamp01(other_light / std::max(limit, 1.17549435e-38f) - 1.0f);
+  const float given_back = weight * taken > 0 ? taken * around.behind(block.coc[within], 1.0f, light, limit) : 0.0f;
+  if (!(sureness > 0) && !(given_back > 0)) return;
+  weight *= 1.0f - given_back;
   for (int c = 0; c < channels; c++)
     block.own[c * BLOCK_PIXELS + within] = (s.light[c * area + at] - weight * block.other[c * BLOCK_PIXELS + within]) / (1.0f - weight);
   block.weight[within] = weight;
