@@ -149,9 +149,38 @@ def test_highlights_behind_a_part_of_a_nearer_surface_send_the_light_of_a_whole_
     image[..., 20, 20] = 100.0
     coc, limit = torch.full_like(image, 6.0), highlights.threshold(image)  # 0.8
     beside = Surface(torch.full_like(image, beside_light), coc - nearer_px, torch.full_like(image, 1.0 - cover))
-    _, rays = highlights.extract(Surface(image, coc, torch.full_like(image, cover)), limit, beside=beside)
+    surface = Surface(image, coc, torch.full_like(image, cover))
+    _, rays = highlights.extract(surface, limit, beside=beside, image_coc_px=beside.coc_px)
     assert rays is not None
     assert float(rays.light) == pytest.approx(sent * (100.0 - 0.8), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("between", "share", "sent"),
+    [
+        (0, 0.5, 1.0),
+        (1, 0.5, 1.0),
+        (2, 0.5, 0.82),  # 1.5 - 10 * 2 / 25 of what it would send more
+        (4, 0.5, 0.4),
+        (25, 0.05, 1.0),  # near enough to one of the surfaces
+        (25, 0.95, 1.0),
+        (3, 0.125, 0.94),  # counts half
+    ],
+)
+def test_highlights_send_the_light_of_a_whole_pixel_only_where_depth_steps(
+    between: int, share: float, sent: float
+) -> None:
+    image = torch.full((1, 1, 40, 40), 0.1)
+    image[..., 20, 20] = 100.0
+    coc, cover = torch.full_like(image, 6.0), torch.full_like(image, 0.4)
+    beside = Surface(torch.full_like(image, 0.1), torch.full_like(image, 2.0), 1.0 - cover)
+    image_coc = beside.coc_px.clone()
+    image_coc[..., 18:23, 18:23] += 4.0 * share * (torch.arange(25) < between).view(5, 5)
+    _, rays = highlights.extract(
+        Surface(image, coc, cover), highlights.threshold(image), beside=beside, image_coc_px=image_coc
+    )
+    assert rays is not None
+    assert float(rays.light) == pytest.approx(sent * (100.0 - 0.8), rel=1e-4)
 
 
 def test_where_a_surface_is_not_it_has_no_rays() -> None:

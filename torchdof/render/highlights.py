@@ -86,19 +86,25 @@ def _cells(size: int, side: int, device: torch.device) -> tuple[int, Tensor]:
 
 
 def extract(
-    surface: Surface, limit: Tensor, from_px: float = _LEAST_PX, beside: Surface | None = None
+    surface: Surface,
+    limit: Tensor,
+    from_px: float = _LEAST_PX,
+    beside: Surface | None = None,
+    image_coc_px: Tensor | None = None,
 ) -> tuple[Surface, Highlights | None]:
     """Take the light above a limit out of a surface of an image, to be splatted ray by ray.
 
     A highlight behind part of a nearer surface sends the light of its whole pixel: that surface stands in the way of
     these rays, and what it takes would be taken twice. Beside a highlight what is behind keeps its share, for it is
-    bright only by what the two mean colours of a mixed pixel do not explain.
+    bright only by what the two mean colours of a mixed pixel do not explain. Nor where depth around has values
+    between the two: it is not exact then, and the farther one may be nearer than the lamp.
 
     Args:
         surface: Of an image.
         limit: As :func:`threshold` gives it, ``[B, 1, H, W]``.
         from_px: Blur from which on there are rays; all of the light above the limit is theirs at 1 px more.
         beside: The other surface of each pixel.
+        image_coc_px: Coc of the image, ``[B, 1, H, W]``; without it a highlight sends what its surface has.
 
     Returns:
         The surface with what is left of its light, and the highlights if there are any.
@@ -123,11 +129,15 @@ def extract(
     left = where_needed(lambda: is_bright.any(), left, light)
     if weight is not None:
         cover = pixels.pick(weight, bright)
-        if beside is not None:
-            stopped = (coc - pixels.pick(beside.coc_px, bright)[0] - NEARER_PX).clamp(0.0, 1.0)
+        if beside is not None and image_coc_px is not None:
+            gap = coc - pixels.pick(beside.coc_px, bright)[0]
+            stopped = (gap - NEARER_PX).clamp(0.0, 1.0)
             beside_peak = pixels.pick(beside.light, bright).amax(0)
             is_dark = (2.0 - beside_peak / most.clamp_min(torch.finfo(most.dtype).tiny)).clamp(0.0, 1.0)
-            cover = cover + going_on(cover) * (stopped * is_dark)
+            around = pixels.pick(image_coc_px, pixels.around(bright, image_coc_px, 2))[0]
+            off_middle = (around - (coc - 0.5 * gap)).abs() / gap.clamp_min(NEARER_PX)  # 1/2 on either surface
+            is_step = (1.5 - 10.0 * (3.5 - 8.0 * off_middle).clamp(0.0, 1.0).mean(0)).clamp(0.0, 1.0)
+            cover = cover + going_on(cover) * (stopped * is_dark * is_step)
         excess = excess * cover
     highlights = Highlights(bright, excess, coc)
     return surface._replace(light=left), highlights

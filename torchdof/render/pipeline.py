@@ -169,7 +169,7 @@ def _render_item(
         from_px = 0.0 if options.occlusion else crisp_px - 1.0
         # a known background says itself what is behind a mixed pixel
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
-        extracted = [highlights.extract(s, limit, from_px, b) for s, b in zip(surfaces, beside, strict=True)]
+        extracted = [highlights.extract(s, limit, from_px, b, coc) for s, b in zip(surfaces, beside, strict=True)]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px) if rays else None
 

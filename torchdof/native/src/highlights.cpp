@@ -105,16 +105,30 @@ void Job::find_threshold() {
   });
 }
 
-// Of a bright pixel of the first or the second surface, in a block, the part whose light goes out as rays. Behind a nearer, dark
-// surface it is the whole: that one is in the way of the rays.
-static float part_sent(const Block &block, int channels, int second, int within, float coc, float image_coc, float limit) {
+// Of a bright pixel of the first or the second surface the part whose light goes out as rays. Behind a nearer, dark surface it
+// is the whole: that one is in the way of the rays. But not where depth around has values between the two: it is not exact.
+static float part_sent(const Surfaces &surfaces, int channels, int second, int y, int x, float coc, float limit) {
+  const Block block = surfaces.block(y / BLOCK * surfaces.block_columns + x / BLOCK);
+  const int within = y % BLOCK * BLOCK + x % BLOCK;
   const float cover = (second ? block.weight : block.seen)[within];
-  const float stopped = clamp(coc - (second ? image_coc : block.coc[within]) - NEARER_PX, 0.0f, 1.0f);
+  const float gap = coc - (second ? surfaces.coc[(size_t)y * surfaces.width + x] : block.coc[within]);
+  const float stopped = clamp(gap - NEARER_PX, 0.0f, 1.0f);
   if (!(stopped > 0)) return cover;
+  const float middle = coc - 0.5f * gap;
+  float between = 0;  // of 25 pixels
+  for (int dy = -2; dy <= 2; dy++) {
+    const float *row = surfaces.coc + (size_t)std::clamp(y + dy, 0, surfaces.height - 1) * surfaces.width;
+    for (int dx = -2; dx <= 2; dx++) {
+      const float off_middle = std::fabs(row[std::clamp(x + dx, 0, surfaces.width - 1)] - middle) / gap;  // 1/2 on either surface
+      between += clamp(3.5f - 8.0f * off_middle, 0.0f, 1.0f);
+    }
+  }
+  const float is_step = clamp(1.5f - 10.0f * (between / 25.0f), 0.0f, 1.0f);
   const float *beside = (second ? block.own : block.other) + within;
   float peak = beside[0];
   for (int c = 1; c < channels; c++) peak = std::max(peak, beside[c * BLOCK_PIXELS]);
-  return cover + going_on(cover) * stopped * clamp(2.0f - peak / std::max(limit, 1.17549435e-38f), 0.0f, 1.0f);
+  const float is_dark = clamp(2.0f - peak / std::max(limit, 1.17549435e-38f), 0.0f, 1.0f);
+  return cover + going_on(cover) * (stopped * is_dark * is_step);
 }
 
 void Job::extract_highlights() {
@@ -145,10 +159,7 @@ void Job::extract_highlights() {
             const float limit = threshold_at(*this, y, x0 + x);
             if (!(brightest > limit)) continue;
             float part = weight ? weight[x] : 1.0f;
-            if (!surfaces.whole() && surfaces.has_block(block)) {
-              const int within = y % BLOCK * BLOCK + x;
-              part = part_sent(surfaces.block(block), channels, i, within, coc[x], surfaces.coc[(size_t)y * width + x0 + x], limit);
-            }
+            if (!surfaces.whole() && surfaces.has_block(block)) part = part_sent(surfaces, channels, i, y, x0 + x, coc[x], limit);
             bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit, part});
           }
         }
