@@ -26,12 +26,16 @@ struct Run {
   std::vector<uint8_t> used;                                   // parts with anything in them
 };
 
-// Pieces of blocks in a window: where each lies in it, its node and values. Those of node i are order[start[i]] to
-// order[start[i + 1]].
+// Pieces of blocks in a window: where each lies in it, its node and values. Those of node i are sorted[start[i]] to
+// sorted[start[i + 1]].
+struct WindowPiece {
+  const float *values;
+  uint16_t row, column, node;
+  bool room_only;
+};
 struct WindowPieces {
-  std::vector<int> at, node, start, order;
-  std::vector<uint8_t> room_only;
-  std::vector<const float *> values;
+  std::vector<WindowPiece> unsorted, sorted;
+  std::vector<int> start;
 };
 
 // The part of a window that lies in one block of pixels: where its surfaces are, and what its terms were last.
@@ -367,10 +371,8 @@ class Composite {
   void find_pieces(const Run &run, const Downsampled &d, int top, int left, int height, int width, Scratch &b) {
     const int per_band = BLOCK / d.scale, L = run.last - run.first + 2, stride = d.stride();
     WindowPieces &p = b.pieces;
-    p.at.clear();
-    p.node.clear();
-    p.room_only.clear();
-    p.values.clear();
+    p.unsorted.clear();
+    p.start.assign(L + 1, 0);
     if (over_)
       for (int y = 0; y < height; y++) memset(b.rest + (size_t)y * pitch_, 0, width * sizeof(float));
     for (int y = 0; y < height; y++) {
@@ -379,25 +381,18 @@ class Composite {
       const int *start = &pieces.start[row - band * per_band], *column = pieces.column.data();
       const int end = (int)(std::lower_bound(column + start[0], column + start[1], left + width) - column);
       for (int i = (int)(std::lower_bound(column + start[0], column + start[1], left) - column); i < end; i++) {
-        const int node = (pieces.node[i] & ~Pieces::ROOM_ONLY) - run.first + 1, at = y * pitch_ + column[i] - left;
+        const int node = (pieces.node[i] & ~Pieces::ROOM_ONLY) - run.first + 1, x = column[i] - left;
         const float *values = &pieces.values[(size_t)i * stride];
-        if (node < 0) continue;
-        if (node >= L) {
-          b.rest[at] += values[0];
-          continue;
-        }
-        p.at.push_back(at);
-        p.node.push_back(node);
-        p.room_only.push_back(pieces.node[i] & Pieces::ROOM_ONLY ? 1 : 0);
-        p.values.push_back(values);
+        if (node >= L) b.rest[(size_t)y * pitch_ + x] += values[0];
+        if (node < 0 || node >= L) continue;
+        p.unsorted.push_back({values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::ROOM_ONLY) != 0});
+        p.start[node + 1]++;
       }
     }
-    p.start.assign(L + 1, 0);
-    for (int node : p.node) p.start[node + 1]++;
     for (int i = 0; i < L; i++) p.start[i + 1] += p.start[i];
-    p.order.resize(p.node.size());
+    p.sorted.resize(p.unsorted.size());
     std::vector<int> next(p.start.begin(), p.start.end() - 1);
-    for (int i = 0; i < (int)p.node.size(); i++) p.order[next[p.node[i]]++] = i;
+    for (const WindowPiece &piece : p.unsorted) p.sorted[next[piece.node]++] = piece;
   }
 
   // What layer k spreads of a window; what lies behind it is added to the rest.
@@ -447,27 +442,38 @@ class Composite {
         }
       }
     }
-    const WindowPieces &p = b.pieces;
-    auto add = [&](int node, bool behind) {  // pieces before the layer's node, or behind it
-      for (int i = p.start[node]; i < p.start[node + 1]; i++) {
-        const int piece = p.order[i], at = p.at[piece];
-        const float *one = p.values[piece], *two = one + C + 1;
-        auto part = [&](int v) { return behind ? one[v] - two[v] : two[v]; };
-        const uint32_t bit = mark(at % pitch_);
-        b.occupied[at / pitch_] |= bit;
-        b.open[at / pitch_] |= bit;
-        b.uneven[at / pitch_] |= bit;
-        if (!p.room_only[piece]) {
-          b.term[C][at] += part(0);
-          for (int c = 0; c < C; c++) b.term[c][at] += part(1 + c);
-        }
-        if (!over_) continue;
-        b.term[C + 1][at] += behind ? one[0] : two[0];
-        if (behind) b.rest[at] += one[0];
+    const int node = k - run.first + 1;
+    if (C == 3) {
+      add_pieces<3, true>(node, b);
+      add_pieces<3, false>(node - 1, b);
+    } else {
+      add_pieces<0, true>(node, b);
+      add_pieces<0, false>(node - 1, b);
+    }
+  }
+
+  // Adds the pieces behind a node to what the layer there spreads and to the rest, or those behind the node before it.
+  template <int CHANNELS, bool BEHIND>
+  void add_pieces(int node, Scratch &b) const {
+    const int C = CHANNELS ? CHANNELS : C_;
+    const WindowPiece *const pieces = b.pieces.sorted.data();
+    for (int i = b.pieces.start[node]; i < b.pieces.start[node + 1]; i++) {
+      const WindowPiece &piece = pieces[i];
+      const size_t at = (size_t)piece.row * pitch_ + piece.column;
+      const float *one = piece.values, *two = one + C + 1;
+      auto part = [&](int v) { return BEHIND ? one[v] - two[v] : two[v]; };
+      const uint32_t bit = mark(piece.column);
+      b.occupied[piece.row] |= bit;
+      b.open[piece.row] |= bit;
+      b.uneven[piece.row] |= bit;
+      if (!piece.room_only) {
+        b.term[C][at] += part(0);
+        for (int c = 0; c < C; c++) b.term[c][at] += part(1 + c);
       }
-    };
-    add(k - run.first + 1, true);
-    add(k - run.first, false);
+      if (!over_) continue;
+      b.term[C + 1][at] += BEHIND ? one[0] : two[0];
+      if (BEHIND) b.rest[at] += one[0];
+    }
   }
 
   // The same of surfaces that cover each other: means of what the layer spreads at each pixel.
