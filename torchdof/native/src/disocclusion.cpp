@@ -11,7 +11,6 @@ constexpr float FALL = 0.35f;      // weight of a level of the pyramid against t
 constexpr int CELL_LEVEL = 3;      // of the pyramid, in whose pixels it is told which may hide something
 constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones are looked at from cells of STEP pixels
 constexpr int STEP = 1 << FINE_LEVELS;
-constexpr int SAMPLES = 32;  // samples of the first level that are made together
 constexpr float SURE = 0.1f;      // weight of what a level shows from which on it has a whole vote
 constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight, or a farther one counts alone
 constexpr float LEAST_SEEN = 1e-4f;  // weight of what lies behind up to which nothing is seen
@@ -51,6 +50,17 @@ void farthest(const float *const *child, int channels, int stride, float *out) {
 
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
+
+// Of two vectors beside each other the values at even places and those at odd ones; lane i of them is the one at even_place(i).
+#if defined(__AVX2__)  // across the halves of a vector it would take twice as long
+inline vec evens(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0x88); }
+inline vec odds(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0xdd); }
+constexpr int even_place(int lane) { return lane % 2 + lane / 4 * 2 + lane % 4 / 2 * 4; }
+#else
+inline vec evens(vec a, vec b) { return vec{a[0], a[2], b[0], b[2]}; }
+inline vec odds(vec a, vec b) { return vec{a[1], a[3], b[1], b[3]}; }
+constexpr int even_place(int lane) { return lane; }
+#endif
 
 // A place along an axis of a level: the sample before it, and how far it is from there to the next.
 struct Place {
@@ -204,7 +214,7 @@ class Filling {
     const int H = job_.height, W = job_.width, planes = C_ + 2;
     const Level &level = pyramid_[0];
     const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2);
-    const int across = 2 * ceil_div(level.width, SAMPLES) * SAMPLES + 1;  // rows are read in whole strips
+    const int across = 2 * ceil_div(level.width, LANES) * LANES + 2;  // rows are read in whole vectors
     const size_t line = (size_t)planes * across;
     std::vector<float> memory(3 * line);
     int held[3] = {-1, -1, -1};
@@ -228,7 +238,7 @@ class Filling {
     for (int y = band * BLOCK / 2; y < std::min(level.height, (band + 1) * BLOCK / 2); y++) {
       const float *rows[3];
       for (int i = 0; i < 2 + H % 2; i++) rows[i] = row_of(top + 2 * y + i);
-      farthest_of_rows(rows, across, level.at(y, 0));
+      W % 2 ? farthest_of_rows<3>(rows, across, level.at(y, 0)) : farthest_of_rows<2>(rows, across, level.at(y, 0));
     }
   }
 
@@ -287,41 +297,48 @@ class Filling {
 
   // Of the pixels of rows that are one in the first level, the mean of those that are farthest: of two, or, where the
   // image's size is odd, of two halves and the one between.
+  template <int COLUMNS>
   void farthest_of_rows(const float *const *rows, size_t across, float *out) const {
-    const int C = C_, H = job_.height, W = job_.width, ny = 2 + H % 2, nx = 2 + W % 2, width = pyramid_[0].width;
-    float counts[9][SAMPLES], most[SAMPLES], each[SAMPLES], total[SAMPLES];
-    for (int x0 = 0; x0 < width; x0 += SAMPLES) {
-      const int n = std::min(SAMPLES, width - x0);
-      auto child = [&](int j, int plane) { return rows[j / nx] + plane * across + 2 * x0 + j % nx; };
-      for (int x = 0; x < SAMPLES; x++) most[x] = -NEVER;
-      for (int j = 0; j < ny * nx; j++) {
-        const float *coc = child(j, C);
-        for (int x = 0; x < SAMPLES; x++) most[x] = std::max(most[x], coc[2 * x]);
-      }
-      for (int x = 0; x < SAMPLES; x++) total[x] = 0;
-      for (int j = 0; j < ny * nx; j++) {
-        const float *coc = child(j, C), *weight = child(j, C + 1);
-        const float share = 0.25f * (ny == 3 && j / nx != 1 ? 0.5f : 1.0f) * (nx == 3 && j % nx != 1 ? 0.5f : 1.0f);
-        for (int x = 0; x < SAMPLES; x++) {
-          counts[j][x] = share * weight[2 * x] * (1.0f - is_behind(most[x] - coc[2 * x]));
-          total[x] += counts[j][x];
+    const int C = C_, rows_count = 2 + job_.height % 2, count = rows_count * COLUMNS, width = pyramid_[0].width;
+    for (int x0 = 0; x0 < width; x0 += LANES, out += LANES * stride_) {
+      vec child[3 * COLUMNS], counts[3 * COLUMNS], total = {};
+      auto read = [&](int plane) {
+        for (int i = 0; i < rows_count; i++) {
+          const float *from = rows[i] + plane * across + 2 * x0;
+          vec *to = child + i * COLUMNS;
+          to[0] = evens(load<vec>(from), load<vec>(from + LANES));
+          to[1] = odds(load<vec>(from), load<vec>(from + LANES));
+          if (COLUMNS == 3) to[2] = evens(load<vec>(from + 2), load<vec>(from + 2 + LANES));
         }
+      };
+      const int n = std::min(LANES, width - x0);
+      auto put = [&](int plane, vec value) {
+        if (n == LANES)
+          for (int i = 0; i < LANES; i++) out[even_place(i) * stride_ + plane] = value[i];
+        else
+          for (int i = 0; i < LANES; i++)
+            if (even_place(i) < n) out[even_place(i) * stride_ + plane] = value[i];
+      };
+      read(C);
+      vec farthest_coc = child[0];
+      for (int j = 1; j < count; j++) farthest_coc = most(farthest_coc, child[j]);
+      for (int j = 0; j < count; j++) counts[j] = all(1.0f) - clamp01(farthest_coc - child[j] - all(BEHIND_PX - 0.5f));
+      read(C + 1);
+      for (int j = 0; j < count; j++) {
+        const bool half_row = rows_count == 3 && j / COLUMNS != 1, half_column = COLUMNS == 3 && j % COLUMNS != 1;
+        counts[j] *= 0.25f * (half_row ? 0.5f : 1.0f) * (half_column ? 0.5f : 1.0f) * child[j];
+        total += counts[j];
       }
-      for (int x = 0; x < SAMPLES; x++) each[x] = 1.0f / std::max(total[x], 1e-9f);
-      float *to = out + (size_t)x0 * stride_;
+      const vec each = all(1.0f) / most(total, all(1e-9f));
+      for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // what fills the stride
       for (int k = 0; k <= C; k++) {
-        float sum[SAMPLES] = {};
-        for (int j = 0; j < ny * nx; j++) {
-          const float *of = child(j, k);
-          for (int x = 0; x < SAMPLES; x++) sum[x] += of[2 * x] * counts[j][x];
-        }
-        for (int x = 0; x < n; x++) to[x * stride_ + k] = each[x] * sum[x];
+        read(k);
+        vec sum = {};
+        for (int j = 0; j < count; j++) sum += child[j] * counts[j];
+        sum *= each;
+        put(k, k < C ? sum : total > vec{} ? sum : all(-NEVER));
       }
-      for (int x = 0; x < n; x++) {
-        if (!(total[x] > 0)) to[x * stride_ + C] = -NEVER;
-        to[x * stride_ + C + 1] = total[x];
-        for (int k = C + 2; k < stride_; k++) to[x * stride_ + k] = 0;
-      }
+      put(C + 1, total);
     }
   }
 
