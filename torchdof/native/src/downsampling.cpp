@@ -267,24 +267,25 @@ class Downsampling {
     for (int i = 0; i < S * S; i += 4) store(coc_[surface] + i, four<S>(coc, surface ? BLOCK : W, i));
     return any != 0;
   }
-  // The same of a block that the frame cuts off, where it goes on with its last pixels.
-  bool read_beyond(int surface, int y0, int x0) {
-    const int s = to_.scale, H = job_.height, W = job_.width;
+  // The same of a block that the frame cuts off, where it goes on with its last pixels: so many, row by row.
+  bool read_beyond(int surface, int y0, int x0, int count, int columns) {
+    const int H = job_.height, W = job_.width;
     float any = 0;
-    for (int i = 0; i < s * s; i++) {
-      const int y = std::clamp(y0 + i / s, 0, H - 1), x = std::clamp(x0 + i % s, 0, W - 1);
+    for (int i = 0; i < count; i++) {
+      const int y = std::clamp(y0 + i / columns, 0, H - 1), x = std::clamp(x0 + i % columns, 0, W - 1);
       const float *coc, *weight;
       const bool has_it = s_.row(surface, y, x, light_.data(), coc, weight);
       coc_[surface][i] = has_it ? *coc : 0.0f;
       any += weight_[surface][i] = !has_it ? 0.0f : weight ? *weight : 1.0f;
       interval_[surface][i] = index_.intervals[surface][(size_t)y * W + x];
     }
+    for (int i = count; i % 4; i++) coc_[surface][i] = weight_[surface][i] = 0.0f, interval_[surface][i] = 0;
     return any != 0;
   }
 
   // How far between its two nodes each pixel of a surface lies.
-  void find_far(int surface) {
-    for (int i = 0; i < to_.scale * to_.scale; i += 4) {
+  void find_far(int surface, int count) {
+    for (int i = 0; i < count; i += 4) {
       const int32_t *k = interval_[surface] + i;
       const Ramp of[4] = {ramps_[k[0]], ramps_[k[1]], ramps_[k[2]], ramps_[k[3]]};
       const f4 at = {of[0].at, of[1].at, of[2].at, of[3].at}, per = {of[0].per, of[1].per, of[2].per, of[3].per};
@@ -295,10 +296,10 @@ class Downsampling {
   // Weights of both surfaces of a block's pixels, in the layer before each and in the one behind it. The farther one of a
   // mixed pixel goes on behind the nearer: there it counts for more than its share, and what it thereby has too much of in
   // the layers up to the nearer one is to be taken from their room. False if there is no such pixel.
-  bool share_out() {
+  bool share_out(int count) {
     lacking_.clear();
     bool any = false;
-    for (int i = 0, last = -1; i < to_.scale * to_.scale; i += 4) {
+    for (int i = 0, last = -1; i < count; i += 4) {
       const f4 weight[2] = {load<f4>(weight_[0] + i), load<f4>(weight_[1] + i)};
       const auto other_is_nearer = load<f4>(coc_[1] + i) < load<f4>(coc_[0] + i);
       const f4 share = other_is_nearer ? weight[0] : weight[1], going = going_on(share), whole = share + going;
@@ -327,50 +328,27 @@ class Downsampling {
   }
 
   void gather(int row, int column, bool inside) {
-    const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width, C = C_;
+    const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width;
+    // away from one side of the frame all is alike but the light: there a pixel stands for a line of them
+    const bool in_rows = y0 >= 0 && y0 + s <= H, in_columns = x0 >= 0 && x0 + s <= W;
+    const bool above_or_below = in_columns && (y0 + s <= 0 || y0 >= H), beside = in_rows && (x0 + s <= 0 || x0 >= W);
+    const int line = above_or_below || beside ? s : 1, count = s * s / line, columns = beside ? 1 : s;
     bool there[2] = {};
     for (int i = 0; i < s_.count; i++) {
-      there[i] = !inside ? read_beyond(i, y0, x0) : s == 2 ? read<2>(i, y0, x0) : s == 4 ? read<4>(i, y0, x0) : s == 8 ? read<8>(i, y0, x0) : read<16>(i, y0, x0);
-      if (there[i]) find_far(i);
+      there[i] = !inside ? read_beyond(i, y0, x0, count, columns) : s == 2 ? read<2>(i, y0, x0) : s == 4 ? read<4>(i, y0, x0) : s == 8 ? read<8>(i, y0, x0) : read<16>(i, y0, x0);
+      if (there[i]) find_far(i, count);
     }
-    const bool two = there[0] && there[1] && mixed(y0, x0) && share_out();
+    const bool two = there[0] && there[1] && mixed(y0, x0) && share_out(count);
     for (int i = 0; i < s_.count; i++) {
       if (!there[i]) continue;
       const float *before = two ? before_[i] : weight_[i], *after = two ? after_[i] : weight_[i];
-      if (inside && C == 3) {
+      if (inside && C_ == 3) {
         const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : W;
         s == 2 ? sum_intervals<2>(i, light_step, before, after) : s == 4 ? sum_intervals<4>(i, light_step, before, after)
         : s == 8 ? sum_intervals<8>(i, light_step, before, after) : sum_intervals<16>(i, light_step, before, after);
         continue;
       }
-      int last = -1;
-      float *one = nullptr;
-      for (int j = 0; j < s * s; j++) {
-        const float first = before[j], second = after[j];
-        if (second == 0) continue;
-        const int k = interval_[i][j];
-        if (!to_.needed(k)) continue;
-        if (k != last) {
-          last = k;
-          one = gathered_.between(to_.stands_for[k]);
-        }
-        if (!to_.wanted[k]) {
-          one[0] += first;
-          continue;
-        }
-        const int y = y0 + j / s, x = x0 + j % s, at_y = std::clamp(y, 0, H - 1), at_x = std::clamp(x, 0, W - 1);
-        const float far = far_[i][j], part = far * second, w = first + far * (second - first);
-        const float *coc, *weight;
-        s_.row(i, at_y, at_x, light_.data(), coc, weight);
-        float *parts = one + C + 1;
-        one[0] += w;
-        parts[0] += part;
-        for (int c = 0; c < C; c++) {
-          const float v = y != at_y || x != at_x ? border_.light(i, c, y, x, *light_[c]) : *light_[c];
-          one[1 + c] += v * w;
-          parts[1 + c] += v * part;
-        }
-      }
+      sum_pixels(i, y0, x0, count, columns, before, after);
     }
     // nothing is left of what weighs nothing
     for (int i = 0; i < gathered_.count;) {
@@ -385,8 +363,44 @@ class Downsampling {
     if (!two) return;
     for (const Lacking &of : lacking_) {
       float *values = gathered_.between(to_.stands_for[of.node] | Pieces::ROOM_ONLY);
-      values[0] += of.up_to;
-      values[C + 1] += of.next;
+      values[0] += line * of.up_to;
+      values[C_ + 1] += line * of.next;
+    }
+  }
+
+  // Pixels of a block of one surface, one by one; where there are fewer than a block has, each stands for a line away from the
+  // frame.
+  void sum_pixels(int i, int y0, int x0, int count, int columns, const float *before, const float *after) {
+    const int H = job_.height, W = job_.width, C = C_, line = to_.scale * to_.scale / count;
+    int last = -1;
+    float *one = nullptr;
+    for (int j = 0; j < count; j++) {
+      const float first = line * before[j], second = line * after[j];
+      if (second == 0) continue;
+      const int k = interval_[i][j];
+      if (!to_.needed(k)) continue;
+      if (k != last) {
+        last = k;
+        one = gathered_.between(to_.stands_for[k]);
+      }
+      if (!to_.wanted[k]) {
+        one[0] += first;
+        continue;
+      }
+      const int y = y0 + j / columns, x = x0 + j % columns, at_y = std::clamp(y, 0, H - 1), at_x = std::clamp(x, 0, W - 1);
+      const float far = far_[i][j], part = far * second, w = first + far * (second - first);
+      const float *coc, *weight;
+      s_.row(i, at_y, at_x, light_.data(), coc, weight);
+      float *parts = one + C + 1;
+      one[0] += w;
+      parts[0] += part;
+      for (int c = 0; c < C; c++) {
+        const float v = line > 1                   ? border_.mean_light(i, c, y, x, line, *light_[c])
+                        : y != at_y || x != at_x ? border_.light(i, c, y, x, *light_[c])
+                                                 : *light_[c];
+        one[1 + c] += v * w;
+        parts[1 + c] += v * part;
+      }
     }
   }
 

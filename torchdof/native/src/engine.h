@@ -316,7 +316,18 @@ class Border {
     const float on = !across ? from_row : !far ? from_column : (from_row * far + from_column * across) / (far + across);
     return 0.5f * (nearest * share + on);
   }
-  // The same of n pixels above or below the frame.
+  // The mean of it over n places one behind the other, away from a side of the frame: rows or columns from the given one on.
+  float mean_light(int surface, int channel, int y, int x, int n, float nearest) const {
+    if (dark_) return 0;
+    const bool upright = y >= 0 && y < height_;
+    const int first = upright ? x : y, size = upright ? width_ : height_, place = upright ? y : x;
+    const Side side = upright ? (first < 0 ? LEFT : RIGHT) : first < 0 ? TOP : BOTTOM;
+    const int nearest_distance = first < 0 ? 1 - first - n : first - size + 1;
+    float on = 0;
+    for (int i = 0; i < n; i++) on += mean(side, surface, channel, nearest_distance + i, place);
+    return 0.5f * (nearest * shares_[side][(size_t)surface * length(side) + place] + on / n);
+  }
+  // Light of n pixels above or below the frame.
   void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
 
  private:
