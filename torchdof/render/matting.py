@@ -152,7 +152,7 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
     peaks, own_peak = pixels.pick(brightest, window)[0], pixels.pick(brightest, bright)[0]
     excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
     scale = peaks.detach().amax(0)
-    colour, peaks, own_peak = pixels.pick(light, window) / scale, peaks / scale, own_peak / scale
+    colour, seen, peaks, own_peak = pixels.pick(light, window) / scale, seen / scale, peaks / scale, own_peak / scale
     window_coc, falloff = pixels.pick(coc_px, window)[0], _falloff(light, _EMITTER_REACH)
     counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
 
@@ -175,7 +175,7 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
     sureness, front, top, distance = behind(own_coc, 0.5)
     floor = front.amax(0)
     weight = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
-    emitter = ((seen / scale - (1.0 - weight) * front) / weight).clamp_min(0.0) * scale
+    emitter = ((seen - (1.0 - weight) * front) / weight).clamp_min(0.0) * scale
     # what was found without it fades out first
     _, other, other_coc, other_weight = (pixels.pick(t, bright) for t in surfaces)
     is_emitter = sureness > 0.5
@@ -186,7 +186,7 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
     bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
     nearer = (own_coc - other_coc[0] - 1.0).clamp(0.0, 1.0)
     weight = weight * (1.0 - nearer * bright_other * behind(other_coc[0], 1.0)[0])
-    own = (seen - weight * other) / (1.0 - weight)
+    own = (seen * scale - weight * other) / (1.0 - weight)
     changed = zip(surfaces, (own, other, other_coc, weight), strict=True)
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
 
