@@ -121,6 +121,14 @@ struct Block {
   float *seen;    // weight of the first
 };
 
+constexpr float TINY = 1.17549435e-38f;  // the least that light is divided by
+// Largest light of a pixel's channels, which lie a step apart.
+inline float peak_of(const float *light, size_t step, int channels) {
+  float peak = *light;
+  for (int c = 1; c < channels; c++) peak = std::max(peak, light[c * step]);
+  return peak;
+}
+
 // Surfaces of a scene: an image with a few second surfaces, or any number of whole ones.
 class Surfaces {
  public:

@@ -93,9 +93,7 @@ void Job::find_threshold() {
       for (int column = 0; column < threshold_columns; column++)
         for (int j = 0; j < CELL_STEPS; j++) {
           const size_t at = (size_t)y * width + xs[column * CELL_STEPS + j];
-          float most = light[at];
-          for (int c = 1; c < channels; c++) most = std::max(most, light[c * area + at]);
-          brightest[(size_t)column * VECTORS * LANES + i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : most;
+          brightest[(size_t)column * VECTORS * LANES + i * CELL_STEPS + j] = valid && !(valid[at] > 0) ? INFINITY : peak_of(light + at, area, channels);
         }
     }
     const float largest = 3.4028234663852886e38f;
@@ -124,10 +122,8 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
     }
   }
   const float is_step = clamp(1.5f - 10.0f * (between / 25.0f), 0.0f, 1.0f);
-  const float *beside = (second ? block.own : block.other) + within;
-  float peak = beside[0];
-  for (int c = 1; c < channels; c++) peak = std::max(peak, beside[c * BLOCK_PIXELS]);
-  const float is_dark = clamp(2.0f - peak / std::max(limit, 1.17549435e-38f), 0.0f, 1.0f);
+  const float beside = peak_of((second ? block.own : block.other) + within, BLOCK_PIXELS, channels);
+  const float is_dark = clamp(2.0f - beside / std::max(limit, TINY), 0.0f, 1.0f);
   return cover + going_on(cover) * (stopped * is_dark * is_step);
 }
 

@@ -110,7 +110,7 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
   const bool masked = job.surfaces.valid;
   const size_t first = (size_t)y * PITCH + x, in_coc = first + PITCH + 1;
   auto tap = [](int i) { return i / AROUND * PITCH + i % AROUND; };
-  vec coc[TAPS], near = all(NEVER), far = all(-NEVER), scale = all(1.17549435e-38f);
+  vec coc[TAPS], near = all(NEVER), far = all(-NEVER), scale = all(TINY);
   for (int i = 0; i < TAPS; i++) {
     coc[i] = load<vec>(w.coc + in_coc + tap(i));
     const auto known = masked ? load<vec>(w.valid + in_coc + tap(i)) > vec{} : ivec{} == 0;
@@ -230,7 +230,7 @@ class Around {
     for (int i = 0; i < COUNT; i++) any |= s_.coc[at_[i]] - front_coc > 1;
     if (!any) return 0.0f;
     if (!scale)
-      for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks_[i] = peak_at(at_[i]));
+      for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
     const float own_peak = light / scale;
     float dim_sum = 0, lit_sum = 0, lit_coc = 0, far_peak = 0, same_peak = 1e-12f;
     front.assign(front.size(), 0.0f);
@@ -251,12 +251,6 @@ class Around {
     return clamp01(light / limit - 1.0f) * clamp01(10.0f * (far_peak / same_peak - share)) * std::min(10.0f * dim_sum, 1.0f);
   }
 
-  float peak_at(size_t i) const {
-    float peak = s_.light[i];
-    for (size_t c = 1; c < front.size(); c++) peak = std::max(peak, s_.light[c * s_.area() + i]);
-    return peak;
-  }
-
  private:
   static constexpr int COUNT = (2 * EMITTER_REACH + 1) * (2 * EMITTER_REACH + 1);
   const Surfaces &s_;
@@ -275,12 +269,11 @@ void find_emitter(Job &job, int y, int x, float least_limit, const float *fallof
   Surfaces &s = job.surfaces;
   const int channels = job.channels;
   const size_t at = (size_t)y * s.width + x, area = s.area();
-  if (s.valid && !(s.valid[at] > 0)) return;
-  Around around(s, y, x, falloff);
-  const float light = around.peak_at(at), own_coc = s.coc[at];
-  if (!(light > least_limit)) return;
+  const float light = peak_of(s.light + at, area, channels), own_coc = s.coc[at];
+  if (!(light > least_limit) || (s.valid && !(s.valid[at] > 0))) return;
   const float limit = threshold_at(job, y, x);
   if (!(light > limit)) return;
+  Around around(s, y, x, falloff);
   const int i = y / BLOCK * s.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
   const float sureness = around.behind(own_coc, 0.5f, light, limit);
   if (!(sureness > 0) && !s.has_block(i)) return;
@@ -299,9 +292,8 @@ void find_emitter(Job &job, int y, int x, float least_limit, const float *fallof
   if (sureness > 0) weight *= std::fabs(2.0f * sureness - 1.0f);
 
   // of the farther surface's pixel a nearer one, dim around, gets nothing
-  float other_light = 0;
-  for (int c = 0; c < channels; c++) other_light = std::max(other_light, block.other[c * BLOCK_PIXELS + within]);
-  const float taken = clamp01(own_coc - block.coc[within] - 1.0f) * clamp01(other_light / std::max(limit, 1.17549435e-38f) - 1.0f);
+  const float other_light = peak_of(block.other + within, BLOCK_PIXELS, channels);
+  const float taken = clamp01(own_coc - block.coc[within] - 1.0f) * clamp01(other_light / std::max(limit, TINY) - 1.0f);
   const float given_back = weight * taken > 0 ? taken * around.behind(block.coc[within], 1.0f, light, limit) : 0.0f;
   if (!(sureness > 0) && !(given_back > 0)) return;
   weight *= 1.0f - given_back;
