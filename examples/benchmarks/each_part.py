@@ -125,7 +125,7 @@ def _drawn_out(light: Tensor, weight: Any, limit: Any, ends: tuple[int, int, int
 
 
 FILL_HIDDEN, SPLAT = surfaces.fill_hidden, highlights.splat
-MATTING = [(surfaces, "matte", _whole_pixels), (surfaces, "emitters_behind", _unchanged)]
+MATTING = [(surfaces, "matte", _whole_pixels), (surfaces, "attribute_emitters", _unchanged)]
 FILL = [(surfaces, "fill_hidden", _nothing_filled)]
 RAYS = [(highlights, "extract", _in_layers)]
 PARTS: dict[str, list[tuple[Any, str, Any]]] = {

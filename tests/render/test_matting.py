@@ -5,8 +5,9 @@ import torch
 from torch import Tensor
 
 from torchdof import blur_by_coc
+from torchdof.reference.scenes import Plane, camera_of, plane_scene, waves
 from torchdof.render.highlights import threshold
-from torchdof.render.matting import emitters_behind, matte
+from torchdof.render.matting import attribute_emitters, matte
 
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
@@ -66,7 +67,7 @@ def strands_before_a_lamp() -> tuple[Tensor, Tensor, Tensor]:
 
 def test_a_lamp_seen_through_strands_is_given_back_to_its_surface() -> None:
     light, coc, shone_through = strands_before_a_lamp()
-    own, other, other_coc, weight = emitters_behind(light, coc, threshold(light), None, matte(light, coc))
+    own, other, other_coc, weight = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
     inner = shone_through
     assert int(inner.sum()) > 5
     assert torch.allclose(weight[0, 0][inner], torch.tensor(0.4), atol=0.05)
@@ -88,7 +89,7 @@ def test_the_rim_of_a_lamp_is_not_given_to_hair_that_is_dim_beside_it() -> None:
     beside_hair = is_rim & ((columns - 40).abs() == 1)
     assert float(found.other_weight[0, 0][beside_hair].min()) > 0.03
     assert float(found.other[..., beside_hair].min()) > 2.0, "the hair, 0.02, gets some of the lamp"
-    own, other, _, weight = emitters_behind(light, coc, threshold(light), None, found)
+    own, other, _, weight = attribute_emitters(light, coc, threshold(light), None, found)
     assert float(weight[0, 0][beside_hair].max()) < 1e-6
     torch.testing.assert_close((1 - weight) * own + weight * other, light, rtol=1e-5, atol=1e-5)
     # hair that shines as much itself keeps what it gets of the lamp
@@ -96,20 +97,38 @@ def test_the_rim_of_a_lamp_is_not_given_to_hair_that_is_dim_beside_it() -> None:
     light[..., 28:36, 40] = 50.0
     found = matte(light, coc)
     assert float(found.other_weight[0, 0][beside_hair].max()) > 0.03
-    for before, after in zip(found, emitters_behind(light, coc, threshold(light), None, found), strict=True):
+    for before, after in zip(found, attribute_emitters(light, coc, threshold(light), None, found), strict=True):
         torch.testing.assert_close(before[..., beside_hair], after[..., beside_hair], rtol=1e-6, atol=1e-6)
 
 
-def test_a_lamp_on_a_near_surface_stays_there() -> None:
+def test_a_lamp_on_a_near_surface_stays_there_with_its_rim() -> None:
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(80), indexing="ij")
     is_post = (columns >= 30) & (columns < 42)
     lamp = (rows >= 30) & (rows < 32) & (columns >= 40) & (columns < 42)
     light = torch.where(lamp, 50.0, torch.where(is_post, 0.05, 0.2)).expand(1, 3, -1, -1).clone()
     light[..., 30:32, 42] = 20.0  # the rim of the lamp, in pixels whose centre shows the wall
     coc = torch.where(is_post, 0.0, 12.0).expand(1, 1, -1, -1)
-    found = matte(light, coc)
-    for before, after in zip(found, emitters_behind(light, coc, threshold(light), None, found), strict=True):
-        torch.testing.assert_close(before, after, rtol=1e-6, atol=1e-6)
+    surfaces = attribute_emitters(light, coc, threshold(light), None, matte(light, coc))
+    own, other, other_coc, weight = (t[0, 0] for t in surfaces)
+    torch.testing.assert_close(((1 - weight) * own)[lamp], torch.full((4,), 50.0))
+    torch.testing.assert_close((weight * other)[30:32, 42], torch.full((2,), 20.0 - 0.6 * 0.2), rtol=0.01, atol=0.0)
+    torch.testing.assert_close(own[30:32, 42], torch.full((2,), 0.2))
+    assert float(other_coc[30:32, 42].abs().max()) == 0.0
+
+
+def test_lamps_in_focus_leave_no_halo_on_the_blurred_wall_behind_them() -> None:
+    lamps = ((20.3, 20.6, 0.8), (44.8, 40.1, 1.7), (72.2, 30.5, 3.2))
+
+    def distance(x: Tensor, y: Tensor) -> Tensor:
+        return torch.stack([torch.hypot(x - cx, y - cy) - radius for cx, cy, radius in lamps]).amin(0)
+
+    camera = camera_of(200.0, 96, aperture_radius_m=0.05, focus_m=1.0)
+    near = Plane(1.0, lambda x, y: torch.full((3, *x.shape), 100.0), lambda x, y: distance(x, y) < 0.0)
+    scene = plane_scene([near, Plane(4.0, waves(3, mean=(0.02, 0.02, 0.02)))], camera, (64, 96), samples=256)
+    made = blur_by_coc(scene.image, scene.coc_px)[0]
+    y, x = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(96) + 0.5, indexing="ij")
+    around = (distance(x, y) > 1.5) & (distance(x, y) < 8.0)
+    assert float((made - scene.truth[0])[:, around].abs().max()) < 0.02, "not 0.18, as by mean colours alone"
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .. import pixels
 
-__all__ = ["NEVER_PX", "Matted", "emitters_behind", "matte"]
+__all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
 
 NEVER_PX = 1e9
 """A coc that no pixel has."""
@@ -27,7 +27,8 @@ _TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
 _ALIKE = 1.0 / 255.0  # contrast, as a share of the brightest light around, that is worth as much as none
 _UNBOUNDED = 1e6  # times the brightest pixel around: so bright is neither part of a pixel
 _EMITTER_REACH = 3  # pixels around a highlight that tell on which surface it lies
-_MOST_WEIGHT = 0.98  # of a highlight's pixel that a farther emitter may have
+_DIM = 0.1  # times the light of a highlight's pixel: what is darker is as sure to be none of it
+_MOST_WEIGHT = 0.98  # of a highlight's pixel that an emitter of another surface may have
 
 
 class Matted(NamedTuple):
@@ -126,13 +127,16 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     )
 
 
-def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Tensor | None, surfaces: Matted) -> Matted:
-    """Gives the light of highlights back to the farther surface on which they lie.
+def attribute_emitters(
+    light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Tensor | None, surfaces: Matted
+) -> Matted:
+    """Gives the light of highlights to the surface on which their emitter lies.
 
-    An emitter seen through hair or twigs shines into pixels whose depth is that of a strand. A highlight's pixel is
-    such a one where its own surface is dim beside it and farther pixels around are about as bright. Of its light what
-    exceeds the own surface's is then the farther surface's, which may cover more than half of the pixel. In turn the
-    emitter's own pixels keep what a nearer surface would get of them that is dim beside it and nowhere as bright.
+    An emitter seen through hair or twigs shines into pixels whose depth is that of a strand, and one in front of a
+    wall into pixels around it whose depth is the wall's. A highlight's pixel is such a one where its own surface is dim
+    beside it and farther pixels around, or nearer ones that touch it, are about as bright. Of its light what exceeds
+    the own surface's is then the other's, which may cover more than half of the pixel. In turn the emitter's own pixels
+    keep what another surface would get of them that is dim beside it and nowhere as bright.
 
     Args:
         light: ``[B, C, H, W]``.
@@ -150,44 +154,57 @@ def emitters_behind(light: Tensor, coc_px: Tensor, threshold: Tensor, valid: Ten
     window = pixels.around(bright, coc_px, _EMITTER_REACH)
     seen, own_coc, limit = pixels.pick(light, bright), pixels.pick(coc_px, bright)[0], pixels.pick(threshold, bright)[0]
     peaks, own_peak = pixels.pick(brightest, window)[0], pixels.pick(brightest, bright)[0]
-    excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
     scale = peaks.detach().amax(0)
-    colour, seen, peaks, own_peak = pixels.pick(light, window) / scale, seen / scale, peaks / scale, own_peak / scale
+    colour = pixels.pick(light, window) / scale
+    seen, peaks, own_peak, limit = seen / scale, peaks / scale, own_peak / scale, limit / scale
+    excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
     window_coc, falloff = pixels.pick(coc_px, window)[0], _falloff(light, _EMITTER_REACH)
     counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
+    touches = counted * (falloff > _FALLOFF**3)
+    nearest = window_coc.amin(0)
 
-    def behind(front_coc: Tensor, share: float) -> tuple[Tensor, ...]:
-        """How surely the emitter lies behind surfaces of a coc, if what is farther has more than a share of their peak.
+    def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, ...]:
+        """How surely the emitter lies behind (side 1) or before (-1) surfaces of a coc, and not on them.
 
-        And light of these where they are dim, the largest light, and how far behind them the emitter lies.
+        It does if what is there has more than a share of their peak. And light of these surfaces where they are
+        dimmest, the largest light, and the emitter's coc.
         """
-        farther_by = window_coc - front_coc
-        farther, same = counted * (farther_by - 1.0).clamp(0.0, 1.0), counted * (2.0 - farther_by.abs()).clamp(0.0, 1.0)
+        away = side * (window_coc - coc)
+        there = (counted if side > 0 else touches) * (away - 1.0).clamp(0.0, 1.0)
+        same = counted * (2.0 - away.abs()).clamp(0.0, 1.0)
         dim = same * falloff * (2.5 - 5.0 * peaks / own_peak.clamp_min(1e-12)).clamp(0.0, 1.0)
-        far_peak, same_peak = (farther * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
-        sureness = excess * (10.0 * (far_peak / same_peak - share)).clamp(0.0, 1.0) * (10.0 * dim.sum(0)).clamp(max=1.0)
-        lit = farther * falloff * peaks**2
-        distance = (farther_by * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
-        front = (colour * dim).sum(1) / dim.sum(0).clamp_min(1e-12)
-        return sureness, front, torch.maximum(far_peak, same_peak), distance
+        emitter_peak, same_peak = (there * peaks).amax(0), (same * peaks).amax(0).clamp_min(1e-12)
+        sureness = excess * (10.0 * dim.sum(0)).clamp(max=1.0)
+        sureness = sureness * (10.0 * (emitter_peak / same_peak - share)).clamp(0.0, 1.0)
+        dimmest = dim / (peaks**2 + (_DIM * own_peak) ** 2).clamp_min(1e-24)
+        surface = (colour * dimmest).sum(1) / dimmest.sum(0).clamp_min(1e-12)
+        lit = there * falloff * peaks**2
+        emitter_coc = nearest + ((window_coc - nearest) * lit).sum(0) / lit.sum(0).clamp_min(1e-12)
+        return sureness, surface, torch.maximum(emitter_peak, same_peak), emitter_coc
 
-    # light of pixels of the nearer surface
-    sureness, front, top, distance = behind(own_coc, 0.5)
-    floor = front.amax(0)
-    weight = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
-    emitter = ((seen - (1.0 - weight) * front) / weight).clamp_min(0.0) * scale
-    # what was found without it fades out first
-    _, other, other_coc, other_weight = (pixels.pick(t, bright) for t in surfaces)
-    is_emitter = sureness > 0.5
-    other, other_coc = torch.where(is_emitter, emitter, other), torch.where(is_emitter, own_coc + distance, other_coc)
-    weight = torch.where(is_emitter, weight, other_weight) * (2.0 * sureness - 1.0).abs()
+    _, other, other_coc, weight = (pixels.pick(t, bright) for t in surfaces)
+    other, other_coc, weight = other / scale, other_coc[0], weight[0]
+    for side, least_share in ((-1.0, 1.0), (1.0, 0.5)):
+        sureness, surface, top, emitter_coc = beyond(own_coc, side, least_share)
+        if side < 0:  # what is seen through a surface is not before it
+            sureness = sureness * (1.0 - beyond(emitter_coc, 1.0, 0.5)[0])
+        floor = surface.amax(0)
+        share = ((own_peak - floor) / (top - floor).clamp_min(1e-12)).clamp(1.0 - _MOST_WEIGHT, _MOST_WEIGHT)
+        emitter = (seen - (1.0 - share) * surface).clamp_min(0.0)
+        # what was found without it goes on before surfaces, which are mostly the same; behind them it fades out first
+        kept, given = (1.0 - sureness, sureness) if side < 0 else (1.0 - 2.0 * sureness, 2.0 * sureness - 1.0)
+        kept, given = kept.clamp_min(0.0) * weight, given.clamp_min(0.0)
+        moved, weight = kept * other + given * emitter, kept + given * share
+        known = weight.clamp_min(1e-12)
+        other = torch.where(weight > 0, moved / known, 0.0)
+        other_coc = torch.lerp(other_coc, emitter_coc, given * share / known)
 
-    # and of pixels of the farther one, of which a nearer one would get some
-    bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
-    nearer = (own_coc - other_coc[0] - 1.0).clamp(0.0, 1.0)
-    weight = weight * (1.0 - nearer * bright_other * behind(other_coc[0], 1.0)[0])
-    own = (seen * scale - weight * other) / (1.0 - weight)
-    changed = zip(surfaces, (own, other, other_coc, weight), strict=True)
+        # and of its own pixels another surface would get some
+        bright_other = (other.amax(0) / limit.clamp_min(torch.finfo(light.dtype).tiny) - 1.0).clamp(0.0, 1.0)
+        apart = (side * (own_coc - other_coc) - 1.0).clamp(0.0, 1.0)
+        weight = weight * (1.0 - apart * bright_other * beyond(other_coc, side, 1.0)[0])
+    own = (seen - weight * other) / (1.0 - weight)
+    changed = zip(surfaces, (own * scale, other * scale, other_coc, weight), strict=True)
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
 
 

@@ -12,7 +12,7 @@ from ..validation import is_traced
 from .border import continued
 from .disocclusion import HIDDEN_WEIGHT, behind_pixels, behind_size, fill_hidden
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
-from .matting import emitters_behind, matte
+from .matting import attribute_emitters, matte
 from .plan import Blur
 
 __all__ = ["Frame", "Placed", "Surface", "framed", "going_on", "surfaces_of_image"]
@@ -230,7 +230,7 @@ def surfaces_of_image(
 def _matte_and_fill(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
 ) -> tuple[Tensor, ...]:
-    own, other, other_coc, weight = emitters_behind(light, coc_px, threshold, valid, matte(light, coc_px, valid))
+    own, other, other_coc, weight = attribute_emitters(light, coc_px, threshold, valid, matte(light, coc_px, valid))
     own_weight = 1.0 - weight
     other, other_coc, weight, behind = fill_hidden(own, coc_px, other, other_coc, weight, valid, threshold, levels)
     if valid is not None:

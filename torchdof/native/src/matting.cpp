@@ -12,7 +12,8 @@ constexpr float TRUST = 4.0f;     // how much texture discredits the contrast of
 constexpr float ALIKE = 1.0f / 255;  // contrast, as a share of the brightest light around, that is worth as much as none
 constexpr float UNBOUNDED = 1e6f;  // times the brightest pixel around: so bright is neither part of a pixel
 constexpr int EMITTER_REACH = 3;  // pixels around a highlight that tell on which surface it lies
-constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that a farther emitter may have
+constexpr float DIM = 0.1f;         // times the light of a highlight's pixel: what is darker is as sure to be none of it
+constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that an emitter of another surface may have
 constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is the surface that the image shows
 
 constexpr int REACH = 1;                   // pixels around a mixed pixel that tell what its two surfaces look like
@@ -217,55 +218,60 @@ void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
 // What the pixels around a highlight's tell of where its emitter lies.
 class Around {
  public:
-  Around(const Surfaces &s, int y, int x, const float *falloff) : s_(s), falloff_(falloff), front(s.channels) {
+  Around(const Surfaces &s, int y, int x, const float *falloff) : s_(s), falloff_(falloff), surface(s.channels) {
     for (int i = 0, dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
-      for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++)
+      for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++) {
         at_[i] = (size_t)std::clamp(y + dy, 0, s.height - 1) * s.width + std::clamp(x + dx, 0, s.width - 1);
+        nearest_ = std::min(nearest_, s.coc[at_[i]]);
+        farthest_ = std::max(farthest_, s.coc[at_[i]]);
+      }
   }
 
-  // How surely it lies behind surfaces of a coc, for a pixel of so much light and a threshold, if what is farther has more
-  // than a share of their largest light.
-  float behind(float front_coc, float share, float light, float limit) {
-    bool any = false;
-    for (int i = 0; i < COUNT; i++) any |= s_.coc[at_[i]] - front_coc > 1;
-    if (!any) return 0.0f;
+  // How surely it lies behind (side 1) or before (-1) surfaces of a coc, for a pixel of so much light and a threshold, if
+  // what is there has more than a share of their largest light.
+  float beyond(float coc, int side, float share, float light, float limit) {
+    if (!((side > 0 ? farthest_ - coc : coc - nearest_) > 1)) return 0.0f;
     if (!scale)
       for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
-    const float own_peak = light / scale;
-    float dim_sum = 0, lit_sum = 0, lit_coc = 0, far_peak = 0, same_peak = 1e-12f;
-    front.assign(front.size(), 0.0f);
+    const float own_peak = light / scale, least_dim = DIM * own_peak;
+    float dim_sum = 0, dimmest_sum = 0, lit_sum = 0, lit_coc = 0, emitter_peak = 0, same_peak = 1e-12f;
+    surface.assign(surface.size(), 0.0f);
     for (int i = 0; i < COUNT; i++) {
-      const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, farther_by = s_.coc[at_[i]] - front_coc;
-      const float farther = counted * clamp01(farther_by - 1.0f), same = counted * clamp01(2.0f - std::fabs(farther_by));
-      const float dim = same * falloff_[i] * clamp01(2.5f - 5.0f * peak / std::max(own_peak, 1e-12f)), lit = farther * falloff_[i] * peak * peak;
+      const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (s_.coc[at_[i]] - coc);
+      const bool touches = std::abs(i / ACROSS - EMITTER_REACH) <= 1 && std::abs(i % ACROSS - EMITTER_REACH) <= 1;
+      const float there = side > 0 || touches ? counted * clamp01(away - 1.0f) : 0.0f;
+      const float same = counted * clamp01(2.0f - std::fabs(away));
+      const float dim = same * falloff_[i] * clamp01(2.5f - 5.0f * peak / std::max(own_peak, 1e-12f));
+      const float dimmest = dim / std::max(peak * peak + least_dim * least_dim, 1e-24f), lit = there * falloff_[i] * peak * peak;
       dim_sum += dim;
-      for (size_t c = 0; c < front.size(); c++) front[c] += s_.light[c * s_.area() + at_[i]] / scale * dim;
+      dimmest_sum += dimmest;
+      for (size_t c = 0; c < surface.size(); c++) surface[c] += s_.light[c * s_.area() + at_[i]] / scale * dimmest;
       lit_sum += lit;
-      lit_coc += farther_by * lit;
-      far_peak = std::max(far_peak, farther * peak);
+      lit_coc += (s_.coc[at_[i]] - nearest_) * lit;
+      emitter_peak = std::max(emitter_peak, there * peak);
       same_peak = std::max(same_peak, same * peak);
     }
-    for (float &colour : front) colour /= std::max(dim_sum, 1e-12f);
-    top = std::max(far_peak, same_peak);
-    distance = lit_coc / std::max(lit_sum, 1e-12f);
-    return clamp01(light / limit - 1.0f) * clamp01(10.0f * (far_peak / same_peak - share)) * std::min(10.0f * dim_sum, 1.0f);
+    for (float &colour : surface) colour /= std::max(dimmest_sum, 1e-12f);
+    top = std::max(emitter_peak, same_peak);
+    emitter_coc = nearest_ + lit_coc / std::max(lit_sum, 1e-12f);
+    return clamp01(light / limit - 1.0f) * std::min(10.0f * dim_sum, 1.0f) * clamp01(10.0f * (emitter_peak / same_peak - share));
   }
 
  private:
-  static constexpr int COUNT = (2 * EMITTER_REACH + 1) * (2 * EMITTER_REACH + 1);
+  static constexpr int ACROSS = 2 * EMITTER_REACH + 1, COUNT = ACROSS * ACROSS;
   const Surfaces &s_;
   const float *falloff_;
   size_t at_[COUNT];
-  float peaks_[COUNT];
+  float peaks_[COUNT], nearest_ = NEVER, farthest_ = -NEVER;
 
  public:
-  // of what was asked last: light of these surfaces where they are dim, the largest light, how far behind them it lies
-  std::vector<float> front;
-  float scale = 0, top = 0, distance = 0;
+  // of what was asked last: light of these surfaces where they are dimmest, the largest light, coc of the emitter
+  std::vector<float> surface;
+  float scale = 0, top = 0, emitter_coc = 0;
 };
 
-// Gives the light of a highlight's pixel to the farther surface on which the emitter lies.
-void find_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
+// Gives the light of a highlight's pixel to the surface on which the emitter lies.
+void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
   Surfaces &s = job.surfaces;
   const int channels = job.channels;
   const size_t at = (size_t)y * s.width + x, area = s.area();
@@ -275,31 +281,46 @@ void find_emitter(Job &job, int y, int x, float least_limit, const float *fallof
   if (!(light > limit)) return;
   Around around(s, y, x, falloff);
   const int i = y / BLOCK * s.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
-  const float sureness = around.behind(own_coc, 0.5f, light, limit);
-  if (!(sureness > 0) && !s.has_block(i)) return;
-  const Block block = s.make_block(i);
-  float weight = block.weight[within];
-  if (sureness > 0.5f) {
-    const float floor = *std::max_element(around.front.begin(), around.front.end());
-    weight = clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
-    for (int c = 0; c < channels; c++) {
-      const float seen = s.light[c * area + at] / around.scale;
-      block.other[c * BLOCK_PIXELS + within] = std::max((seen - (1.0f - weight) * around.front[c]) / weight, 0.0f) * around.scale;
+  std::vector<float> emitter;
+  bool changed = false;
+  for (const int side : {-1, 1}) {
+    float sureness = around.beyond(own_coc, side, side < 0 ? 1.0f : 0.5f, light, limit);
+    if (sureness > 0) {
+      const Block block = s.make_block(i);
+      const float coc = around.emitter_coc, floor = *std::max_element(around.surface.begin(), around.surface.end());
+      const float share = clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
+      emitter.resize(channels);
+      for (int c = 0; c < channels; c++)
+        emitter[c] = std::max(s.light[c * area + at] / around.scale - (1.0f - share) * around.surface[c], 0.0f) * around.scale;
+      // what is seen through a surface is not before it
+      if (side < 0) sureness *= 1.0f - around.beyond(coc, 1, 0.5f, light, limit);
+      const float given = std::max(side < 0 ? sureness : 2.0f * sureness - 1.0f, 0.0f);
+      const float kept = std::max(side < 0 ? 1.0f - sureness : 1.0f - 2.0f * sureness, 0.0f) * block.weight[within];
+      const float weight = kept + given * share, per_weight = weight > 0 ? 1.0f / std::max(weight, 1e-12f) : 0.0f;
+      for (int c = 0; c < channels; c++) {
+        float &other = block.other[c * BLOCK_PIXELS + within];
+        other = (kept * other + given * emitter[c]) * per_weight;
+      }
+      block.coc[within] += given * share * per_weight * (coc - block.coc[within]);
+      block.weight[within] = weight;
+      changed = true;
     }
-    block.coc[within] = own_coc + around.distance;
-  }
-  // what was found without it fades out first
-  if (sureness > 0) weight *= std::fabs(2.0f * sureness - 1.0f);
+    if (!s.has_block(i)) continue;
 
-  // of the farther surface's pixel a nearer one, dim around, gets nothing
-  const float other_light = peak_of(block.other + within, BLOCK_PIXELS, channels);
-  const float taken = clamp01(own_coc - block.coc[within] - 1.0f) * clamp01(other_light / std::max(limit, TINY) - 1.0f);
-  const float given_back = weight * taken > 0 ? taken * around.behind(block.coc[within], 1.0f, light, limit) : 0.0f;
-  if (!(sureness > 0) && !(given_back > 0)) return;
-  weight *= 1.0f - given_back;
+    // of its own pixels a surface that is dim around gets nothing
+    const Block block = s.block(i);
+    const float other_light = peak_of(block.other + within, BLOCK_PIXELS, channels);
+    const float taken = clamp01(side * (own_coc - block.coc[within]) - 1.0f) * clamp01(other_light / std::max(limit, TINY) - 1.0f);
+    if (!(block.weight[within] * taken > 0)) continue;
+    const float given_back = taken * around.beyond(block.coc[within], side, 1.0f, light, limit);
+    block.weight[within] *= 1.0f - given_back;
+    changed |= given_back > 0;
+  }
+  if (!changed) return;
+  const Block block = s.block(i);
+  const float weight = block.weight[within];
   for (int c = 0; c < channels; c++)
     block.own[c * BLOCK_PIXELS + within] = (s.light[c * area + at] - weight * block.other[c * BLOCK_PIXELS + within]) / (1.0f - weight);
-  block.weight[within] = weight;
   block.seen[within] = 1.0f - weight;
 }
 
@@ -359,7 +380,7 @@ void Job::split_mixed() {
       if (!emitters || !(high - low > 1) || !(block_peak[by * columns + bx] > least_threshold(*this, y0, x0))) continue;
       const float least_limit = least_threshold(*this, y0, x0);
       for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
-        for (int x = x0; x < std::min(width, x0 + BLOCK); x++) find_emitter(*this, y, x, least_limit, around_emitter.data());
+        for (int x = x0; x < std::min(width, x0 + BLOCK); x++) attribute_emitter(*this, y, x, least_limit, around_emitter.data());
     }
   });
 }
