@@ -7,43 +7,6 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-typedef float f4 __attribute__((vector_size(16)));
-typedef int32_t i4 __attribute__((vector_size(16)));
-
-// Four pixels of a block of S x S, the i-th of them the first.
-template <int S>
-inline f4 four(const float *from, size_t step, int i) {
-  if (S == 2) return f4{from[0], from[1], from[step], from[step + 1]};
-  return load<f4>(from + i / S * step + i % S);
-}
-
-// Adds up what a block of one surface, of three channels, has between two nodes; out as Pieces::values. Weights, in the layer
-// before and in the one behind, lie without gaps, and so does how far between the nodes each pixel lies.
-template <int S>
-void sum_part(const float *const *light, size_t light_step, const float *before, const float *after, const float *far, float *out) {
-  constexpr int CHANNELS = 3;
-  f4 share = {}, part_sum = {}, one[CHANNELS] = {}, two[CHANNELS] = {};
-  for (int i = 0; i < S * S; i += 4) {
-    const f4 first = load<f4>(before + i), second = load<f4>(after + i), its_far = load<f4>(far + i);
-    const f4 part = its_far * second, w = first + its_far * (second - first);
-    share += w;
-    part_sum += part;
-    for (int c = 0; c < CHANNELS; c++) {
-      const f4 v = four<S>(light[c], light_step, i);
-      one[c] += v * w;
-      two[c] += v * part;
-    }
-  }
-  auto sum = [](f4 v) { return (v[0] + v[2]) + (v[1] + v[3]); };
-  float *two_of = out + CHANNELS + 1;
-  out[0] += sum(share);
-  two_of[0] += sum(part_sum);
-  for (int c = 0; c < CHANNELS; c++) {
-    out[1 + c] += sum(one[c]);
-    two_of[1 + c] += sum(two[c]);
-  }
-}
-
 // Of a block of pixels: what lies between each two nodes.
 struct Gathered {
   int count = 0;
@@ -123,79 +86,55 @@ class Downsampling {
       std::fill(to_.row(1, row) + column, to_.row(1, row) + column + count, 1.0f);
       return count;
     }
-    if (count * s == CELL && !index_.mixed[cell])
-      s == 2 ? cell_sums<2>(row, column, pieces) : s == 4 ? cell_sums<4>(row, column, pieces) : cell_sums<8>(row, column, pieces);
+    if (count * s == std::max(s, CELL))
+      s == 2   ? cell_sums<2>(row, column, pieces)
+      : s == 4 ? cell_sums<4>(row, column, pieces)
+      : s == 8 ? cell_sums<8>(row, column, pieces)
+               : cell_sums<16>(row, column, pieces);
     else
       for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
     return count;
   }
 
-  // Blocks in a row of a cell whose surfaces are not mixed: interval by interval, a row of the cell at once.
+  // Blocks beside each other that fill a cell's width, or one that is wider: interval by interval, a row of pixels at once.
   template <int S>
   void cell_sums(int row, int column, Pieces &pieces) {
-    constexpr int PARTS = CELL / LANES, COUNT = CELL / S, DONE = -1;
+    constexpr int WIDTH = S > CELL ? S : CELL, COUNT = WIDTH / S;
     typedef uint16_t halves __attribute__((vector_size(LANES * 2)));
-    const int C = C_, y0 = row * S, x0 = column * S;
-    cell_nodes_.clear();
-    for (int i = 0; i < s_.count; i++) {
+    const int y0 = row * S, x0 = column * S;
+    int there = 0;
+    for (; there < s_.count; there++) {
       const float *coc, *weight;
-      if (!s_.row(i, y0, x0, light_.data(), coc, weight)) break;
-      const uint16_t *intervals = &index_.intervals[i][(size_t)y0 * s_.width + x0];
-      const size_t light_step = weight ? BLOCK : s_.width, coc_step = i ? BLOCK : s_.width;
-      vec weighs[S][PARTS], place[S][PARTS], whole[S][PARTS], far[S][PARTS];
-      ivec interval[S][PARTS];
-      for (int y = 0; y < S; y++)
-        for (int p = 0; p < PARTS; p++) {
+      if (!s_.row(there, y0, x0, light_of_[there].data(), coc, weight)) break;
+      const uint16_t *intervals = &index_.intervals[there][(size_t)y0 * s_.width + x0];
+      for (int y = 0, i = 0; y < S; y++, coc += there ? BLOCK : s_.width, intervals += s_.width)
+        for (int x = 0; x < WIDTH; x += LANES, i += LANES) {
           halves of_row;
-          memcpy(&of_row, intervals + (size_t)y * s_.width + p * LANES, sizeof(of_row));
-          interval[y][p] = __builtin_convertvector(of_row, ivec);
-          weighs[y][p] = weight ? load<vec>(weight + y * BLOCK + p * LANES) : all(1.0f);
-          place[y][p] = index_.place(load<vec>(coc + y * coc_step + p * LANES));
+          memcpy(&of_row, intervals + x, sizeof(of_row));
+          store(interval_[there] + i, __builtin_convertvector(of_row, ivec));
+          store(weight_[there] + i, weight ? load<vec>(weight + y * BLOCK + x) : all(1.0f));
+          store(coc_[there] + i, load<vec>(coc + x));
         }
-      for (int k = *intervals; k != DONE;) {
-        vec one[PARTS] = {}, two[PARTS] = {};
-        ivec left = ivec{} + DONE;  // intervals still to come
-        for (int y = 0; y < S; y++)
-          for (int p = 0; p < PARTS; p++) {
-            const auto its = interval[y][p] == k;
-            one[p] += whole[y][p] = its ? weighs[y][p] : vec{};
-            interval[y][p] = its ? ivec{} + DONE : interval[y][p];
-            left = most(left, interval[y][p]);
-          }
-        if (to_.needed(k)) {
-          const size_t sums = cell_sums_of(to_.stands_for[k], COUNT);
-          auto put = [&](int value, const vec *sum) {  // sums of S neighbours
-            float columns_of[CELL], *to = cell_sums_.data() + sums + value * COUNT;
-            for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
-            for (int x = 0; x < CELL; x++) to[x / S] += columns_of[x];
-          };
-          put(0, one);
-          for (int y = 0; y < S && to_.wanted[k]; y++)
-            for (int p = 0; p < PARTS; p++) two[p] += far[y][p] = whole[y][p] * behind(job_.layers[k], place[y][p], over_);
-          put(C + 1, two);
-          for (int c = 0; c < C && to_.wanted[k]; c++) {
-            for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
-            for (int y = 0; y < S; y++)
-              for (int p = 0; p < PARTS; p++) {
-                const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
-                one[p] += v * whole[y][p];
-                two[p] += v * far[y][p];
-              }
-            put(1 + c, one);
-            put(C + 2 + c, two);
-          }
-        }
-        k = DONE;
-        for (int lane = 0; lane < LANES; lane++) k = std::max(k, (int)left[lane]);
-      }
+    }
+    const bool two = there == 2 && mixed(y0, x0) && share_out(S * WIDTH);
+    const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : s_.width;
+    cell_nodes_.clear();
+    for (int i = 0; i < there; i++)
+      two ? sum_intervals<S, true>(i, light_step, before_[i], after_[i]) : sum_intervals<S, false>(i, light_step, weight_[i], weight_[i]);
+    for (int i = 0; two && i < (int)lacking_.size(); i++) {
+      const Lacking &of = lacking_[i];
+      float *sums = &cell_sums_[cell_sums_of(to_.stands_for[of.node] | Pieces::ROOM_ONLY, COUNT)] + of.pixel % WIDTH / S;
+      sums[0] += of.up_to * each_;
+      sums[(C_ + 1) * COUNT] += of.next * each_;
     }
     for (int j = 0; j < COUNT; j++) {
       float first = NOWHERE;
       const float *values_of_first = nullptr;
       for (size_t i = 0; i < cell_nodes_.size(); i++) {
         const float *values = &cell_sums_[i * stride_ * COUNT] + j;
-        if (*values == 0) continue;
-        if (values_of_first)
+        const bool room_only = cell_nodes_[i] & Pieces::ROOM_ONLY;
+        if (*values == 0 && !(room_only && values[(C_ + 1) * COUNT] != 0)) continue;
+        if (values_of_first || room_only)
           add_piece(pieces, column + j, cell_nodes_[i], values, COUNT, 1.0f);
         else
           first = (float)cell_nodes_[i], values_of_first = values;
@@ -203,6 +142,66 @@ class Downsampling {
       put_in_planes(row, column + j, first, values_of_first, COUNT, 1.0f);
     }
   }
+
+  // Sums of a surface's pixels, whose weights are told in the layer before each and, where they are MIXED, in the one behind it.
+  template <int S, bool MIXED>
+  void sum_intervals(int surface, size_t light_step, const float *before, const float *after) {
+    constexpr int WIDTH = S > CELL ? S : CELL, PARTS = WIDTH / LANES, COUNT = WIDTH / S, DONE = -1;
+    const int C = C_;
+    vec place[S][PARTS], share[S][PARTS], part[S][PARTS];
+    ivec interval[S][PARTS], last = ivec{} + DONE;
+    for (int y = 0; y < S; y++)
+      for (int p = 0; p < PARTS; p++) {
+        const int i = y * WIDTH + p * LANES;
+        place[y][p] = index_.place(load<vec>(coc_[surface] + i));
+        interval[y][p] = load<vec>(weight_[surface] + i) != vec{} ? load<ivec>(interval_[surface] + i) : ivec{} + DONE;
+        last = most(last, interval[y][p]);
+      }
+    for (;;) {
+      int k = DONE;
+      for (int lane = 0; lane < LANES; lane++) k = std::max(k, (int)last[lane]);
+      if (k == DONE) return;
+      vec one[PARTS] = {}, two[PARTS] = {};
+      last = ivec{} + DONE;
+      for (int y = 0; y < S; y++)
+        for (int p = 0; p < PARTS; p++) {
+          const int i = y * WIDTH + p * LANES;
+          const auto its = interval[y][p] == k;
+          const vec first = its ? load<vec>(before + i) : vec{};
+          share[y][p] = first;
+          if (to_.wanted[k]) {
+            const vec far = behind(job_.layers[k], place[y][p], over_), second = MIXED ? its ? load<vec>(after + i) : vec{} : first;
+            if (MIXED) share[y][p] += far * (second - first);
+            two[p] += part[y][p] = far * second;
+          }
+          one[p] += share[y][p];
+          interval[y][p] = its ? ivec{} + DONE : interval[y][p];
+          last = most(last, interval[y][p]);
+        }
+      if (!to_.needed(k)) continue;
+      const size_t sums = cell_sums_of(to_.stands_for[k], COUNT);
+      auto put = [&](int value, const vec *sum) {  // sums of S neighbours
+        float columns_of[WIDTH], *to = cell_sums_.data() + sums + value * COUNT;
+        for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
+        for (int x = 0; x < WIDTH; x++) to[x / S] += columns_of[x];
+      };
+      put(0, one);
+      if (!to_.wanted[k]) continue;
+      put(C + 1, two);
+      for (int c = 0; c < C; c++) {
+        for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
+        for (int y = 0; y < S; y++)
+          for (int p = 0; p < PARTS; p++) {
+            const vec v = load<vec>(light_of_[surface][c] + y * light_step + p * LANES);
+            one[p] += v * share[y][p];
+            two[p] += v * part[y][p];
+          }
+        put(1 + c, one);
+        put(C + 2 + c, two);
+      }
+    }
+  }
+
   // Where the sums of a node begin, [stride, count].
   size_t cell_sums_of(int node, int count) {
     const size_t size = (size_t)stride_ * count, i = std::find(cell_nodes_.begin(), cell_nodes_.end(), node) - cell_nodes_.begin();
@@ -235,7 +234,7 @@ class Downsampling {
   // Any block. The first of what it holds stands in the planes, unless part of the block lies beyond the frame.
   void block(int row, int column, bool inside, Pieces &pieces) {
     gathered_.count = 0;
-    gather(row, column, inside);
+    gather(row, column);
     const float *values = gathered_.values.data();
     if (inside) put_in_planes(row, column, gathered_.count ? (float)gathered_.nodes[0] : NOWHERE, gathered_.count ? values : nullptr, 1, each_);
     for (int i = inside ? 1 : 0; i < gathered_.count; i++) add_piece(pieces, column, gathered_.nodes[i], values + (size_t)i * stride_, 1, each_);
@@ -251,23 +250,7 @@ class Downsampling {
     return false;
   }
 
-  // Pixels of a surface in a block within the frame; false if it has no weight there.
-  template <int S>
-  bool read(int surface, int y0, int x0) {
-    const int W = job_.width;
-    const float *coc, *weight;
-    if (!s_.row(surface, y0, x0, light_of_[surface].data(), coc, weight)) return false;
-    const uint16_t *interval = &index_.intervals[surface][(size_t)y0 * W + x0];
-    float any = 0;
-    for (int y = 0; y < S; y++)
-      for (int x = 0; x < S; x++) {
-        any += weight_[surface][y * S + x] = weight ? weight[y * BLOCK + x] : 1.0f;
-        interval_[surface][y * S + x] = interval[(size_t)y * W + x];
-      }
-    for (int i = 0; i < S * S; i += 4) store(coc_[surface] + i, four<S>(coc, surface ? BLOCK : W, i));
-    return any != 0;
-  }
-  // The same of a block that the frame cuts off, where it goes on with its last pixels: so many, row by row.
+  // Pixels of a surface in a block, so many, row by row; the frame goes on with its last ones. False if none weighs anything.
   bool read_beyond(int surface, int y0, int x0, int count, int columns) {
     const int H = job_.height, W = job_.width;
     float any = 0;
@@ -279,55 +262,55 @@ class Downsampling {
       any += weight_[surface][i] = !has_it ? 0.0f : weight ? *weight : 1.0f;
       interval_[surface][i] = index_.intervals[surface][(size_t)y * W + x];
     }
-    for (int i = count; i % 4; i++) coc_[surface][i] = weight_[surface][i] = 0.0f, interval_[surface][i] = 0;
+    for (int i = count; i % LANES; i++) coc_[surface][i] = weight_[surface][i] = 0.0f, interval_[surface][i] = 0;
     return any != 0;
   }
 
-  // How far between its two nodes each pixel of a surface lies.
-  void find_far(int surface, int count) {
-    for (int i = 0; i < count; i += 4) {
-      const int32_t *k = interval_[surface] + i;
-      const Ramp of[4] = {ramps_[k[0]], ramps_[k[1]], ramps_[k[2]], ramps_[k[3]]};
-      const f4 at = {of[0].at, of[1].at, of[2].at, of[3].at}, per = {of[0].per, of[1].per, of[2].per, of[3].per};
-      store(far_[surface] + i, ramp((index_.place(load<f4>(coc_[surface] + i)) - at) * per, over_));
+  // How far between their two nodes pixels of a surface lie.
+  vec far_between(int surface, int i) const {
+    vec at, per;
+    for (int lane = 0; lane < LANES; lane++) {
+      const Ramp &of = ramps_[interval_[surface][i + lane]];
+      at[lane] = of.at, per[lane] = of.per;
     }
+    return ramp((index_.place(load<vec>(coc_[surface] + i)) - at) * per, over_);
   }
 
-  // Weights of both surfaces of a block's pixels, in the layer before each and in the one behind it. The farther one of a
-  // mixed pixel goes on behind the nearer: there it counts for more than its share, and what it thereby has too much of in
-  // the layers up to the nearer one is to be taken from their room. False if there is no such pixel.
+  // Weights of both surfaces of pixels, in the layer before each and in the one behind it. The farther one of a mixed pixel
+  // goes on behind the nearer: there it counts for more than its share, and what it thereby has too much of in the layers up
+  // to the nearer one is to be taken from their room. False if there is no such pixel.
   bool share_out(int count) {
     lacking_.clear();
     bool any = false;
-    for (int i = 0, last = -1; i < count; i += 4) {
-      const f4 weight[2] = {load<f4>(weight_[0] + i), load<f4>(weight_[1] + i)};
-      const auto other_is_nearer = load<f4>(coc_[1] + i) < load<f4>(coc_[0] + i);
-      const f4 share = other_is_nearer ? weight[0] : weight[1], going = going_on(share), whole = share + going;
-      const f4 far[2] = {load<f4>(far_[0] + i), load<f4>(far_[1] + i)}, of_near = other_is_nearer ? far[1] : far[0];
-      const i4 interval[2] = {load<i4>(interval_[0] + i), load<i4>(interval_[1] + i)};
-      const i4 k = other_is_nearer ? interval[1] : interval[0], n = other_is_nearer ? interval[0] : interval[1];
-      const f4 next = share + where_it_shows(going, of_near);  // in layer k + 1
-      const f4 first = n == k ? share : n == k + 1 ? next : whole, second = n == k ? next : whole;
+    for (int i = 0; i < count; i += LANES) {
+      const vec weight[2] = {load<vec>(weight_[0] + i), load<vec>(weight_[1] + i)};
+      const auto other_is_nearer = load<vec>(coc_[1] + i) < load<vec>(coc_[0] + i);
+      const vec share = other_is_nearer ? weight[0] : weight[1], going = going_on(share), whole = share + going;
+      for (int surface = 0; surface < 2; surface++) store(before_[surface] + i, weight[surface]), store(after_[surface] + i, weight[surface]);
+      if (!any_positive(going)) continue;
+      any = true;
+      const vec fars[2] = {far_between(0, i), far_between(1, i)};
+      const vec of_near = other_is_nearer ? fars[1] : fars[0], of_far = other_is_nearer ? fars[0] : fars[1];
+      const ivec interval[2] = {load<ivec>(interval_[0] + i), load<ivec>(interval_[1] + i)};
+      const ivec k = other_is_nearer ? interval[1] : interval[0], n = other_is_nearer ? interval[0] : interval[1];
+      const vec next = share + where_it_shows(going, of_near);  // in layer k + 1
+      const vec first = n == k ? share : n == k + 1 ? next : whole, second = n == k ? next : whole;
       store(before_[0] + i, other_is_nearer ? first : weight[0]);
       store(after_[0] + i, other_is_nearer ? second : weight[0]);
       store(before_[1] + i, other_is_nearer ? weight[1] : first);
       store(after_[1] + i, other_is_nearer ? weight[1] : second);
-      for (int lane = 0; lane < 4; lane++) {
-        if (!(going[lane] > 0)) continue;
-        any = true;
+      for (int lane = 0; lane < LANES; lane++) {
         const int nearer = k[lane], farther = n[lane];
-        if (!to_.needed(nearer)) continue;
-        const float of_far = to_.wanted[farther] ? far[other_is_nearer[lane] ? 0 : 1][lane] : 0.0f;
-        const float given = first[lane] + of_far * (second[lane] - first[lane]);
-        if (nearer != last) lacking_.push_back({last = nearer, 0.0f, 0.0f});
-        lacking_.back().up_to += share[lane] - given;
-        if (to_.wanted[nearer] && farther > nearer) lacking_.back().next += next[lane] - given;
+        if (!(going[lane] > 0) || !to_.needed(nearer)) continue;
+        const float given = first[lane] + (to_.wanted[farther] ? of_far[lane] : 0.0f) * (second[lane] - first[lane]);
+        const bool shows_next = to_.wanted[nearer] && farther > nearer;
+        lacking_.push_back({i + lane, nearer, share[lane] - given, shows_next ? next[lane] - given : 0.0f});
       }
     }
     return any;
   }
 
-  void gather(int row, int column, bool inside) {
+  void gather(int row, int column) {
     const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width;
     // away from one side of the frame all is alike but the light: there a pixel stands for a line of them
     const bool in_rows = y0 >= 0 && y0 + s <= H, in_columns = x0 >= 0 && x0 + s <= W;
@@ -335,21 +318,12 @@ class Downsampling {
     const int line = above_or_below || beside ? s : 1, count = s * s / line, columns = beside ? 1 : s;
     bool there[2] = {};
     for (int i = 0; i < s_.count; i++) {
-      there[i] = !inside ? read_beyond(i, y0, x0, count, columns) : s == 2 ? read<2>(i, y0, x0) : s == 4 ? read<4>(i, y0, x0) : s == 8 ? read<8>(i, y0, x0) : read<16>(i, y0, x0);
-      if (there[i]) find_far(i, count);
+      there[i] = read_beyond(i, y0, x0, count, columns);
+      for (int j = 0; there[i] && j < count; j += LANES) store(far_[i] + j, far_between(i, j));
     }
     const bool two = there[0] && there[1] && mixed(y0, x0) && share_out(count);
-    for (int i = 0; i < s_.count; i++) {
-      if (!there[i]) continue;
-      const float *before = two ? before_[i] : weight_[i], *after = two ? after_[i] : weight_[i];
-      if (inside && C_ == 3) {
-        const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : W;
-        s == 2 ? sum_intervals<2>(i, light_step, before, after) : s == 4 ? sum_intervals<4>(i, light_step, before, after)
-        : s == 8 ? sum_intervals<8>(i, light_step, before, after) : sum_intervals<16>(i, light_step, before, after);
-        continue;
-      }
-      sum_pixels(i, y0, x0, count, columns, before, after);
-    }
+    for (int i = 0; i < s_.count; i++)
+      if (there[i]) sum_pixels(i, y0, x0, count, columns, two ? before_[i] : weight_[i], two ? after_[i] : weight_[i]);
     // nothing is left of what weighs nothing
     for (int i = 0; i < gathered_.count;) {
       if (gathered_.values[(size_t)i * stride_] != 0) {
@@ -404,37 +378,6 @@ class Downsampling {
     }
   }
 
-  // A block of one surface, of three channels, within the frame: the sums of each interval that occurs in it.
-  template <int S>
-  void sum_intervals(int surface, size_t light_step, const float *before, const float *after) {
-    constexpr int AREA = S * S;
-    const int32_t *const interval = interval_[surface];
-    int differs = 0;
-    for (int i = 0; i < AREA; i++) differs |= interval[i] ^ *interval;
-    auto add = [&](int node, const float *firsts, const float *seconds) {
-      if (to_.wanted[node]) {
-        sum_part<S>(light_of_[surface].data(), light_step, firsts, seconds, far_[surface], gathered_.between(to_.stands_for[node]));
-      } else if (to_.needed(node)) {
-        float sum = 0;
-        for (int i = 0; i < AREA; i++) sum += firsts[i];
-        gathered_.between(to_.stands_for[node])[0] += sum;
-      }
-    };
-    if (!differs) return add(*interval, before, after);
-    float left[AREA], of_one[AREA], of_one_after[AREA];
-    memcpy(left, before, sizeof(left));
-    for (int i = 0; i < AREA; i++) {
-      if (left[i] == 0) continue;
-      const int k = interval[i];
-      for (int j = 0; j < AREA; j++) {  // the others weigh nothing
-        of_one[j] = interval[j] == k ? left[j] : 0.0f;
-        of_one_after[j] = interval[j] == k ? after[j] : 0.0f;
-        left[j] -= of_one[j];
-      }
-      add(k, of_one, of_one_after);
-    }
-  }
-
   const Job &job_;
   const Surfaces &s_;
   const LayerIndex &index_;
@@ -444,7 +387,7 @@ class Downsampling {
   const int C_, stride_;
   const float each_;
   struct Lacking {
-    int node;           // before a nearer surface
+    int pixel, node;    // before its nearer surface
     float up_to, next;  // room that is to be added in the layers up to it, and in the next one
   };
   // of a block's pixels, of both surfaces; far: how far between their nodes; before, after: weight in the layers there
