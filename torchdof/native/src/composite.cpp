@@ -1108,7 +1108,7 @@ class Composite {
 
   // For each tile the rays that land in it, in their order.
   void sort_rays() {
-    visibility_ = look_at(job_);
+    if (over_) visibility_ = look_at(job_, ray_kernels_);
     gains_ = gains_of(job_, ray_kernels_);
     const int tile_rows = ceil_div(H_, TILE), tile_columns = ceil_div(W_, TILE);
     ray_start_.assign(tile_rows * tile_columns + 1, 0);

@@ -365,14 +365,14 @@ struct Visibility {
   float low = 0, class_width = 1;
   std::vector<int> bins;  // of 1 px of coc in which there may be something, or in the one before
   int cell_rows = 0, cell_columns = 0;
-  std::vector<uint64_t> cells;  // classes of coc that occur in each cell
+  std::vector<uint64_t> cells;  // classes of coc that occur in each cell that rays may pass
   // Classes of what may lie in a bin, or in the one before.
   uint64_t classes_of(int bin) const {
     const int first = std::min((int)(std::max(0, bin - 1) / class_width), CLASSES - 1), last = std::min((int)((bin + 1) / class_width), CLASSES - 1);
     return (2ull << last) - (1ull << first);
   }
 };
-Visibility look_at(const Job &job);
+Visibility look_at(const Job &job, const RayKernels &kernels);
 // Adds the light of rays to a tile [channels, TILE, TILE].
 void splat(const Job &job, const Visibility &visibility, int y0, int x0, const int *rays, int count,
            const RayKernels &kernels, const std::vector<float> &gains, float *tile);

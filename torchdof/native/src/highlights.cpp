@@ -234,7 +234,29 @@ static void each_shown(const Surfaces &surfaces, int y, int x, const float **lig
   }
 }
 
-Visibility look_at(const Job &job) {
+// For each cell the number of rays on whose way to where they land it lies, as far as surfaces from a coc on may be in their way.
+static std::vector<int> passing(const Job &job, const RayKernels &kernels, float low, int cell_rows, int cell_columns) {
+  std::vector<int> count((size_t)cell_rows * cell_columns, 0);
+  auto add = [&](int row, int column, int n) {
+    if (row < cell_rows && column < cell_columns) count[(size_t)row * cell_columns + column] += n;
+  };
+  for (const Ray &ray : job.rays) {
+    const int half = std::max(kernels.halves[ray.radius], kernels.halves[ray.radius + 1]);
+    const int reach = (int)std::min(half * std::fabs(1.0f - low / ray.coc), (float)(job.height + job.width)) + 3;
+    const int r0 = std::max(ray.row - reach, 0) / CELL, r1 = std::min(ray.row + reach, job.height - 1) / CELL + 1;
+    const int c0 = std::max(ray.column - reach, 0) / CELL, c1 = std::min(ray.column + reach, job.width - 1) / CELL + 1;
+    add(r0, c0, 1), add(r0, c1, -1), add(r1, c0, -1), add(r1, c1, 1);
+  }
+  for (int row = 0; row < cell_rows; row++)  // sums over all cells above and to the left
+    for (int column = 0, in_row = 0; column < cell_columns; column++) {
+      int &cell = count[(size_t)row * cell_columns + column];
+      in_row += cell;
+      cell = in_row + (row ? (&cell)[-cell_columns] : 0);
+    }
+  return count;
+}
+
+Visibility look_at(const Job &job, const RayKernels &kernels) {
   Visibility v;
   const int H = job.height, W = job.width;
   float low = NEVER, high = -NEVER;
@@ -248,6 +270,7 @@ Visibility look_at(const Job &job) {
   v.cell_rows = ceil_div(H, CELL);
   v.cell_columns = ceil_div(W, CELL);
   v.cells.assign((size_t)v.cell_rows * v.cell_columns, 0);
+  const std::vector<int> passed = passing(job, kernels, low, v.cell_rows, v.cell_columns);
   const Surfaces &surfaces = job.surfaces;
   typedef uint64_t wide __attribute__((vector_size(LANES * 8)));
   auto bits_of = [&](vec coc, ivec shown) {
@@ -260,6 +283,9 @@ Visibility look_at(const Job &job) {
     std::vector<const float *> light(job.channels);
     for (int x = 0; x < W; x += BLOCK) {
       const int block = row * CELL / BLOCK * surfaces.block_columns + x / BLOCK, n = std::min(BLOCK, W - x);
+      bool passes = false;
+      for (int j = 0; j < n; j += CELL) passes |= passed[(size_t)row * v.cell_columns + (x + j) / CELL] > 0;
+      if (!passes) continue;
       // the image's own surface within 1 px has no other classes than its ends
       const float ends[2] = {job.block_low[block], job.block_high[block]};
       const bool flat = !surfaces.whole() && ends[1] - ends[0] < 1;
