@@ -15,11 +15,11 @@ FOLDERS = {"torchdof": "torchdof", "torchdof.fit": "fit", "torchdof.export": "ex
 
 # Room -> what it may import, from the lowest floor up.
 FLOORS = {
-    "validation": set(),
+    "native": set(),
+    "validation": {"native"},
     "batch": {"validation"},
     "exporting": set(),
     "pixels": {"validation", "exporting"},
-    "native": set(),
     "io": {"validation"},
     "optics": {"validation", "io"},
     "depth": {"validation", "pixels", "native", "io", "optics"},

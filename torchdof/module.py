@@ -383,7 +383,7 @@ def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
 
 def _has_steps(coc_px: Tensor) -> Tensor:
     """Whether two pixels of a map are so far apart that a repair could change one: half a step, beside lamps."""
-    low, high = coc_px.detach().aminmax()
+    low, high = validation.ends(coc_px)
     return ~(high - low < 0.5 * STEP_PX)  # holes tell nothing
 
 

@@ -7,11 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from . import native
+
 __all__ = [
     "WHOLE_NUMBERS",
     "background",
     "coc_of_lens",
     "depth_edges",
+    "ends",
     "finite_background",
     "floating",
     "is_resizable",
@@ -90,6 +93,13 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
     return value
 
 
+def ends(values: Tensor) -> Tensor:
+    """Least and largest of some numbers, ``[2]``; NaN if one of them is NaN. One look at each value."""
+    if not is_traced() and values.dtype == torch.float32 and native.can_read(values) and native.chosen():
+        return torch.tensor(native.ends(values))
+    return torch.stack(torch.aminmax(values.detach()))
+
+
 def pixels_wide(width: Any) -> None:
     """Refuse a width in pixels that is none; the symbols and tensors of a traced program pass.
 
@@ -145,7 +155,7 @@ def image_and_depth(image: Tensor, depth: Tensor, values: bool, name: str = "dep
     """
     image_and_map(image, name, depth, "in metres")
     if values and not is_traced():
-        if not depth.amin() > 0:  # one look at each value; NaN is the least
+        if not ends(depth)[0] > 0:
             bad = int((~(depth > 0)).sum())
             raise ValueError(
                 f"{name} must be > 0 (inf allowed), got {bad} of {depth.numel()} pixels that are NaN, zero or "
@@ -293,7 +303,7 @@ def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
     Raises:
         ValueError: Naming the nearest depth and all numbers of the lens.
     """
-    if not is_traced() and not bool(torch.isfinite(coc_px.sum())) and not bool(torch.isfinite(coc_px).all()):
+    if not is_traced() and not bool(torch.isfinite(ends(coc_px)).all()):
         stated = ", ".join(f"{name} {_number(value)}" for name, value in lens.items())
         raise ValueError(
             f"depth and lens must blur by some number of pixels, got a blur beyond any: this lens ({stated}) "
@@ -309,10 +319,8 @@ def _number(value: Any) -> str:
 
 def _finite(name: str, values: Tensor) -> None:
     """Refuse numbers that are NaN or infinite."""
-    if bool(torch.isfinite(values.sum())):  # one look at each value; a sum that overflows tells nothing
-        return
-    bad = values.numel() - int(torch.isfinite(values).sum())
-    if bad:
+    if not bool(torch.isfinite(ends(values)).all()):
+        bad = values.numel() - int(torch.isfinite(values).sum())
         raise ValueError(
             f"{name} must be finite, got {bad} of {values.numel()} values that are NaN or infinite; "
             "mend them, or pass check=False"

@@ -211,6 +211,11 @@ void check(unsigned seed) {
   torchdof_convolve(scene.light[0].data(), scene.scene.height, scene.scene.width, disc(half, half, 1).data(), half,
                     spread.data());
 
+  float low = 0, high = 0;
+  if (torchdof_ends(alone.data(), int64_t(alone.size()), 3, &low, &high) != TORCHDOF_OK) fail("its ends cannot be told", number);
+  if (!scene.scene.masked && (low != *std::min_element(alone.begin(), alone.end()) || high != *std::max_element(alone.begin(), alone.end())))
+    fail("its ends are wrong", number);
+
   std::vector<std::thread> callers;
   for (int threads : {2, 3, 8})
     callers.emplace_back([&, threads] {

@@ -26,6 +26,7 @@ __all__ = [
     "chosen",
     "convolve",
     "describe",
+    "ends",
     "render",
     "repair_edges",
     "use_instructions",
@@ -40,7 +41,7 @@ HALF_LARGEST = 64
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 3  # of ``src/api.h``
+_REVISION = 4  # of ``src/api.h``
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 
@@ -303,6 +304,20 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
     return out if changed.value else nearness
 
 
+def ends(values: Tensor) -> tuple[float, float]:
+    """Least and largest of some numbers, float32, on as many threads as PyTorch uses; NaN if one of them is NaN.
+
+    PyTorch's own threads would wait for their next work beside the engine's, which takes the processor from these.
+
+    Raises:
+        MemoryError: If there is too little.
+    """
+    values, low, high = values.contiguous(), ctypes.c_float(), ctypes.c_float()
+    threads = torch.get_num_threads()
+    _check(_engine().torchdof_ends(values.data_ptr(), values.numel(), threads, ctypes.byref(low), ctypes.byref(high)))
+    return low.value, high.value
+
+
 def convolve(values: Tensor, kernel: Tensor) -> Tensor:
     """Values ``[H, W]`` spread with a kernel ``[k, k]``, float32; what falls outside is lost."""
     out, values, kernel = torch.empty_like(values), values.contiguous(), kernel.contiguous()
@@ -420,6 +435,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]
     library.torchdof_convolve.restype = None
     library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map), ctypes.POINTER(ctypes.c_int32)]
+    library.torchdof_ends.argtypes = [pointer, ctypes.c_int64, ctypes.c_int32, _Floats, _Floats]
     library.torchdof_instructions.restype = ctypes.c_char_p
     library.torchdof_use.argtypes = [ctypes.c_char_p]
     return library, ""

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from .. import validation
 from .layer_weights import blur_axis
 
 __all__ = ["DENSE", "border_nodes", "ends", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
@@ -69,9 +70,9 @@ def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
 
 def ends(coc_px: Tensor) -> tuple[float, float]:
     """Nearest and farthest place of the pixels ``[B, 1, H, W]``."""
-    both = torch.stack(torch.aminmax(coc_px))
+    both = validation.ends(coc_px)
     if bool(both.isnan().any()):
-        both = torch.stack(torch.aminmax(torch.where(coc_px.isnan(), 0.0, coc_px)))
+        both = validation.ends(torch.where(coc_px.isnan(), 0.0, coc_px))
     low, high = on_axis(both, max(coc_px.shape[-2:])).tolist()
     return low, high
 

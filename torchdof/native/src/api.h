@@ -95,13 +95,16 @@ typedef struct {
 // changed: 0 if the map is right as it is; then out is left as it was.
 TORCHDOF_API int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed);
 
+// Least and largest of numbers; NaN both if one of them is NaN.
+TORCHDOF_API int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high);
+
 // out[y, x] = sum of kernel[v, u] in[y - v, x - u]: what spreads a layer. For tests and benchmarks.
 TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half,
                                     float *out);
 
 // What a caller compares with its own idea of this file before it calls anything else: sizes of the two structures and,
 // in the upper half, a number that goes up with every other change of this file.
-#define TORCHDOF_REVISION 3
+#define TORCHDOF_REVISION 4
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

@@ -77,6 +77,10 @@ int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed) {
   return torchdof::guarded([&] { *changed = torchdof::chosen().repair_edges(*map); });
 }
 
+int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high) {
+  return torchdof::guarded([&] { torchdof::chosen().ends(values, count, threads, low, high); });
+}
+
 void torchdof_convolve(const float *in, int32_t height, int32_t width, const float *kernel, int32_t half, float *out) {
   torchdof::chosen().convolve(in, height, width, kernel, half, out);
 }

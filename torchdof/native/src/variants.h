@@ -24,6 +24,7 @@ class AnyJob {
 struct Variant {
   AnyJob *(*begin)(const torchdof_scene &scene);
   bool (*repair_edges)(const torchdof_map &map);
+  void (*ends)(const float *values, int64_t count, int threads, float *low, float *high);
   void (*convolve)(const float *in, int height, int width, const float *kernel, int half, float *out);
 };
 

@@ -1,0 +1,62 @@
+"""What is asked of whole frames before they are rendered: their ends, looked for by the engine's own threads."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from torchdof import blur_by_coc, native, validation
+
+SIZES = (1, 7, 8, 9, 2**16 - 1, 2**16, 2**16 + 1, 3 * 2**16 + 5)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_ends_are_the_least_and_the_largest_number(size: int) -> None:
+    values = torch.randn(size, generator=torch.Generator().manual_seed(size))
+    assert native.ends(values) == (float(values.min()), float(values.max()))
+    assert native.ends(values.repeat(2, 1).T) == (float(values.min()), float(values.max()))
+
+
+@pytest.mark.parametrize("place", [0, 0.5, 1])
+@pytest.mark.parametrize("size", SIZES)
+def test_one_nan_is_seen_and_so_is_one_infinity(size: int, place: float) -> None:
+    values = torch.zeros(size)
+    values[int(place * (size - 1))] = -math.inf
+    assert native.ends(values)[0] == -math.inf
+    values[int(place * (size - 1))] = math.nan
+    assert all(map(math.isnan, native.ends(values)))
+
+
+@pytest.mark.parametrize("engine", ["native", "torch"])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_both_engines_find_the_same_ends(engine: str, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    values = torch.linspace(-3.0, 5.0, 100, dtype=dtype, requires_grad=True)
+    assert validation.ends(values).tolist() == [-3.0, 5.0]
+    assert validation.ends(torch.cat([values, torch.tensor([math.nan], dtype=dtype)])).isnan().all()
+
+
+class LargeReads(TorchDispatchMode):
+    """PyTorch's operators that look at as many numbers as its threads share, by name."""
+
+    names: list[str]
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        reads = not func.is_view and func is not torch.ops.aten.empty_like.default
+        if reads and any(isinstance(a, torch.Tensor) and a.numel() >= 2**15 for a in args):
+            self.names.append(str(func))
+        return result
+
+
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_pytorch_looks_at_no_whole_frame(occlusion: bool) -> None:
+    """Its threads would spin beside the engine's."""
+    image, coc = torch.rand(1, 3, 256, 256), torch.linspace(-6.0, 9.0, 256).expand(1, 1, 256, -1).contiguous()
+    reads = LargeReads()
+    reads.names = []
+    with torch.inference_mode(), reads:
+        blur_by_coc(image, coc, occlusion=occlusion)
+    assert reads.names == []
