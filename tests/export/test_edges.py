@@ -92,5 +92,7 @@ def test_openvino_repairs_the_same(exported_by_command: tuple[Path, str], tensor
     path, _ = exported_by_command
     compiled = openvino.Core().compile_model(str(path), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     image, coc = tensors
-    got = compiled({"image": image.numpy(), "coc_px": coc.numpy()})[0]
+    feed = {"image": image.numpy(), "coc_px": coc.numpy()}
+    compiled(feed)  # the first inference of a size may be wrong: docs/embedding.md
+    got = compiled(feed)[0]
     assert error(got, rendered(image, coc, "auto"), image) <= 10 * TOLERANCE

@@ -45,8 +45,9 @@ def test_openvino_gives_the_same_pixels(layered: Any, record_property: Any) -> N
     compiled = openvino.Core().compile_model(str(layered.path), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
     tensors = scene()
     names = ("image", "depth", "focus_m", "f_number")
-    result = compiled({name: tensor.numpy() for name, tensor in zip(names, tensors, strict=True)})
-    compare(layered, tensors, result[0])
+    feed = {name: tensor.numpy() for name, tensor in zip(names, tensors, strict=True)}
+    compiled(feed)  # the first inference of a size may be wrong: docs/embedding.md
+    compare(layered, tensors, compiled(feed)[0])
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="Node is not installed")

@@ -218,56 +218,65 @@ void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
 // What the pixels around a highlight's tell of where its emitter lies.
 class Around {
  public:
-  Around(const Surfaces &s, int y, int x, const float *falloff) : s_(s), falloff_(falloff), surface(s.channels) {
+  Around(const Surfaces &s, int y, int x, const float *falloff) : s_(s), falloff_(falloff) {
     for (int i = 0, dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
       for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++, i++) {
         at_[i] = (size_t)std::clamp(y + dy, 0, s.height - 1) * s.width + std::clamp(x + dx, 0, s.width - 1);
-        nearest_ = std::min(nearest_, s.coc[at_[i]]);
-        farthest_ = std::max(farthest_, s.coc[at_[i]]);
+        coc_[i] = s.coc[at_[i]];
+        nearest_ = std::min(nearest_, coc_[i]);
+        farthest_ = std::max(farthest_, coc_[i]);
+        if (touches(i)) nearest_touching_ = std::min(nearest_touching_, coc_[i]);
       }
   }
 
   // How surely it lies behind (side 1) or before (-1) surfaces of a coc, for a pixel of so much light and a threshold, if
   // what is there has more than a share of their largest light.
   float beyond(float coc, int side, float share, float light, float limit) {
-    if (!((side > 0 ? farthest_ - coc : coc - nearest_) > 1)) return 0.0f;
+    if (!((side > 0 ? farthest_ - coc : coc - nearest_touching_) > 1)) return 0.0f;
     if (!scale)
       for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
-    const float own_peak = light / scale, least_dim = DIM * own_peak;
-    float dim_sum = 0, dimmest_sum = 0, lit_sum = 0, lit_coc = 0, emitter_peak = 0, same_peak = 1e-12f;
-    surface.assign(surface.size(), 0.0f);
+    const float own_peak = light / scale, dim_below = 5.0f / std::max(own_peak, 1e-12f);
+    float dim_sum = 0, emitter_peak = 0, same_peak = 1e-12f;
     for (int i = 0; i < COUNT; i++) {
-      const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (s_.coc[at_[i]] - coc);
-      const bool touches = std::abs(i / ACROSS - EMITTER_REACH) <= 1 && std::abs(i % ACROSS - EMITTER_REACH) <= 1;
-      const float there = side > 0 || touches ? counted * clamp01(away - 1.0f) : 0.0f;
+      const float counted = s_.valid ? s_.valid[at_[i]] : 1.0f, peak = peaks_[i] / scale, away = side * (coc_[i] - coc);
       const float same = counted * clamp01(2.0f - std::fabs(away));
-      const float dim = same * falloff_[i] * clamp01(2.5f - 5.0f * peak / std::max(own_peak, 1e-12f));
-      const float dimmest = dim / std::max(peak * peak + least_dim * least_dim, 1e-24f), lit = there * falloff_[i] * peak * peak;
-      dim_sum += dim;
-      dimmest_sum += dimmest;
-      for (size_t c = 0; c < surface.size(); c++) surface[c] += s_.light[c * s_.area() + at_[i]] / scale * dimmest;
-      lit_sum += lit;
-      lit_coc += (s_.coc[at_[i]] - nearest_) * lit;
-      emitter_peak = std::max(emitter_peak, there * peak);
+      there_[i] = side > 0 || touches(i) ? counted * clamp01(away - 1.0f) : 0.0f;
+      dim_[i] = same * falloff_[i] * clamp01(2.5f - dim_below * peak);
+      dim_sum += dim_[i];
+      emitter_peak = std::max(emitter_peak, there_[i] * peak);
       same_peak = std::max(same_peak, same * peak);
     }
-    for (float &colour : surface) colour /= std::max(dimmest_sum, 1e-12f);
     top = std::max(emitter_peak, same_peak);
-    emitter_coc = nearest_ + lit_coc / std::max(lit_sum, 1e-12f);
     return clamp01(light / limit - 1.0f) * std::min(10.0f * dim_sum, 1.0f) * clamp01(10.0f * (emitter_peak / same_peak - share));
+  }
+
+  // Of what was asked last: light of these surfaces where they are dimmest, and coc of the emitter.
+  float look(float light, std::vector<float> &surface) const {
+    const float own_peak = light / scale, least_dim = DIM * own_peak;
+    float dimmest_sum = 0, lit_sum = 0, lit_coc = 0;
+    surface.assign(s_.channels, 0.0f);
+    for (int i = 0; i < COUNT; i++) {
+      const float peak = peaks_[i] / scale, dimmest = dim_[i] / std::max(peak * peak + least_dim * least_dim, 1e-24f);
+      const float lit = there_[i] * falloff_[i] * peak * peak;
+      dimmest_sum += dimmest;
+      for (int c = 0; c < s_.channels; c++) surface[c] += s_.light[c * s_.area() + at_[i]] / scale * dimmest;
+      lit_sum += lit;
+      lit_coc += (coc_[i] - nearest_) * lit;
+    }
+    for (float &colour : surface) colour /= std::max(dimmest_sum, 1e-12f);
+    return nearest_ + lit_coc / std::max(lit_sum, 1e-12f);
   }
 
  private:
   static constexpr int ACROSS = 2 * EMITTER_REACH + 1, COUNT = ACROSS * ACROSS;
+  static bool touches(int i) { return std::abs(i / ACROSS - EMITTER_REACH) <= 1 && std::abs(i % ACROSS - EMITTER_REACH) <= 1; }
   const Surfaces &s_;
   const float *falloff_;
   size_t at_[COUNT];
-  float peaks_[COUNT], nearest_ = NEVER, farthest_ = -NEVER;
+  float coc_[COUNT], peaks_[COUNT], there_[COUNT], dim_[COUNT], nearest_ = NEVER, nearest_touching_ = NEVER, farthest_ = -NEVER;
 
  public:
-  // of what was asked last: light of these surfaces where they are dimmest, the largest light, coc of the emitter
-  std::vector<float> surface;
-  float scale = 0, top = 0, emitter_coc = 0;
+  float scale = 0, top = 0;  // largest light around, and of what was asked last, in parts of that
 };
 
 // Gives the light of a highlight's pixel to the surface on which the emitter lies.
@@ -281,17 +290,17 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
   if (!(light > limit)) return;
   Around around(s, y, x, falloff);
   const int i = y / BLOCK * s.block_columns + x / BLOCK, within = y % BLOCK * BLOCK + x % BLOCK;
-  std::vector<float> emitter;
+  std::vector<float> surface, emitter;
   bool changed = false;
   for (const int side : {-1, 1}) {
     float sureness = around.beyond(own_coc, side, side < 0 ? 1.0f : 0.5f, light, limit);
     if (sureness > 0) {
       const Block block = s.make_block(i);
-      const float coc = around.emitter_coc, floor = *std::max_element(around.surface.begin(), around.surface.end());
+      const float coc = around.look(light, surface), floor = *std::max_element(surface.begin(), surface.end());
       const float share = clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
       emitter.resize(channels);
       for (int c = 0; c < channels; c++)
-        emitter[c] = std::max(s.light[c * area + at] / around.scale - (1.0f - share) * around.surface[c], 0.0f) * around.scale;
+        emitter[c] = std::max(s.light[c * area + at] / around.scale - (1.0f - share) * surface[c], 0.0f) * around.scale;
       // what is seen through a surface is not before it
       if (side < 0) sureness *= 1.0f - around.beyond(coc, 1, 0.5f, light, limit);
       const float given = std::max(side < 0 ? sureness : 2.0f * sureness - 1.0f, 0.0f);
