@@ -97,7 +97,9 @@ def ends(values: Tensor) -> Tensor:
     """Least and largest of some numbers, ``[2]``; NaN if one of them is NaN. One look at each value."""
     if not is_traced() and values.dtype == torch.float32 and native.can_read(values) and native.chosen():
         return torch.tensor(native.ends(values))
-    return torch.stack(torch.aminmax(values.detach()))
+    # not as half precision, of which autocast knows only one kind at a time
+    exact = torch.promote_types(values.dtype, torch.float32)
+    return torch.stack([end.to(exact) for end in torch.aminmax(values.detach())])
 
 
 def pixels_wide(width: Any) -> None:

@@ -413,6 +413,8 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
         with importlib.resources.as_file(file) as path:
             library = ctypes.CDLL(str(path))
     except OSError as error:
+        if "failed to map segment" in str(error) and "permitted" not in str(error):  # a file system may forbid it, too
+            raise MemoryError("there is too little memory to load the compiled engine") from None
         return None, f"the compiled engine cannot be loaded: {error}"
     if not _fits(library):
         stale = "the compiled engine is of another version of torchdof"
