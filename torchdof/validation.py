@@ -98,7 +98,7 @@ def ends(values: Tensor) -> Tensor:
     if not is_traced() and values.dtype == torch.float32 and native.can_read(values) and native.chosen():
         return torch.tensor(native.ends(values))
     # not as half precision, of which autocast knows only one kind at a time
-    exact = torch.promote_types(values.dtype, torch.float32)
+    exact = torch.float64 if values.dtype == torch.float64 else torch.float32
     return torch.stack([end.to(exact) for end in torch.aminmax(values.detach())])
 
 
