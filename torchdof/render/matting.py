@@ -160,7 +160,7 @@ def attribute_emitters(
     excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
     window_coc, falloff = pixels.pick(coc_px, window)[0], _falloff(light, _EMITTER_REACH)
     counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
-    touches = counted * (falloff > _FALLOFF**3)
+    touches = counted * (falloff > _FALLOFF**3)  # of the window the middle 3 x 3
     nearest = window_coc.amin(0)
 
     def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, ...]:
