@@ -149,3 +149,38 @@ def test_the_gradient_of_the_image_is_the_adjoint_of_the_paper_s_sum(method: str
     other = torch.rand_like(image)
     forward = render(other, depth, focus, f_number)
     assert_close((back * other).sum(), (seen * forward).sum(), rtol=1e-11, atol=0.0)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # by PyTorch, for tangents
+@pytest.mark.parametrize("way", [{"occlusion": True}, {"method": "fold", "occlusion": False}], ids=["over", "paper"])
+@pytest.mark.parametrize("which", ["image", "depth", "focus", "f-number", "rotation", "squeeze"])
+def test_derivatives_forwards_and_by_transforms_are_those_of_autograd(way: dict[str, Any], which: str) -> None:
+    numbers = [torch.tensor(value, dtype=torch.float64) for value in (25.0, 1.3)]
+    inputs = dict(zip(["image", "depth", "focus", "f-number", "rotation", "squeeze"], [*case(), *numbers], strict=True))
+    seen, step = torch.rand_like(inputs["image"]), torch.rand_like(inputs[which])
+
+    def shown(value: Tensor) -> Tensor:
+        image, depth, focus, f_number, rotation, squeeze = {**inputs, which: value}.values()
+        table = BlurTable.polygon(5, rotation_deg=rotation, squeeze=squeeze)
+        dof = DepthOfField(Camera(sensor_width_mm=0.6), table, tolerance=1 / 60, **way)
+        return (dof(image, depth, focus, f_number) * seen).sum()
+
+    leaf = inputs[which].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(shown(leaf), leaf)
+    assert gradient.abs().max() > 0
+    assert_close(torch.func.grad(shown)(inputs[which]), gradient, rtol=1e-12, atol=0.0)
+    (again,) = torch.autograd.grad(shown(leaf), leaf)  # what transforms left in caches is not theirs
+    assert torch.equal(again, gradient)
+    with torch.no_grad():
+        _, tangent = torch.func.jvp(shown, (inputs[which],), (step,))
+    assert_close(tangent, (gradient * step).sum(), rtol=1e-9, atol=1e-12)
+
+
+def test_transforms_leave_kernels_in_the_cache_that_serve_without_them() -> None:
+    image, depth = torch.rand(1, 3, 20, 30), torch.linspace(0.7, 6.3, 600).reshape(1, 1, 20, 30)
+    dof = DepthOfField(Camera(f_number=1.337, sensor_width_mm=3.0), BlurTable.polygon(7, rotation_deg=12.34))
+    torch.func.grad(lambda image: dof(image, depth).sum())(image)
+    plain = dof(image, depth)
+    assert not torch._C._functorch.is_functorch_wrapped_tensor(plain)
+    twin = DepthOfField(dof.camera, BlurTable.polygon(7, rotation_deg=12.34))
+    assert_close(twin(image, depth), plain, rtol=0.0, atol=0.0)

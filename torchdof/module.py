@@ -378,7 +378,7 @@ def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
         return coc_px
     mended = repair(image, coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto", of_coc=True)
     mended = where_needed(lambda: _has_steps(coc_px), mended, coc_px)
-    return torch.where(mended == coc_px, coc_px, mended) if coc_px.requires_grad else mended
+    return torch.where(mended == coc_px, coc_px, mended) if validation.is_differentiated(coc_px) else mended
 
 
 def _has_steps(coc_px: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from . import native
 
@@ -17,6 +18,8 @@ __all__ = [
     "ends",
     "finite_background",
     "floating",
+    "is_differentiated",
+    "is_in_memory",
     "is_resizable",
     "image_and_coc",
     "image_and_depth",
@@ -44,6 +47,24 @@ WHOLE_NUMBERS = (
 def is_traced() -> bool:
     """Whether this code is being compiled or exported: tensors then have no numbers that could be looked at."""
     return torch.compiler.is_compiling() or torch.compiler.is_exporting()
+
+
+def is_differentiated(values: Tensor) -> bool:
+    """Whether derivatives are taken with respect to some numbers: backwards, forwards, or by torch.func."""
+    if is_traced():
+        return torch.is_grad_enabled() and values.requires_grad
+    while True:
+        if (torch.is_grad_enabled() and values.requires_grad) or forward_ad.unpack_dual(values).tangent is not None:
+            return True
+        if not torch._C._functorch.is_functorch_wrapped_tensor(values):
+            return False
+        values = torch._C._functorch.get_unwrapped(values)
+
+
+def is_in_memory(values: Tensor) -> bool:
+    """Whether the compiled engine can read some numbers, and nobody asks for more than numbers."""
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(values)
+    return values.device.type == "cpu" and not wrapped and not is_differentiated(values)
 
 
 def number(
@@ -95,7 +116,7 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
 
 def ends(values: Tensor) -> Tensor:
     """Least and largest of some numbers, ``[2]``; NaN if one of them is NaN. One look at each value."""
-    if not is_traced() and values.dtype == torch.float32 and native.can_read(values) and native.chosen():
+    if not is_traced() and values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
         return torch.tensor(native.ends(values))
     # not as half precision, of which autocast knows only one kind at a time
     exact = torch.float64 if values.dtype == torch.float64 else torch.float32

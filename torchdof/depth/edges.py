@@ -131,7 +131,7 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of
     if torch.is_autocast_enabled(device):  # it would convolve in half precision
         with torch.autocast(device, enabled=False):
             return repair(image, nearness, step, auto, of_coc)
-    compiled = not validation.is_traced() and all(map(native.can_read, (image, nearness))) and native.chosen()
+    compiled = not validation.is_traced() and all(map(validation.is_in_memory, (image, nearness))) and native.chosen()
     if of_coc and not compiled:
         return -repair(image, -nearness, step, auto)
     light, given = image.detach().float(), nearness.detach().float().expand(image.shape[0], -1, -1, -1)

@@ -17,12 +17,10 @@ from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 __all__ = [
     "HALF_LARGEST",
     "Kind",
-    "can_read",
     "chosen",
     "convolve",
     "describe",
@@ -159,12 +157,6 @@ def describe() -> str:
 def use_instructions(name: Literal["avx2", "baseline"]) -> bool:
     """Choose the processor's instructions, for tests; False if it lacks them."""
     return bool(_engine().torchdof_use(name.encode()))
-
-
-def can_read(values: Tensor) -> bool:
-    """Whether numbers alone are asked for, in memory of the CPU: no gradients, no device."""
-    followed = torch.is_grad_enabled() and values.requires_grad
-    return values.device.type == "cpu" and not followed and forward_ad.unpack_dual(values).tangent is None
 
 
 def render(

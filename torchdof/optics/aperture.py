@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import real_tensor, show, whole
+from ..validation import is_differentiated, real_tensor, show, whole
 
 __all__ = ["Aperture"]
 
@@ -107,9 +107,9 @@ class Aperture:
         return self.blades == 0 and self.mask is None
 
     @property
-    def requires_grad(self) -> bool:
-        """Whether a gradient is to be taken to the rotation or to the squeeze."""
-        return any(isinstance(v, Tensor) and v.requires_grad for v in (self.rotation_deg, self.squeeze))
+    def is_differentiated(self) -> bool:
+        """Whether derivatives are taken with respect to the rotation or to the squeeze."""
+        return any(isinstance(v, Tensor) and is_differentiated(v) for v in (self.rotation_deg, self.squeeze))
 
     @property
     def widest(self) -> float:

@@ -253,9 +253,9 @@ class BlurTable:
         return self.field is not None or (self.aperture is not None and self.aperture.depends_on_place)
 
     @property
-    def requires_grad(self) -> bool:
-        """Whether a gradient is to be taken to the aperture's rotation or squeeze."""
-        return self.aperture is not None and self.aperture.requires_grad
+    def is_differentiated(self) -> bool:
+        """Whether derivatives are taken with respect to the aperture's rotation or squeeze."""
+        return self.aperture is not None and self.aperture.is_differentiated
 
     def fingerprint(self) -> str:
         """Hash of all that kernels depend on: tables with the same numbers share it. Kept once it is made.

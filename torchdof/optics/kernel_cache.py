@@ -5,6 +5,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, TypeVar
 
+import torch
 from torch import Tensor
 
 __all__ = ["KernelCache"]
@@ -49,7 +50,7 @@ class KernelCache:
                     results[key] = self._entries[key][0]
         missing = [key for key in keys if key not in results]
         if missing:
-            results.update(zip(missing, make(missing), strict=True))
+            results.update(zip(missing, map(_unwrapped, make(missing)), strict=True))
         with self._lock:
             for key in missing:
                 size = _ENTRY_BYTES + _bytes(results[key])
@@ -60,6 +61,15 @@ class KernelCache:
                         _, (_, freed) = self._entries.popitem(last=False)
                         self.bytes -= freed
         return [results[key] for key in keys]
+
+
+def _unwrapped(made: Any) -> Any:
+    """What was made, outside of every transform of torch.func: it is wrapped by them, though it depends on no input."""
+    if isinstance(made, tuple):
+        return tuple(map(_unwrapped, made))
+    while isinstance(made, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(made):
+        made = torch._C._functorch.get_unwrapped(made)
+    return made
 
 
 def _bytes(made: Tensor | tuple[Tensor, ...] | float) -> int:

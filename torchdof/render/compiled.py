@@ -12,7 +12,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
 from ..optics.placed_kernels import Shares, ray_shares
 from ..options import Options
-from ..validation import is_traced
+from ..validation import is_in_memory, is_traced
 from . import headroom
 from .plan import KERNELS_PER_PX, Blur, Plan, kernels_for
 
@@ -36,7 +36,7 @@ def picture(
     The compiled engine serves eager inference on the CPU in float32, with layers. Arguments are those of the plain
     engine's entry, ``torchdof.render.pipeline._render_item``.
     """
-    if torch.is_grad_enabled() and options.table.requires_grad:
+    if options.table.is_differentiated:
         return None
     given = [t for t in (light, coc, behind_light, behind_coc, cover) if t is not None]
     if plan.rays and plan.kernels_per_px != KERNELS_PER_PX:
@@ -66,7 +66,7 @@ def picture(
 
 def _is_plain(values: Tensor) -> bool:
     """Whether numbers alone are asked for, in memory that the compiled engine can read: no gradients, no device."""
-    return values.dtype == torch.float32 and native.can_read(values)
+    return values.dtype == torch.float32 and is_in_memory(values)
 
 
 def _render(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..exporting import exported_graph, where_needed
 from ..options import NAMED, Options
-from ..validation import is_traced
+from ..validation import is_differentiated, is_traced
 from . import compiled, composite, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
@@ -45,7 +45,7 @@ def blur(
         # numbers that the graph is made for: those that differ between two modules would be variables in it
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
         plan = Plan.all(max_coc_px, tolerance, rays=exported_graph() is not None)
-    elif plan is None and torch.is_grad_enabled() and any(coc.requires_grad for coc in maps[1::2]):
+    elif plan is None and any(map(is_differentiated, maps[1::2])):
         plan = Plan.of_frame(torch.cat(maps[1::2]), options.tolerance, still=True)
     elif plan is not None and not is_traced():
         plan = plan.reaching(torch.cat(maps[1::2]))
@@ -99,8 +99,7 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     valid = torch.isfinite(coc) & torch.isfinite(light).all(2, keepdim=True) & (cover > 0)
     cover, coc = torch.where(valid, cover, 0.0), torch.where(valid, coc, coc.new_zeros(()))
     light = torch.where(valid, light * scale[:, None] / cover.clamp_min(1e-12), 0.0)
-    moves = torch.is_grad_enabled() and coc.requires_grad
-    plan = Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=moves)
+    plan = Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=is_differentiated(coc))
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
     return (_render_item(plan, options, light, coc, cover=cover) / scale).to(rgba.dtype)
@@ -133,7 +132,7 @@ def _render_item(
         return _composite(stack, None, plan, options, stacked=True)
     if plan.nodes == (0.0,):
         # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
-        return light + 0.0 * torch.nan_to_num(coc) if torch.is_grad_enabled() and coc.requires_grad else light.clone()
+        return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
     image, valid, weight = light, None, None
     if not options.check:
         valid = torch.isfinite(coc) & torch.isfinite(light).all(1, keepdim=True)

@@ -12,7 +12,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.kernel_cache import KernelCache
 from ..optics.placed_kernels import Shares, layer_shares, own_kernels
 from ..options import tolerance_of
-from ..validation import is_traced, show
+from ..validation import is_differentiated, is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
@@ -242,7 +242,7 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_
     Each is interpolated between those of so many radii a pixel where no gradient asks for more. They are cut to what
     reaches within a frame whose longer side is ``longest`` pixels.
     """
-    if torch.is_grad_enabled() and (coc_px.requires_grad or table.requires_grad):
+    if is_differentiated(coc_px) or table.is_differentiated:
         kernels = own_kernels(table, coc_px, width)
     else:
         steps = coc_px.double() * per_px
@@ -264,7 +264,7 @@ def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, 
                 coc *= shrink(table, coc, width / scale, scale)
             return own_kernels(table, torch.tensor([coc], dtype=torch.float64), width / scale, window)[0].clone()
 
-    if torch.is_grad_enabled() and table.requires_grad:
+    if table.is_differentiated:
         return made()
     return _kernels.get((lens, coc_px, width, scale, window), made)
 
