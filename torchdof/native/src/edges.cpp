@@ -68,7 +68,7 @@ class Scratch {
     if (blocks_[block_].used == 0 && block_ > 0) block_--;
   }
 
-  std::vector<Edge> edges;
+  const Buffer<Edge> edges{AREA * AREA};  // of a part
 
   static thread_local Scratch *mine;
 
@@ -126,7 +126,17 @@ inline void sum(const vec *v, int count, float *out) {
     store(out + i, quad{ab[0], ab[1], cd[0], cd[1]} + quad{ab[2], ab[3], cd[2], cd[3]});
   }
 }
-inline vec size_of(vec v) { return most(v, -v); }
+// A bit for each lane.
+inline int bits(ivec mask) {
+#if defined(__AVX2__)
+  return __builtin_ia32_movmskps256((vec)mask);
+#else
+  int lanes = 0;
+  for (int i = 0; i < LANES; i++) lanes |= (mask[i] & 1) << i;
+  return lanes;
+#endif
+}
+inline vec size_of(vec v) { return (vec)((ivec)v & 0x7fffffff); }
 inline float square_root(float v) { return std::sqrt(v); }
 inline vec square_root(vec v) {
   float lanes[LANES];
@@ -537,10 +547,8 @@ class Repair {
     std::vector<Found> found(groups.size());
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
-      std::vector<Edge> &edges = Scratch::mine->edges;
-      edges.clear();
-      find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, asked, edges, measures ? &found[g] : nullptr);
-      group.edges.assign(edges.begin(), edges.end());
+      const Edge *edges = Scratch::mine->edges.data();
+      group.edges.assign(edges, find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, asked, measures ? &found[g] : nullptr));
       group.bounds = bounds(group, [](size_t) { return true; });
     });
     found_ = {};
@@ -553,7 +561,8 @@ class Repair {
     return groups;
   }
 
-  void find_in(const Part &own, const Part &part, bool expects_ramps, const Asked &asked, std::vector<Edge> &edges, Found *found) {
+  // The end of those in a part.
+  const Edge *find_in(const Part &own, const Part &part, bool expects_ramps, const Asked &asked, Found *found) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *values = map_.nearness + i;
@@ -561,8 +570,9 @@ class Repair {
       for (int x = 0; x < part.width; x++) marks[x] = std::fabs(values[x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
     }
     const Part busy = changing(part);
-    if (busy.height <= 0 || busy.width <= 0) return;
-    if (expects_ramps || !find_in(own, busy, STEP_HALO, asked, edges, found)) find_in(own, busy, HALO, asked, edges, found);
+    if (busy.height <= 0 || busy.width <= 0) return Scratch::mine->edges.data();
+    const Edge *end = expects_ramps ? nullptr : find_in(own, busy, STEP_HALO, asked, found);
+    return end ? end : find_in(own, busy, HALO, asked, found);
   }
 
   // Where there may be edges.
@@ -608,8 +618,8 @@ class Repair {
     return {y0, x0, std::min(part.bottom(), wide.bottom()) - y0, std::min(part.right(), wide.right()) - x0};
   }
 
-  // Returns whether the halo was wide enough.
-  bool find_in(const Part &own, const Part &inner, int halo, const Asked &asked, std::vector<Edge> &edges, Found *found) {
+  // Null if the halo was not wide enough.
+  const Edge *find_in(const Part &own, const Part &inner, int halo, const Asked &asked, Found *found) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -647,7 +657,7 @@ class Repair {
       });
     }
     if (any_beside(is_ramp)) {
-      if (!is_wide) return false;
+      if (!is_wide) return nullptr;
       end_ramps(up, down, slope, high, low, rows, ramp, ramps);
       each_vector(beside, [&](int y, int x) {
         const vec near = load<vec>(high.at(y, x)), far = load<vec>(low.at(y, x));
@@ -673,68 +683,73 @@ class Repair {
     });
     sums<2>(slope, high, rows, means, 1.0f / 25.0f);
 
-    float near_row[AREA + LANES], far_row[AREA + LANES], mark_row[AREA + LANES];
+    Edge *edges = Scratch::mine->edges.data();
+    float marks_of_row[AREA + LANES];
     for (int y = inner.y0; y < inner.bottom(); y++) {
+      const size_t row = (size_t)y * width_;
+      const bool is_own = y >= own.y0 && y < own.bottom();
       for (int x = inner.x0, k = 0; x < inner.right(); x += LANES, k += LANES) {
-        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {};
+        const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {}, one = all(1.0f);
+        const auto is_valid = size_of(v) <= all(LARGEST);
         vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
-        const vec least = most(0.6f * (near + far), s);
+        if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is as large
+          store(marks_of_row + k, is_valid ? none : all((float)UNSURE * (RINGS + 1)));
+          continue;
+        }
+        const vec least_gap = most(0.6f * (near + far), s);
         for (int r = RINGS - 1; r >= 0; r--) {
           const vec n = load<vec>(nears[r].at(y, x)), f = load<vec>(fars[r].at(y, x)), gap = n + f;
-          const auto here = (gap > least) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
-          near = here ? n : near;
-          far = here ? f : far;
-          unsure = here ? all((float)(RINGS - r)) : unsure;
+          const auto is_step = (gap > least_gap) & (load<vec>(jumps[r].at(y, x)) > ABRUPT * gap);
+          near = is_step ? n : near;
+          far = is_step ? f : far;
+          unsure = is_step ? all((float)(RINGS - r)) : unsure;
         }
         near = is_ramp > none ? load<vec>(up.at(y, x)) : near;
         far = is_ramp > none ? -load<vec>(down.at(y, x)) : -far;
-        const auto is_valid = size_of(v) <= all(LARGEST);
         const auto is_edge = (is_ramp + unsure > none) & (near - far > s) & is_valid;
-        store(near_row + k, near);
-        store(far_row + k, far);
-        const vec mark = (is_edge ? all((float)EDGE) : none) + (2.0f * v > near + far ? all((float)(NEAR + GIVEN_NEAR)) : none) + is_ramp * (float)RAMP;
-        store(mark_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : all((float)(RINGS + 1))));
-      }
-      const size_t row = (size_t)y * width_ + inner.x0;
-      uint8_t *marks = marks_.data() + row;
-      for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)mark_row[k];
-      if (y < own.y0 || y >= own.bottom()) continue;
-      const int last = std::min(inner.right(), own.right());
-      for (int x = std::max(inner.x0, own.x0); x < last; x += LANES) {
-        const int k = x - inner.x0, count = std::min(LANES, last - x);
-        int edges_here = 0;
-        for (int i = 0; i < count; i++) edges_here |= (marks[k + i] & EDGE) << i;
+        const vec is_near = 2.0f * v > near + far ? one : none;
+        const vec mark = (is_edge ? all((float)EDGE) : none) + is_near * (float)(NEAR + GIVEN_NEAR) + is_ramp * (float)RAMP;
+        store(marks_of_row + k, (is_edge | (is_ramp > none) ? mark : none) + (float)UNSURE * (is_valid & (is_ramp <= none) ? unsure : all((float)(RINGS + 1))));
+        const int first = std::max(0, own.x0 - x), last = std::min(LANES, std::min(inner.right(), own.right()) - x);
+        int edges_here = is_own && first < last ? bits(is_edge) & ((1 << last) - (1 << first)) : 0;
         if (!edges_here) continue;
-        const vec near = load<vec>(near_row + k), far = load<vec>(far_row + k), gap = most(near - far, all(1e-12f)), value = load<vec>(raw.at(y, x));
-        const vec level = (value - far) / gap;
+        const vec gap = most(near - far, all(1e-12f)), level = (v - far) / gap;
         const vec right = load<vec>(high.at(y, x + 2)) - load<vec>(high.at(y, x - 2)), below = load<vec>(high.at(y + 2, x)) - load<vec>(high.at(y - 2, x));
-        const vec none = {}, one = all(1.0f);
         const vec across = size_of(right) > size_of(below) + TIE * gap ? (right > none ? one : -one) : none;
         const vec along = size_of(below) > size_of(right) + TIE * gap ? (below > none ? one : -one) : none;
-        float levels[LANES], directions[LANES], climbed[LANES];
-        store(levels, level);
-        store(directions, 2.0f * along + across + (float)(DIRECTIONS / 2));
-        if (found) store(climbed, climb(raw.at(y, x), -1, 1, -raw.pitch, raw.pitch, gap));
+        const vec on_ramp = 2.0f * RINGS + convert(convert(least(most(level * (float)LEVELS, none), all(LEVELS - 1.0f))));
+        const vec place = is_ramp > none ? on_ramp : (level > 0.5f ? all((float)RINGS) : none) + (float)RINGS - unsure;
+        float nearest[LANES], farthest[LANES];
+        int32_t kinds[LANES], sides[LANES];
+        store(nearest, near);
+        store(farthest, far);
+        const ivec kind = convert(place * (float)DIRECTIONS + 2.0f * along + across + (float)(DIRECTIONS / 2));
+        store(kinds, kind);
+        store(sides, kind + convert(is_near * (float)KINDS));
+        if (found) measure(*found, edges_here, level, is_near, climb(raw.at(y, x), -1, 1, -raw.pitch, raw.pitch, gap));
         for (; edges_here; edges_here &= edges_here - 1) {
-          const int i = __builtin_ctz(edges_here);
-          const float level = levels[i];
-          uint8_t &mark = marks[k + i];
-          if (found) {
-            const bool is_middle = is_mixed(level);
-            found->length += climbed[i];
-            found->climbed += is_middle ? climbed[i] : 0.0f;
-            found->middles += is_middle;
-            found->lost += (mark & NEAR ? 1.0f : 0.0f) - clamp01(level);
-          }
-          const int place = mark & RAMP ? 2 * RINGS + std::min(std::max((int)(level * LEVELS), 0), LEVELS - 1) : (level > 0.5f) * RINGS + RINGS - mark / UNSURE;
-          const int kind = place * DIRECTIONS + (int)directions[i];
-          if (!asked[kind + (mark & GIVEN_NEAR ? KINDS : 0)]) continue;
-          mark |= LISTED;
-          edges.push_back({(int)row + k + i, near_row[k + i], far_row[k + i], (uint8_t)kind});
+          const int n = __builtin_ctz(edges_here), is_asked = asked[sides[n]];
+          *edges = {(int)row + x + n, nearest[n], farthest[n], (uint8_t)kinds[n]};
+          marks_of_row[k + n] += (float)(LISTED * is_asked);
+          edges += is_asked;
         }
       }
+      uint8_t *marks = marks_.data() + row + inner.x0;
+      for (int k = 0; k < inner.width; k++) marks[k] = (uint8_t)(int)marks_of_row[k];
     }
-    return true;
+    return edges;
+  }
+
+  // Adds what the chosen ones of some pixels at edges tell of edges.
+  static void measure(Found &found, int chosen, vec level, vec is_near, vec climbed) {
+    for (; chosen; chosen &= chosen - 1) {
+      const int n = __builtin_ctz(chosen);
+      const bool is_middle = is_mixed(level[n]);
+      found.length += climbed[n];
+      found.climbed += is_middle ? climbed[n] : 0.0f;
+      found.middles += is_middle;
+      found.lost += is_near[n] - clamp01(level[n]);
+    }
   }
 
   // Steepness where it goes on from one side to the other, and by how much the change on one side exceeds it.
@@ -824,15 +839,24 @@ class Repair {
     const Grid given(around), witness(around), colour(around, channels);
     for (int c = 0; c < channels; c++) fetch(map_.light + c * area_, colour, colour.at(around.y0, around.x0) + c * colour.size, root);
     fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
-    fetch(marks_.data(), witness, [](uint8_t marks) { return SURE[marks / UNSURE]; });
+    fetch(marks_.data(), witness, [](uint8_t marks) { return (float)(marks / UNSURE); });
+    float *sure = witness.at(around.y0, around.x0);
+    for (size_t i = 0; i < witness.size; i += LANES) store(sure + i, pick(SURE, convert(load<vec>(sure + i))));
     struct Lanes {
       vec lanes;
     };
     std::vector<Lanes> many(C ? 0 : count);
-    std::vector<float> numbers(C ? 0 : count + 3 + channels);
+    std::vector<float> numbers(C ? 0 : count + 3 + channels), of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
+    struct Window {
+      vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
+    } windows[LANES];
+    const vec none = {}, one = all(1.0f);
+    const auto of = [&](int n) { return load<vec>(&of_lanes[n * LANES]); };
     each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
+      const int lane = (int)(k % LANES);
+      Window &window = windows[lane];
       const float near = edge.near, far = edge.far;
-      const vec most_off = all(0.25f * std::max(near - far, 1e-12f)), none = {};
+      const vec most_off = all(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
       float few_sums[C ? 4 + 2 * C + 3 : 1], few_own[C ? C : 1];
       vec *sums = C ? few : &many[0].lanes;  // of weights, of what colours are apart, and of colours: of both surfaces each
@@ -840,8 +864,7 @@ class Repair {
       for (int n = 0; n < count; n++) sums[n] = none;
       const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH), *colour_at = colour.at(y - REACH, x - REACH);
       for (int c = 0; c < channels; c++) own[c] = colour_at[c * colour.size + REACH * colour.pitch + REACH];
-      vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
-      const auto look = [&](int n, const auto &take) {
+      each_of_window([&](int n, const auto &take) {
         const vec value = take(given_at, given.pitch), weight = load<vec>(falloff + n * LANES) * take(witness_at, given.pitch), off = value - near;
         const vec w[2] = {size_of(off) < most_off ? weight : none, size_of(value - far) < most_off ? weight : none};
         vec stray = none;
@@ -853,55 +876,68 @@ class Repair {
         for (int side = 0; side < 2; side++) {
           sums[side] += w[side];
           sums[2 + side] += w[side] * stray;
-          weights[side][n] = w[side];
+          window.weights[side][n] = w[side];
         }
-        values[n] = off;
-        apart[n] = stray;
-      };
-      each_of_window(look);
+        window.values[n] = off;
+        window.apart[n] = stray;
+      });
       sum(sums, count, totals);
+      for (int n = 0; n < count; n++) of_lanes[n * LANES + lane] = totals[n];
+      for (int c = 0; c < channels; c++) of_lanes[(count + c) * LANES + lane] = own[c];
+      if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
 
-      Judgement &judged = group.judged[k];
-      judged = {0.0f, 1.0f, near, far};
-      score_[edge.i] = 0.0f;
-      float square = 0;
-      for (int c = 0; c < channels; c++) square += own[c] * own[c];
-      const float per_light = 1.0f / (0.0225f * square + 1e-12f), *apart_at = (const float *)apart + REACH * WHOLE + REACH;
-      for (int n = 0; n < 8; n++) group.around[k].alike[n] = 1.0f / (1.0f + apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]] * per_light);
-      if (!(totals[0] > 1e-3f && totals[1] > 1e-3f)) return;  // the neighbours tell
-      const float per_total[2] = {1.0f / totals[0], 1.0f / totals[1]};
-      float contrast = 0, noise = 0, from_mean[2] = {0, 0};
+      // LANES pixels at once
+      const vec per_total[2] = {1.0f / of(0), 1.0f / of(1)};
+      vec square = none, contrast = none, noise = none, from_mean[2] = {none, none};
       for (int c = 0; c < channels; c++) {
-        const float near_off = totals[4 + 2 * c] * per_total[0], far_off = totals[5 + 2 * c] * per_total[1], both = 2.0f * own[c] + near_off + far_off;
+        const vec mine = of(count + c), near_off = of(4 + 2 * c) * per_total[0], far_off = of(5 + 2 * c) * per_total[1], both = 2.0f * mine + near_off + far_off;
+        square += mine * mine;
         from_mean[0] += near_off * near_off;
         from_mean[1] += far_off * far_off;
         contrast += (near_off - far_off) * (near_off - far_off);
         noise += both * both;
       }
-      float spread = 2.25e-4f * noise + 1e-12f;
-      for (int side = 0; side < 2; side++) spread += 0.5f * std::max(totals[2 + side] * per_total[side] - from_mean[side], 0.0f);
-      const float per_spread = 1.0f / (0.3f * spread);
-      vec likely[2] = {}, parts[4] = {};
-      for (int n = 0; n < WINDOW; n++) {
-        const vec t = 1.0f + apart[n] * per_spread, alike = 1.0f / (t * t);
+      vec spread = 2.25e-4f * noise + 1e-12f;
+      for (int side = 0; side < 2; side++) spread += 0.5f * most(of(2 + side) * per_total[side] - from_mean[side], none);
+      const vec per_light = 1.0f / (0.0225f * square + 1e-12f), per_spread = 1.0f / (0.3f * spread);
+      const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours tell
+      const vec tells = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
+      float likely[2][LANES + 3], surfaces[2][LANES];
+      for (int l = 0; l <= lane; l++) {
+        const Window &window = windows[l];
+        const Edge &edge = group.edges[k - lane + l];
+        const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
+        float *alike_around = group.around[k - lane + l].alike;
+        for (int n = 0; n < 8; n++) alike_around[n] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
+        for (int n = 0; n < 8; n += LANES) store(alike_around + n, 1.0f / (1.0f + load<vec>(alike_around + n) * per_light[l]));
+        vec parts[6] = {};  // of likelihood, and of weights and nearness: of both surfaces each
+        for (int n = 0; n < WINDOW; n++) {
+          const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
+          for (int side = 0; side < 2; side++) {
+            const vec part = window.weights[side][n] * (alike + 1e-3f);
+            parts[side] += window.weights[side][n] * alike;
+            parts[2 + side] += part;
+            parts[4 + side] += part * window.values[n];
+          }
+        }
+        float of_parts[6 + 3];
+        sum(parts, 6, of_parts);
         for (int side = 0; side < 2; side++) {
-          const vec part = weights[side][n] * (alike + 1e-3f);
-          likely[side] += weights[side][n] * alike;
-          parts[side] += part;
-          parts[2 + side] += part * values[n];
+          likely[side][l] = of_parts[side];
+          surfaces[side][l] = edge.near + of_parts[4 + side] / std::max(of_parts[2 + side], 1e-12f);
         }
       }
-      float of_parts[4 + 3], likelihood[4 + 3];
-      sum(parts, 4, of_parts);
-      sum(likely, 2, likelihood);
+      vec likelihood[2];
       for (int side = 0; side < 2; side++) {
-        const float t = 1.0f + from_mean[side] * per_spread;
-        likelihood[side] = likelihood[side] * per_total[side] + 0.02f / (t * t) + 1e-9f;
+        const vec t = 1.0f + from_mean[side] * per_spread;
+        likelihood[side] = load<vec>(likely[side]) * per_total[side] + 0.02f / (t * t) + 1e-9f;
       }
-      score_[edge.i] = clamp(std::log(likelihood[0] / likelihood[1]), -8.0f, 8.0f);
-      judged.tells = std::max(contrast / (contrast + 0.5f * spread) - 0.1f, 0.0f) / 0.9f;
-      judged.near = near + of_parts[2] / std::max(of_parts[0], 1e-12f);
-      judged.far = near + of_parts[3] / std::max(of_parts[1], 1e-12f);
+      const vec odds = likelihood[0] / likelihood[1];
+      for (int l = 0; l <= lane; l++) {
+        const Edge &edge = group.edges[k - lane + l];
+        score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) : 0.0f;
+        group.judged[k - lane + l] = {0.0f, tells[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
+      }
     });
   }
 
