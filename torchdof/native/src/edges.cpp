@@ -260,7 +260,7 @@ struct Judgement {
 };
 
 struct Around {
-  float alike[8];  // how much the colours around a pixel are its own
+  float alike[8][LANES];  // how much the colours around LANES pixels are their own
 };
 
 // Edges of a part that are looked at together, in the order of rows.
@@ -269,7 +269,7 @@ struct Group {
   std::vector<Edge> edges;
   Part bounds = {};             // where they lie
   Judgement *judged = nullptr;  // of each
-  Around *around = nullptr;
+  Around *around = nullptr;     // of LANES of them each
 };
 
 // Whether pixels are asked, by kind: those that the map gives the far surface, and those that it gives the near one.
@@ -305,7 +305,7 @@ class Repair {
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });  // what is around blocks may lie in others
     allot(sampled);
     judge(sampled);
-    decide(sampled, [](int, size_t, const Edge &) {});
+    decide(sampled, [](int, size_t, const Edge &, float) {});
     calibrate(sampled);
     const bool is_soft = is_on_ramps(sampled);
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
@@ -469,12 +469,14 @@ class Repair {
     size_t count = 0;
     for (const Group &group : groups) count += group.edges.size();
     judged_ = Buffer<Judgement>(count);
-    around_ = Buffer<Around>(count);
+    around_ = Buffer<Around>(count / LANES + groups.size());
     count = 0;
+    size_t arounds = 0;
     for (Group &group : groups) {
       group.judged = judged_.data() + count;
-      group.around = around_.data() + count;
+      group.around = around_.data() + arounds;
       count += group.edges.size();
+      arounds += (group.edges.size() + LANES - 1) / LANES;
     }
   }
 
@@ -902,14 +904,12 @@ class Repair {
       const vec per_light = 1.0f / (0.0225f * square + 1e-12f), per_spread = 1.0f / (0.3f * spread);
       const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours tell
       const vec tells = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
-      float likely[2][LANES + 3], surfaces[2][LANES];
+      float likely[2][LANES], surfaces[2][LANES], *around = group.around[k / LANES].alike[0];
       for (int l = 0; l <= lane; l++) {
         const Window &window = windows[l];
         const Edge &edge = group.edges[k - lane + l];
         const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
-        float *alike_around = group.around[k - lane + l].alike;
-        for (int n = 0; n < 8; n++) alike_around[n] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
-        for (int n = 0; n < 8; n += LANES) store(alike_around + n, 1.0f / (1.0f + load<vec>(alike_around + n) * per_light[l]));
+        for (int n = 0; n < 8; n++) around[n * LANES + l] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
         vec parts[6] = {};  // of likelihood, and of weights and nearness: of both surfaces each
         for (int n = 0; n < WINDOW; n++) {
           const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
@@ -927,6 +927,7 @@ class Repair {
           surfaces[side][l] = edge.near + of_parts[4 + side] / std::max(of_parts[2 + side], 1e-12f);
         }
       }
+      for (int n = 0; n < 8; n++) store(around + n * LANES, 1.0f / (1.0f + load<vec>(around + n * LANES) * per_light));
       vec likelihood[2];
       for (int side = 0; side < 2; side++) {
         const vec t = 1.0f + from_mean[side] * per_spread;
@@ -941,7 +942,7 @@ class Repair {
     });
   }
 
-  // Neighbours of like colour decide together: calls body(g, k, edge) for each of all groups' edges that has its score.
+  // Neighbours of like colour decide together: calls body(g, k, edge, evidence) for each of all groups' edges that has its score.
   template <typename Body>
   void decide(const std::vector<Group> &groups, const Body &body) const {
     parallel((int)groups.size(), [&](int g) {
@@ -949,19 +950,29 @@ class Repair {
       if (group.edges.empty()) return;
       const Grid said(group.bounds.grown(1));
       take_listed(score_.data(), said, UNSAID);
-      each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
-        const float *own = said.at(y, x), *around = group.around[k].alike;
-        float total = 1.0f, score = *own, strongest = std::fabs(*own);
+      float beside[9][LANES];  // scores around LANES pixels, and their own
+      each_edge(group, [&](size_t k, const Edge &, int y, int x) {
+        const int lane = (int)(k % LANES);
+        const float *own = said.at(y, x);
+        for (int n = 0; n < 8; n++) beside[n][lane] = own[NEIGHBOURS[n][0] * said.pitch + NEIGHBOURS[n][1]];
+        beside[8][lane] = *own;
+        if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
+        const float *around = group.around[k / LANES].alike[0];
+        const vec none = {};
+        vec total = all(1.0f), score = load<vec>(beside[8]), strongest = size_of(score);
         for (int n = 0; n < 8; n++) {
-          const float other = own[NEIGHBOURS[n][0] * said.pitch + NEIGHBOURS[n][1]], alike = other < UNSAID ? around[n] : 0.0f;
+          const vec other = load<vec>(beside[n]), alike = other < UNSAID ? load<vec>(around + n * LANES) : none;
           total += alike;
           score += alike * other;
-          strongest = std::max(strongest, other < UNSAID ? std::fabs(other) : 0.0f);
+          strongest = most(strongest, other < UNSAID ? size_of(other) : none);
         }
-        const float tells = group.judged[k].tells;
-        group.judged[k].score = clamp(SHARPNESS * tells * (score / total), -6.0f, 6.0f);
-        evidence_[edge.i] = clamp01(2.0f * tells * strongest - 1.0f);
-        body(g, k, edge);
+        score /= total;
+        for (int l = 0; l <= lane; l++) {
+          const size_t at = k - lane + l;
+          const float tells = group.judged[at].tells;
+          group.judged[at].score = clamp(SHARPNESS * tells * score[l], -6.0f, 6.0f);
+          body(g, at, group.edges[at], clamp01(2.0f * tells * strongest[l] - 1.0f));
+        }
       });
     });
   }
@@ -1051,7 +1062,8 @@ class Repair {
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<int64_t> lost(groups.size(), 0);
-    decide(groups, [&](int g, size_t k, const Edge &edge) {
+    decide(groups, [&](int g, size_t k, const Edge &edge, float evidence) {
+      evidence_[edge.i] = evidence;
       const float score = groups[g].judged[k].score;
       const bool shows_near = score + prior[edge.kind] > -lean * clamp01(std::fabs(score) - 1.0f);
       uint8_t &marks = marks_[edge.i];
