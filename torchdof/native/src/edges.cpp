@@ -305,7 +305,7 @@ class Repair {
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });  // what is around blocks may lie in others
     allot(sampled);
     judge(sampled);
-    decide(sampled, [](int, size_t, const Edge &, float) {});
+    decide(sampled, [](const Edge &, float) {});
     calibrate(sampled);
     const bool is_soft = is_on_ramps(sampled);
     if (map_.automatic && (!is_related(sampled) || !(is_soft || is_inexact(sampled)))) return false;
@@ -942,7 +942,7 @@ class Repair {
     });
   }
 
-  // Neighbours of like colour decide together: calls body(g, k, edge, evidence) for each of all groups' edges that has its score.
+  // Neighbours of like colour decide together: calls body(edge, evidence) for each of all groups' edges that has its score.
   template <typename Body>
   void decide(const std::vector<Group> &groups, const Body &body) const {
     parallel((int)groups.size(), [&](int g) {
@@ -971,7 +971,7 @@ class Repair {
           const size_t at = k - lane + l;
           const float tells = group.judged[at].tells;
           group.judged[at].score = clamp(SHARPNESS * tells * score[l], -6.0f, 6.0f);
-          body(g, at, group.edges[at], clamp01(2.0f * tells * strongest[l] - 1.0f));
+          body(group.edges[at], clamp01(2.0f * tells * strongest[l] - 1.0f));
         }
       });
     });
@@ -1062,13 +1062,16 @@ class Repair {
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<int64_t> lost(groups.size(), 0);
-    decide(groups, [&](int g, size_t k, const Edge &edge, float evidence) {
-      evidence_[edge.i] = evidence;
-      const float score = groups[g].judged[k].score;
-      const bool shows_near = score + prior[edge.kind] > -lean * clamp01(std::fabs(score) - 1.0f);
-      uint8_t &marks = marks_[edge.i];
-      lost[g] += shows_near - (marks & NEAR) / NEAR;
-      marks = (uint8_t)((marks & ~NEAR) | shows_near * NEAR);
+    decide(groups, [&](const Edge &edge, float evidence) { evidence_[edge.i] = evidence; });
+    parallel((int)groups.size(), [&](int g) { // only now: to decide, each group reads the marks beside it
+      for (size_t k = 0; k < groups[g].edges.size(); k++) {
+        const Edge &edge = groups[g].edges[k];
+        const float score = groups[g].judged[k].score;
+        const bool shows_near = score + prior[edge.kind] > -lean * clamp01(std::fabs(score) - 1.0f);
+        uint8_t &marks = marks_[edge.i];
+        lost[g] += shows_near - (marks & NEAR) / NEAR;
+        marks = (uint8_t)((marks & ~NEAR) | shows_near * NEAR);
+      }
     });
     double total = found_.lost;
     for (const int64_t here : lost) total += (double)here;
