@@ -13,7 +13,7 @@ from torch import Tensor
 from .. import validation
 from .layer_weights import blur_axis
 
-__all__ = ["DENSE", "border_nodes", "ends", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
+__all__ = ["DENSE", "border_nodes", "extent", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
 
 DENSE = 0.65
 """Share of the tolerance for which coarse layers are spaced where nothing tells where a scene's borders lie.
@@ -68,7 +68,7 @@ def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
     return near + (node - near) * min(max((gap - _NEAR) / _NEAR, 0.0), 1.0)
 
 
-def ends(coc_px: Tensor) -> tuple[float, float]:
+def extent(coc_px: Tensor) -> tuple[float, float]:
     """Nearest and farthest place of the pixels ``[B, 1, H, W]``."""
     both = validation.ends(coc_px)
     if bool(both.isnan().any()):

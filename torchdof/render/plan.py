@@ -96,12 +96,12 @@ class Plan:
         tolerance, lest layers move with the scene.
         """
         coc_px = coc_px.detach()
-        ends = layer_cocs.ends(coc_px)
-        low, high = (from_blur_axis(end) for end in ends)
+        extent = layer_cocs.extent(coc_px)
+        low, high = (from_blur_axis(end) for end in extent)
         part = min(1.0, min(coc_px.shape[-2:]) / (_SMALL_RADII * max(-low, high, 1.0)))
         if still:
             return cls.still(coc_px, tolerance * 2.0 ** math.floor(math.log2(part)))
-        return cls._between(*ends, coc_px, tolerance * part)
+        return cls._between(*extent, coc_px, tolerance * part)
 
     @classmethod
     def of_scene(cls, coc_px: Tensor, tolerance: float) -> "Plan":
@@ -110,7 +110,7 @@ class Plan:
         A scene ``[B, 1, H, W]`` of one plane gets one layer, and its kernel is exact. NaN is left out.
         """
         coc_px = coc_px.detach()
-        return cls._between(*layer_cocs.ends(coc_px), coc_px, tolerance)
+        return cls._between(*layer_cocs.extent(coc_px), coc_px, tolerance)
 
     @classmethod
     def _between(cls, low: float, high: float, coc_px: Tensor, tolerance: float) -> "Plan":
@@ -134,7 +134,7 @@ class Plan:
     @classmethod
     def still(cls, coc_px: Tensor, tolerance: float) -> "Plan":
         """Layers that reach as far as this scene does but do not move with it: for gradients."""
-        return cls(layer_cocs.spaced_nodes(*layer_cocs.ends(coc_px.detach()), tolerance), tolerance)
+        return cls(layer_cocs.spaced_nodes(*layer_cocs.extent(coc_px.detach()), tolerance), tolerance)
 
     @classmethod
     def all(cls, max_coc_px: float, tolerance: float, rays: bool = False) -> "Plan":
@@ -150,8 +150,8 @@ class Plan:
 
     def reaching(self, coc_px: Tensor) -> "Plan":
         """This plan, with layers added outwards as far as a scene ``[B, 1, H, W]`` is blurred; itself if it reaches."""
-        ends = layer_cocs.ends(coc_px.detach())
-        if not self.grows or (self.nodes[0] <= ends[0] and ends[1] <= self.nodes[-1]):
+        nearest, farthest = layer_cocs.extent(coc_px.detach())
+        if not self.grows or (self.nodes[0] <= nearest and farthest <= self.nodes[-1]):
             return self
         nodes, scene = list(self.nodes), Plan.of_scene(coc_px, self.tolerance)
         for sign, last in ((-1.0, -self.nodes[0]), (1.0, self.nodes[-1])):
