@@ -370,15 +370,19 @@ class Repair {
   bool is_on_ramps(const std::vector<Group> &sampled) const {
     double edges = 0, ramps = 0, mixed = 0, length = 0;
     for (const Group &group : sampled)
-      each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
-        const float *value = map_.nearness + edge.i, level = (nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f);
+      for (const Edge &edge : group.edges) {
         const bool is_ramp = marks_[edge.i] & RAMP;
         edges++;
         ramps += is_ramp;
-        mixed += is_ramp && is_mixed(level);
+        mixed += is_ramp && is_mixed((nearness(edge.i) - edge.far) / std::max(edge.near - edge.far, 1e-12f));
+      }
+    if (!(ramps > SOFT * edges)) return false;
+    for (const Group &group : sampled)
+      each_edge(group, [&](size_t, const Edge &edge, int y, int x) {
+        const float *value = map_.nearness + edge.i;
         length += climb(value, x > 0 ? -1 : 0, x < width_ - 1 ? 1 : 0, y > 0 ? -width_ : 0, y < height_ - 1 ? width_ : 0, std::max(edge.near - edge.far, 1e-12f));
       });
-    return ramps > SOFT * edges && (ramps > WIDE * length || mixed > MIXED * ramps);
+    return ramps > WIDE * length || mixed > MIXED * ramps;
   }
 
   // Whether a place on a step is far from both of its surfaces.
@@ -1011,10 +1015,20 @@ class Repair {
       assumed[p] = p < RINGS ? TRUSTED : p < 2 * RINGS ? 1.0f - TRUSTED : (p - 2 * RINGS + 0.5f) / LEVELS;
       start[p] = p < 2 * RINGS ? 0.5f : assumed[p];
     }
-    const std::vector<float> together = fit(groups, DIRECTIONS, start, assumed);
+    std::vector<Witnesses> heard(KINDS);
+    for (const Group &group : groups)
+      for (size_t k = 0; k < group.edges.size(); k++) {
+        const float score = group.judged[k].score;
+        Witnesses &witnesses = heard[group.edges[k].kind];
+        witnesses.weights.push_back(std::min(0.5f * std::fabs(score), 1.0f));
+        witnesses.odds.push_back(std::exp(-score));
+      }
+    for (Witnesses &witnesses : heard)
+      for (std::vector<float> *values : {&witnesses.weights, &witnesses.odds}) values->resize((values->size() + LANES - 1) / LANES * LANES);
+    const std::vector<float> together = fit(heard, DIRECTIONS, start, assumed);
     std::vector<float> each(KINDS);
     for (int k = 0; k < KINDS; k++) each[k] = together[k / DIRECTIONS];
-    shares_ = fit(groups, 1, std::vector<float>(KINDS, 0.5f), each);
+    shares_ = fit(heard, 1, std::vector<float>(KINDS, 0.5f), each);
     // where the pixels beside a step are right those farther away are too
     for (int r = 1; r < RINGS; r++)
       for (int d = 0; d < DIRECTIONS; d++) {
@@ -1024,28 +1038,30 @@ class Repair {
       }
   }
 
-  std::vector<float> fit(const std::vector<Group> &groups, int together, std::vector<float> share, const std::vector<float> &assumed) const {
-    const size_t count = share.size();
-    std::vector<double> total(count, 0.0), found(count);
-    struct Witness {
-      int kind;
-      float weight, odds;
+  // What pixels of a kind said of which of two surfaces they show; the rest of the last vector says nothing.
+  struct Witnesses {
+    std::vector<float> weights, odds;
+  };
+
+  static std::vector<float> fit(const std::vector<Witnesses> &heard, int together, std::vector<float> share, const std::vector<float> &assumed) {
+    const auto sum_of = [&](size_t first, const auto &part) {
+      double totals[LANES] = {}, total = 0;
+      for (size_t kind = first; kind < first + together; kind++)
+        for (size_t n = 0; n < heard[kind].weights.size(); n += LANES) {
+          float parts[LANES];
+          store(parts, part(load<vec>(&heard[kind].weights[n]), load<vec>(&heard[kind].odds[n])));
+          for (int i = 0; i < LANES; i++) totals[i] += parts[i];
+        }
+      for (const double each : totals) total += each;
+      return total;
     };
-    std::vector<Witness> witnesses;
-    for (const Group &group : groups)
-      for (size_t k = 0; k < group.edges.size(); k++) {
-        const float score = group.judged[k].score, weight = std::min(0.5f * std::fabs(score), 1.0f);
-        const int kind = group.edges[k].kind / together;
-        total[kind] += weight;
-        if (weight > 0) witnesses.push_back({kind, weight, std::exp(-score)});
+    for (size_t g = 0; g < share.size(); g++) {
+      const double total = sum_of(g * together, [](vec weight, vec) { return weight; });
+      for (int round = 0; round < ROUNDS; round++) {
+        const float odds = (1.0f - share[g]) / share[g];
+        const double found = sum_of(g * together, [&](vec weight, vec other) { return weight / (1.0f + odds * other); });
+        share[g] = clamp((float)((found + PRIOR_COUNT * assumed[g]) / (total + PRIOR_COUNT)), 0.005f, 0.995f);
       }
-    for (int round = 0; round < ROUNDS; round++) {
-      std::fill(found.begin(), found.end(), 0.0);
-      std::vector<float> odds(count);
-      for (size_t g = 0; g < count; g++) odds[g] = (1.0f - share[g]) / share[g];
-      for (const Witness &w : witnesses) found[w.kind] += w.weight / (1.0f + odds[w.kind] * w.odds);
-      for (size_t g = 0; g < count; g++)
-        share[g] = clamp((float)((found[g] + PRIOR_COUNT * assumed[g]) / (total[g] + PRIOR_COUNT)), 0.005f, 0.995f);
     }
     return share;
   }
