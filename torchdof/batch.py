@@ -28,6 +28,8 @@ def leading_axes(image: Any) -> tuple[int, ...]:
 def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> Any:
     """A tensor of images or maps as a batch, its leading axes made one; one that is shared by all stays one item.
 
+    Parts of a larger frame are copied here, once, for a rendering looks at them often.
+
     Args:
         axes: :func:`leading_axes` of the image.
         name: Of the argument.
@@ -45,7 +47,7 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
         return value
     _not_mapped(name, value)
     if len(axes) == 1:
-        return value
+        return value.contiguous()
     fits = value.ndim == len(axes) + 3 and all(n in (1, m) for n, m in zip(value.shape, axes, strict=False))
     if not fits:
         lead = ", ".join(map(str, axes)) + ", " * bool(axes)
@@ -53,9 +55,9 @@ def flattened(axes: tuple[int, ...], name: str, value: Any, what: str = "1") -> 
             f"{name} must be [{lead}{what}, H, W] beside an image [{lead}C, H, W], got {list(value.shape)}"
         )
     if not axes:
-        return value[None]
+        return value[None].contiguous()
     shared = all(n == 1 for n in value.shape[: len(axes)])
-    return value.flatten(0, 1) if shared else value.expand(*axes, -1, -1, -1).flatten(0, 1)
+    return (value if shared else value.expand(*axes, -1, -1, -1)).flatten(0, 1).contiguous()
 
 
 def numbers(axes: tuple[int, ...], name: str, value: Any) -> Any:
