@@ -304,7 +304,7 @@ class Repair {
     }
     choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });  // what is around blocks may lie in others
     allot(sampled);
-    judge(sampled);
+    judge(sampled, false);
     decide(sampled, [](const Edge &, float) {});
     calibrate(sampled);
     const bool is_soft = is_on_ramps(sampled);
@@ -318,7 +318,7 @@ class Repair {
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[side_of(edge)]; });
     allot(groups);
-    judge(groups);
+    judge(groups, true);
     const float sigma = blur(), lost_px = choose(groups);
     if (is_soft) unmix(groups, sigma, lost_px);
     move(groups, is_soft);
@@ -833,23 +833,23 @@ class Repair {
     }
   }
 
-  // Which of two surfaces pixels show, by their colour.
-  void judge(std::vector<Group> &groups) const {
+  // Which of two surfaces pixels show, by their colour; and how near these are, if that is wanted.
+  void judge(std::vector<Group> &groups, bool wants_surfaces) const {
     const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });  // none is its own witness
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
       switch (channels_) {
-        case 1: return judge<1>(groups[g], falloff.data());
-        case 3: return judge<3>(groups[g], falloff.data());
-        case 4: return judge<4>(groups[g], falloff.data());
-        default: judge<0>(groups[g], falloff.data());
+        case 1: return judge<1>(groups[g], falloff.data(), wants_surfaces);
+        case 3: return judge<3>(groups[g], falloff.data(), wants_surfaces);
+        case 4: return judge<4>(groups[g], falloff.data(), wants_surfaces);
+        default: judge<0>(groups[g], falloff.data(), wants_surfaces);
       }
     });
   }
 
   // C: channels, or 0 for any number.
   template <int C>
-  void judge(Group &group, const float *falloff) const {
+  void judge(Group &group, const float *falloff, bool wants_surfaces) const {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
     const Part around = group.bounds.grown(REACH);
     const Grid given(around), witness(around), colour(around, channels);
@@ -928,8 +928,9 @@ class Repair {
         for (int n = 0; n < WINDOW; n++) {
           const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
           for (int side = 0; side < 2; side++) {
-            const vec part = window.weights[side][n] * (alike + 1e-3f);
             parts[side] += window.weights[side][n] * alike;
+            if (!wants_surfaces) continue;
+            const vec part = window.weights[side][n] * (alike + 1e-3f);
             parts[2 + side] += part;
             parts[4 + side] += part * window.values[n];
           }
