@@ -214,84 +214,69 @@ class Filling {
     const int H = job_.height, W = job_.width, planes = C_ + 2;
     const Level &level = pyramid_[0];
     const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2);
-    const int across = 2 * ceil_div(level.width, LANES) * LANES + 2;  // rows are read in whole vectors
+    const int across = 2 * ceil_div(level.width, LANES) * LANES + BLOCK;  // rows are read in whole vectors, and blocks written
     const size_t line = (size_t)planes * across;
-    std::vector<float> memory(3 * line);
-    int held[3] = {-1, -1, -1};
-    auto row_of = [&](int y) {  // planes of a row, continued to both sides, from pixel `left` on
-      y = std::clamp(y, 0, H - 1);
-      float *row = memory.data() + y % 3 * line;
-      if (held[y % 3] == y) return row;
-      held[y % 3] = y;
+    // planes of its rows, continued to both sides, from pixel `left` on: first the image's, then those of blocks, each as it
+    // lies in memory
+    const int first = band * BLOCK / 2, end = std::min(level.height, (band + 1) * BLOCK / 2);
+    const int y0 = std::clamp(top + 2 * first, 0, H - 1), y1 = std::clamp(top + 2 * end - 1 + H % 2, 0, H - 1);
+    const Buffer<float> memory((y1 + 1 - y0) * line);
+    auto row_of = [&](int y) { return memory.data() + (std::clamp(y, 0, H - 1) - y0) * line; };
+    for (int y = y0; y <= y1; y++) {
+      float *const row = row_of(y) - left;
+      for (int c = 0; c < C_; c++) memcpy(row + c * across, s_.light + c * s_.area() + (size_t)y * W, W * sizeof(float));
+      memcpy(row + C_ * across, s_.coc + (size_t)y * W, W * sizeof(float));
+      std::fill(row + (C_ + 1) * across, row + (C_ + 1) * across + W, 1.0f);
+    }
+    for (int block_y = y0 / BLOCK; block_y <= y1 / BLOCK; block_y++)
       for (int x0 = 0; x0 < W; x0 += BLOCK) {
-        const int n = std::min(BLOCK, W - x0), which = y / BLOCK * s_.block_columns + x0 / BLOCK;
-        const float limit = least_threshold(job_, y / BLOCK * BLOCK, x0);
-        pixels(y, x0, n, s_.has_block(which) || job_.block_peak[which] > limit, limit, row + x0 - left, across);
+        const int n = std::min(BLOCK, W - x0), which = block_y * s_.block_columns + x0 / BLOCK;
+        const float limit = least_threshold(job_, block_y * BLOCK, x0);
+        const bool bright = s_.has_block(which) || job_.block_peak[which] > limit;
+        for (int y = std::max(y0, block_y * BLOCK); y <= std::min(y1, block_y * BLOCK + BLOCK - 1); y++)
+          pixels(y, x0, n, bright, limit, row_of(y) + x0 - left, across);
       }
+    for (int y = y0; y <= y1; y++)
       for (int k = 0; k < planes; k++) {
-        float *plane = row + (size_t)k * across;
+        float *plane = row_of(y) + (size_t)k * across;
         std::fill(plane, plane - left, plane[-left]);
         std::fill(plane + W - left, plane + across, plane[W - 1 - left]);
       }
-      return row;
-    };
-    for (int y = band * BLOCK / 2; y < std::min(level.height, (band + 1) * BLOCK / 2); y++) {
+    for (int y = first; y < end; y++) {
       const float *rows[3];
       for (int i = 0; i < 2 + H % 2; i++) rows[i] = row_of(top + 2 * y + i);
       W % 2 ? farthest_of_rows<3>(rows, across, level.at(y, 0)) : farthest_of_rows<2>(rows, across, level.at(y, 0));
     }
   }
 
-  // Light, coc and weight, in planes that lie `pitch` apart, of the surfaces that n pixels of a row give to the pyramid: of two
-  // the farther one.
+  // Of n pixels of a row, in planes of light, coc and weight that lie `pitch` apart: what the pyramid takes in place of the image,
+  // where there are two surfaces the farther one.
   void pixels(int y, int x0, int n, bool bright, float least_limit, float *out, size_t pitch) const {
-    const size_t area = s_.area(), row = (size_t)y * job_.width;
-    const int C = C_, whole = y / BLOCK * s_.block_columns + x0 / BLOCK;
-    const bool inside = n == BLOCK;
-    float *coc = out + C * pitch, *weight = coc + pitch;
-    if (inside && !s_.has_block(whole)) {
-      for (int c = 0; c < C; c++) memcpy(out + c * pitch, s_.light + c * area + row + x0, BLOCK * sizeof(float));
-      memcpy(coc, s_.coc + row + x0, BLOCK * sizeof(float));
-      for (int i = 0; i < BLOCK; i++) weight[i] = 1.0f;
-    } else if (inside && !s_.valid) {
-      const Block b = s_.block(whole);
-      const int first = y % BLOCK * BLOCK;
-      const float *own_coc = s_.coc + row + x0, *other_coc = b.coc + first, *share = b.weight + first, *seen = b.seen + first;
+    const int C = C_, which = y / BLOCK * s_.block_columns + x0 / BLOCK, first = y % BLOCK * BLOCK;
+    if (s_.has_block(which)) {
+      const Block b = s_.block(which);
+      float *coc = out + C * pitch, *weight = coc + pitch;
       for (int x = 0; x < BLOCK; x += LANES) {
-        const vec its = load<vec>(other_coc + x), mine = load<vec>(own_coc + x), s = load<vec>(share + x);
-        const auto mixed = (s > all(MIXED)) & (its > mine);
+        const vec its = load<vec>(b.coc + first + x), mine = load<vec>(coc + x), share = load<vec>(b.weight + first + x);
+        const auto mixed = (share > all(MIXED)) & (its > mine);
         store(coc + x, mixed ? its : mine);
-        store(weight + x, mixed ? s : load<vec>(seen + x));
+        store(weight + x, mixed ? share : load<vec>(b.seen + first + x));
         for (int c = 0; c < C; c++)
           store(out + c * pitch + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x) : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
       }
-    } else {
-      for (int i = 0; i < n; i++) {
-        const int x = std::min(x0 + i, job_.width - 1), which = y / BLOCK * s_.block_columns + x / BLOCK;
-        const size_t at = row + x;
-        coc[i] = s_.coc[at];
-        weight[i] = 1.0f;
-        if (s_.has_block(which)) {
-          const int within = y % BLOCK * BLOCK + x % BLOCK;
-          const Block b = s_.block(which);
-          const bool mixed = b.weight[within] > MIXED && b.coc[within] > coc[i];
-          for (int c = 0; c < C; c++) out[c * pitch + i] = (mixed ? b.other : b.own)[c * BLOCK_PIXELS + within];
-          weight[i] = mixed ? b.weight[within] : b.seen[within];
-          if (mixed) coc[i] = b.coc[within];
-          if (s_.valid && !(s_.valid[at] > 0)) coc[i] = -NEVER;
-        } else {
-          for (int c = 0; c < C; c++) out[c * pitch + i] = s_.light[c * area + at];
-        }
-      }
+      for (int x = 0; s_.valid && x < n; x++)
+        if (!(s_.valid[(size_t)y * job_.width + x0 + x] > 0)) coc[x] = -NEVER;
     }
     if (!bright) return;
-    for (int i = 0; i < n; i++) {
-      float most = out[i];
-      for (int c = 1; c < C; c++) most = std::max(most, out[c * pitch + i]);
-      if (!(most > least_limit)) continue;
-      const float limit = threshold_at(job_, y, std::min(x0 + i, job_.width - 1));
-      if (most > limit)  // what is hidden beside a highlight is none
-        for (int c = 0; c < C; c++) out[c * pitch + i] *= limit / most;
+    for (int x = 0; x < n; x += LANES) {
+      vec peaks = load<vec>(out + x);
+      for (int c = 1; c < C; c++) peaks = most(peaks, load<vec>(out + c * pitch + x));
+      if (!any_of(peaks > all(least_limit))) continue;
+      for (int i = x; i < std::min(x + LANES, n); i++) {
+        const float peak = peaks[i - x], limit = peak > least_limit ? threshold_at(job_, y, x0 + i) : peak;
+        if (peak > limit)  // what is hidden beside a highlight is none
+          for (int c = 0; c < C; c++) out[c * pitch + i] *= limit / peak;
+      }
     }
   }
 

@@ -86,7 +86,9 @@ class Downsampling {
       std::fill(to_.row(1, row) + column, to_.row(1, row) + column + count, 1.0f);
       return count;
     }
-    if (count * s == std::max(s, CELL))
+    if (count * s == CELL && k >= 0)
+      s == 2 ? cell_means<2>(row, column, k) : s == 4 ? cell_means<4>(row, column, k) : cell_means<8>(row, column, k);
+    else if (count * s == std::max(s, CELL))
       s == 2   ? cell_sums<2>(row, column, pieces)
       : s == 4 ? cell_sums<4>(row, column, pieces)
       : s == 8 ? cell_sums<8>(row, column, pieces)
@@ -94,6 +96,42 @@ class Downsampling {
     else
       for (int i = 0; i < count; i++) block(row, column + i, true, pieces);
     return count;
+  }
+
+  // Blocks beside each other that fill a cell's width, where it shows one surface alone, between two nodes.
+  template <int S>
+  void cell_means(int row, int column, int k) {
+    constexpr int PARTS = CELL / LANES, COUNT = CELL / S;
+    const int y0 = row * S, x0 = column * S;
+    const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : s_.width;
+    const float *coc, *weight;
+    s_.row(0, y0, x0, light_.data(), coc, weight);
+    auto put = [&](int plane, const vec *sum) {  // means of S neighbours
+      float columns_of[CELL], *to = to_.row(plane, row) + column;
+      for (int p = 0; p < PARTS; p++) store(columns_of + p * LANES, sum[p] * each_);
+      for (int j = 0; j < COUNT; j++) {
+        to[j] = columns_of[j * S];
+        for (int x = 1; x < S; x++) to[j] += columns_of[j * S + x];
+      }
+    };
+    vec far[S][PARTS], one[PARTS], two[PARTS] = {};
+    for (int y = 0; y < S; y++)
+      for (int p = 0; p < PARTS; p++)
+        two[p] += far[y][p] = behind(job_.layers[k], index_.place(load<vec>(coc + y * s_.width + p * LANES)), over_);
+    std::fill(to_.row(0, row) + column, to_.row(0, row) + column + COUNT, (float)to_.stands_for[k]);
+    std::fill(to_.row(1, row) + column, to_.row(1, row) + column + COUNT, 1.0f);
+    put(2, two);
+    for (int c = 0; c < C_; c++) {
+      for (int p = 0; p < PARTS; p++) one[p] = two[p] = vec{};
+      for (int y = 0; y < S; y++)
+        for (int p = 0; p < PARTS; p++) {
+          const vec v = load<vec>(light_[c] + y * light_step + p * LANES);
+          one[p] += v;
+          two[p] += v * far[y][p];
+        }
+      put(3 + c, one);
+      put(3 + C_ + c, two);
+    }
   }
 
   // Blocks beside each other that fill a cell's width, or one that is wider: interval by interval, a row of pixels at once.
