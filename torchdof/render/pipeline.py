@@ -19,7 +19,8 @@ from .layer_weights import blur_axis
 from .matting import matte
 from .plan import Blur, Plan
 from .scatter import fold
-from .surfaces import Frame, Surface, framed, surfaces_of_image
+from .strands import strands_joined
+from .surfaces import Frame, Surface, framed, met_by_rays, surfaces_of_image
 
 __all__ = ["blur", "blur_attended", "blur_stack"]
 
@@ -153,17 +154,17 @@ def _render_item(
 
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
-    if behind_light is not None and behind_coc is not None:
-        surfaces = _before_background(surfaces[0], behind_light, behind_coc, (low, high), options)
+    shown = surfaces  # as rays meet them
+    if behind_light is not None and behind_coc is not None and limit is not None:
+        surfaces, shown = _before_background(surfaces[0], behind_light, behind_coc, (low, high), limit, options)
     elif options.occlusion and limit is not None and splatted:
         widest = max(2.0, *(abs(c) for c in plan.coc_px))
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
-        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels)
+        surfaces, shown, behind = surfaces_of_image(light, coc, weight, limit, levels)
 
     # the highlights of these, ray by ray; a known background is in nobody's way
     splats = None
     if limit is not None and splatted and plan.rays:
-        shown = surfaces if behind_light is None else surfaces[1::-1]
         # without occlusion only those that coarse layers would soften
         from_px = 0.0 if options.occlusion else crisp_px - 1.0
         # a known background says itself what is behind a mixed pixel
@@ -179,13 +180,17 @@ def _render_item(
 
 
 def _before_background(
-    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: tuple[float, float], options: Options
-) -> list[Surface]:
-    """Surfaces of an image in front of a known background, near to far, with coc within the layers' reach."""
+    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: tuple[float, float], limit: Tensor, options: Options
+) -> tuple[list[Surface], list[Surface]]:
+    """Surfaces of an image in front of a known background, near to far, with coc within the layers' reach.
+
+    And those that rays meet, the image's own first. The limit is the light from which on pixels are highlights'.
+    """
     light, coc, weight = surface
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*reach)
-    own, other, other_coc, other_weight = matte(light, coc, weight)
+    matted, joined = strands_joined(light, coc, limit, weight, matte(light, coc, weight))
+    own_light, other_light, other_coc, other_weight = matted
     # what shows past a nearer surface of a mixed pixel is the background's to tell
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:
@@ -194,8 +199,9 @@ def _before_background(
     behind_weight = apart + (1.0 - apart) * other_weight
     if valid is not None:
         behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
-    shown = [Surface(other, other_coc, other_weight), Surface(own, coc, own_weight)]
-    return [*shown, Surface(behind, torch.maximum(behind_coc, coc), behind_weight)]
+    own, other = Surface(own_light, coc, own_weight), Surface(other_light, other_coc, other_weight)
+    background = Surface(behind, torch.maximum(behind_coc, coc), behind_weight)
+    return [other, own, background], met_by_rays(own, other, joined)
 
 
 def _composite(
