@@ -1,10 +1,13 @@
 """Strands thinner than a pixel, of which depth shows dashes."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from torchdof import blur_by_coc
+from torchdof.render import strands
 from torchdof.render.highlights import threshold
 from torchdof.render.matting import Matted, matte
 from torchdof.render.strands import strands_joined
@@ -53,6 +56,33 @@ def test_no_light_is_lost_and_the_strand_covers_no_more_than_it_may() -> None:
     _, (own, other, _, weight) = joined(light, coc)
     torch.testing.assert_close((1.0 - weight) * own + weight * other, light)
     assert 0.3 < float(weight.max()) <= 0.6
+
+
+NUMBERS = ["_REACH", "_WIDTH", "_NARROW", "_LEVEL", "_SEEN", "_LEAST_COVERED", "_MOST_COVERED"]
+
+
+def joined_part() -> float:
+    """Mean part of pixels that is joined where three wires cross before a wall of waves."""
+    y, x = torch.meshgrid(torch.arange(40).double(), torch.arange(30).double(), indexing="ij")
+    light = WALL[:, None, None] * (1.0 + 0.1 * torch.sin(0.9 * x + 0.5 * y) + 0.01 * x)
+    coc = torch.full_like(x, FAR_PX)
+    for angle, across, width_px in ((0.17, 12.3, 0.3), (-0.5, 22.0, 0.5), (1.2, 26.0, 0.4)):
+        aside = ((x - across) * math.cos(angle) - (y - 16.0) * math.sin(angle)).abs()
+        cover = (0.5 * (width_px + 1.0) - aside).clamp(0.0, width_px)
+        light = light + cover * (WIRE[:, None, None] - light)
+        coc = torch.where(aside < 0.5 * width_px, 0.0, coc)
+    before, after = joined(light[None], coc[None, None])
+    return float((after.other_weight - before.other_weight).clamp_min(0.0).mean())
+
+
+def test_as_much_is_joined_as_recorded() -> None:
+    assert joined_part() == pytest.approx(7.094e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_twice_a_number_joins_something_else(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(strands, name, 2 * getattr(strands, name))
+    assert joined_part() != pytest.approx(7.094e-3, rel=2e-3)
 
 
 @pytest.mark.parametrize("what", ["thick", "no depth", "left out"])
