@@ -54,6 +54,8 @@ class Downsampling {
         // as far as the next block of the image, or around the frame
         const int block_of = std::clamp(floor_div(column * s, BLOCK), 0, s_.block_columns - 1);
         int end = block_of + 1 == s_.block_columns ? to_.columns + to_.margin : (block_of + 1) * BLOCK / s;
+        if (row >= 0 && row * s < job_.height && block_of + 2 < s_.block_columns)
+          s_.fetch_block(row * s / BLOCK * s_.block_columns + block_of + 2, row * s % BLOCK, s);
         if (!near[block_of]) {
           std::fill(to_.row(0, row) + column, to_.row(0, row) + end, FARTHEST);
           std::fill(to_.row(1, row) + column, to_.row(1, row) + end, 1.0f);
