@@ -64,6 +64,27 @@ inline float largest(vec v) {
   return m;
 }
 inline float smallest(vec v) { return -largest(-v); }
+inline vec size_of(vec v) { return (vec)((ivec)v & 0x7fffffff); }
+typedef float quad __attribute__((vector_size(16)));
+inline quad quad_of(vec v) {
+  quad parts[LANES / 4], total;
+  memcpy(parts, &v, sizeof(v));
+  total = parts[0];
+  for (int i = 1; i < LANES / 4; i++) total += parts[i];
+  return total;
+}
+inline float sum(vec v) {
+  const quad total = quad_of(v);
+  return (total[0] + total[1]) + (total[2] + total[3]);
+}
+// The sum of each of many vectors; goes up to three numbers beyond them.
+inline void sum(const vec *v, int count, float *out) {
+  for (int i = 0; i < count; i += 4) {
+    const quad none = {}, a = quad_of(v[i]), b = i + 1 < count ? quad_of(v[i + 1]) : none, c = i + 2 < count ? quad_of(v[i + 2]) : none, d = i + 3 < count ? quad_of(v[i + 3]) : none;
+    const quad ab = quad{a[0], b[0], a[1], b[1]} + quad{a[2], b[2], a[3], b[3]}, cd = quad{c[0], d[0], c[1], d[1]} + quad{c[2], d[2], c[3], d[3]};
+    store(out + i, quad{ab[0], ab[1], cd[0], cd[1]} + quad{ab[2], ab[3], cd[2], cd[3]});
+  }
+}
 // Of eight values those of the lanes' indices.
 inline vec pick(const float *values, ivec index) {
 #if defined(__AVX2__)

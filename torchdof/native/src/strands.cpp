@@ -37,25 +37,6 @@ struct Around {
   }
 };
 
-inline float sum(vec v) {
-  float total = 0;
-  for (int i = 0; i < LANES; i++) total += v[i];
-  return total;
-}
-// The same of each of LANES vectors.
-inline vec sums(const vec *of) {
-#if defined(__AVX2__)
-  auto pairs = [](vec a, vec b) { return (vec)__builtin_ia32_haddps256(a, b); };
-  const vec low = pairs(pairs(of[0], of[1]), pairs(of[2], of[3])), high = pairs(pairs(of[4], of[5]), pairs(of[6], of[7]));
-  return (vec)__builtin_ia32_vperm2f128_ps256(low, high, 0x20) + (vec)__builtin_ia32_vperm2f128_ps256(low, high, 0x31);
-#else
-  vec total = {};
-  for (int i = 0; i < LANES; i++)
-    for (int lane = 0; lane < LANES; lane++) total[i] += of[i][lane];
-  return total;
-#endif
-}
-
 // As many pixels as there are lanes, each beside a strand, and what the pixels around them sum to: of what is behind, how many,
 // their places and how much their light differs; then, of each colour, what differs, times place, and that of the strand.
 struct Batch {
@@ -176,7 +157,7 @@ void gather_light(const Job &job, const Inside &frame, Strands::Maps &w) {
       vec size = {};
       for (int c = 0; c < job.channels; c++) {
         const vec v = load<vec>(w.light.data() + ((size_t)c * NEAREST + i) * PITCH + j);
-        size = most(size, most(v, -v));
+        size = most(size, size_of(v));
       }
       store(w.size + i * PITCH + j, size);
     }
@@ -254,7 +235,11 @@ bool sum_around(const Job &job, const Around &taps, Strands::Maps &w, int y, int
 template <int CHANNELS>
 void split(Job &job, Batch &b, int which) {
   const int C = CHANNELS ? CHANNELS : job.channels;
-  auto sum_at = [&](int k) { return sums(b.around.data() + k * LANES); };
+  auto sum_at = [&](int k) {
+    float totals[LANES];
+    sum(b.around.data() + k * LANES, LANES, totals);
+    return load<vec>(totals);
+  };
   for (int n = b.count; n < LANES; n++) b.sureness[n] = 0, b.scale[n] = 1;
 
   // a plane through the light behind the strand, at each pixel; the strand's light, and how much of it is here
