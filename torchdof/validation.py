@@ -1,7 +1,7 @@
 """Tensors and numbers at the public boundary: taken as they are, or refused, saying what was expected and what came."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from . import native
 __all__ = [
     "WHOLE_NUMBERS",
     "background",
+    "broadcast_shapes",
     "coc_of_lens",
     "depth_edges",
     "ends",
@@ -96,6 +97,15 @@ def number(
     bounds = [f"> {low:g}"] * (low > -math.inf) + [f"< {high:g}"] * (high < math.inf)
     wanted = " ".join(["a number", *([f"of {unit}"] * bool(unit)), " and ".join(bounds)]).rstrip()
     raise ValueError(f"{name} must be {wanted}{' (inf allowed)' if infinite else ''}, got {show(value)}")
+
+
+def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
+    """What :func:`torch.broadcast_shapes` computes, which imports sympy, half a second, when it is first called.
+
+    Raises:
+        RuntimeError: If the shapes do not fit each other.
+    """
+    return torch.broadcast_tensors(*(torch.zeros(()).expand(tuple(shape)) for shape in shapes))[0].shape
 
 
 def floating(value: Any) -> bool:

@@ -6,9 +6,17 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import BlurTable
-from torchdof.render.downsampling import downsampled, shrink, upsampled
+from torchdof.optics.kernel_bank import bank_of
+from torchdof.render import downsampling
+from torchdof.render.downsampling import downsampled, upsampled
 
 TABLES = {"disc": BlurTable.disc(), "gaussian": BlurTable.gaussian()}
+
+
+def shrink(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
+    """The factor for a coc and a width in coarse pixels."""
+    coc, scales = (torch.tensor([value], dtype=torch.float64) for value in (coc_px * scale, scale))
+    return float(downsampling.shrink(bank_of(table), coc, width * scale, scales))
 
 
 def photograph(size: int = 256) -> Tensor:
@@ -58,7 +66,6 @@ def test_a_wide_gaussian_keeps_its_second_moment() -> None:
 @pytest.mark.parametrize("coc_px", [-3.0, 0.3, 11.0, 400.0])
 def test_a_size_is_a_share(coc_px: float) -> None:
     assert 0.5 <= shrink(TABLES["disc"], coc_px, 500.0, 2) <= 1.0
-    # each sign is computed by itself, and the order of float64 sums depends on where memory lies
     mirrored = shrink(TABLES["disc"], -coc_px, 500.0, 2)
     assert shrink(TABLES["disc"], coc_px, 500.0, 2) == pytest.approx(mirrored, rel=1e-12)
 

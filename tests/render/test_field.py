@@ -12,7 +12,8 @@ from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.io.transfer import encode
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
-from torchdof.optics.placed_kernels import layer_shares, own_kernels, placed
+from torchdof.optics.kernel_bank import bank_of
+from torchdof.optics.placed_kernels import layer_shares, placed
 from torchdof.reference.metrics import psnr
 from torchdof.render.field import BLOCK
 
@@ -127,7 +128,7 @@ def test_a_spot_lies_outwards_of_its_place_and_is_turned_with_it(y: float, x: fl
     per_mm = width / 36.0
     half_diagonal = 0.5 * math.hypot(width, 240) / per_mm
     shares = layer_shares(table, coc_px, 1, (240, width))
-    own = own_kernels(table, number(coc_px)[None], width)
+    own = bank_of(table).kernels(number(coc_px)[None], width)
     kernel = placed(own, [(shares, number(1.0))], number(y / half_diagonal)[None], number(x / half_diagonal)[None])[
         0, 0
     ]
@@ -153,7 +154,7 @@ def test_in_focus_a_field_leaves_a_point_a_point() -> None:
     table = lopsided()
     for coc_px in (0.0, 0.02):
         shares = layer_shares(table, coc_px, 1, (240, 360))
-        own = own_kernels(table, number(coc_px)[None], 360)
+        own = bank_of(table).kernels(number(coc_px)[None], 360)
         kernel = placed(own, [(shares, number(1.0))], number(0.4)[None], number(0.7)[None])[0, 0]
         assert float(kernel[len(kernel) // 2, len(kernel) // 2]) > 1.0 - 1e-9
 
@@ -166,7 +167,7 @@ def test_fold_scatters_each_pixel_with_the_kernel_of_its_own_place(colours: int)
     image[0, :, row, column] = torch.tensor([1.0, 2.0, 3.0])
     coc = torch.full((1, 1, height, width), coc_px, dtype=torch.float64)
     picture = blur_by_coc(image, coc, table=table, method="fold", occlusion=False, normalize=False)[0]
-    own = own_kernels(table, number(coc_px)[None], width)
+    own = bank_of(table).kernels(number(coc_px)[None], width)
     diagonal = 0.5 * math.hypot(height, width)
     y, x = (number((p + 0.5 - n / 2) / diagonal)[None] for p, n in ((row, height), (column, width)))
     kernel = placed(own, [(layer_shares(table, coc_px, 1, (height, width)), number(1.0))], y, x)[0]
@@ -221,7 +222,7 @@ def test_a_highlight_has_the_kernel_of_its_own_radius_and_place(table: BlurTable
     spot = (blur_by_coc(image, coc, table=table, tolerance=0) - dark)[0, 0] / 199.9
     half_diagonal = 0.5 * math.hypot(height, width)
     y, x = ((p + 0.5 - n / 2) / half_diagonal for p, n in ((row, height), (column, width)))
-    shares, own = layer_shares(table, coc_px, 1, (height, width)), own_kernels(table, number(coc_px)[None], width)
+    shares, own = layer_shares(table, coc_px, 1, (height, width)), bank_of(table).kernels(number(coc_px)[None], width)
     expected = placed(own, [(shares, number(1.0))], number(y)[None], number(x)[None])[0, 0]
     half = len(expected) // 2
     spot = spot[row - half : row + half + 1, column - half : column + half + 1]

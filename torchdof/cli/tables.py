@@ -12,7 +12,8 @@ from torch import Tensor
 from ..io.sheet import write_sheet
 from ..optics import table_file
 from ..optics.blur_table import BlurTable
-from ..optics.placed_kernels import layer_shares, own_kernels, placed
+from ..optics.kernel_bank import bank_of
+from ..optics.placed_kernels import layer_shares, placed
 from .arguments import ApertureImage, AsJson, Blades, Curvature, Rotation, Squeeze, Vignetting
 from .printed import json_line
 from .settings import load_aperture, load_table
@@ -122,7 +123,7 @@ def _kernels(table: BlurTable, place: float, size: int) -> Tensor:
     y, x = (torch.tensor([place * side / math.hypot(*frame)]) for side in frame)
     kernels = []
     for coc in _COC_PX:
-        own = own_kernels(table, torch.tensor([coc]), _WIDTH, window=size).float()
+        own = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=size // 2 + 1).float()
         shares = layer_shares(table, coc, 1, frame).to(own)
         kernel = placed(own, [(shares, own.new_ones(()))], y, x)[0]
         kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))

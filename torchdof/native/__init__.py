@@ -25,6 +25,8 @@ __all__ = [
     "convolve",
     "describe",
     "ends",
+    "kernels",
+    "plan",
     "render",
     "repair_edges",
     "use_instructions",
@@ -39,7 +41,7 @@ HALF_LARGEST = 64
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
-_REVISION = 4  # of ``src/api.h``
+_REVISION = 5  # of ``src/api.h``
 
 _Floats = ctypes.POINTER(ctypes.c_float)
 
@@ -70,6 +72,34 @@ class _Shares(ctypes.Structure):
         ("colours", ctypes.c_int32),
         ("rows", ctypes.c_int32),
         ("columns", ctypes.c_int32),
+    ]
+
+
+class KernelSpots(Protocol):
+    """What kernels are made from: :class:`torchdof.optics.kernel_bank.Spots`."""
+
+    templates: list[Tensor]
+    index: Tensor
+    part: Tensor
+    finer: Tensor
+    reach: Tensor
+    fade: Tensor
+    flipped: Tensor
+    half: Tensor
+
+
+class _Spots(ctypes.Structure):
+    """``torchdof_spots`` of ``src/api.h``."""
+
+    _fields_ = [  # noqa: RUF012
+        ("count", ctypes.c_int32),
+        ("colours", ctypes.c_int32),
+        ("templates", ctypes.POINTER(ctypes.c_void_p)),
+        ("cells", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("index", "part", "finer", "reach", "fade", "flipped", "half")),
+        ("squeeze", ctypes.c_double),
+        ("round", ctypes.c_int32),
+        ("even", ctypes.c_int32),
     ]
 
 
@@ -296,6 +326,62 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
     return out if changed.value else nearness
 
 
+def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
+    """Layers for a frame, and the tolerance they are for: what ``torchdof.render.plan.Plan.of_frame`` computes.
+
+    Args:
+        coc_px: Signed coc of the frame, ``[B, 1, H, W]``, float32, in pixels.
+        tolerance: What the picture is to keep.
+
+    Returns:
+        Places of the layers on the blur axis, near to far, and the tolerance, smaller where blurs are as large as the
+        frame.
+
+    Raises:
+        MemoryError: If there is too little.
+    """
+    coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(tolerance), ctypes.c_int32(), 256
+    while True:
+        nodes = (ctypes.c_double * capacity)()
+        size = (coc_px.shape[0], *coc_px.shape[-2:])
+        kept.value = tolerance
+        arguments = (*size, ctypes.byref(kept), torch.get_num_threads(), nodes, capacity, ctypes.byref(count))
+        _check(_engine().torchdof_plan(coc_px.data_ptr(), *arguments))
+        if count.value <= capacity:
+            return tuple(nodes[: count.value]), kept.value
+        capacity = count.value
+
+
+def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool) -> list[Tensor]:
+    """Kernels of a lens, on as many threads as PyTorch uses.
+
+    Args:
+        spots: What they are made from.
+        squeeze: Height of the blur over its width.
+        is_round: Whether they are symmetric about both axes.
+        is_even: Whether they are even light within their radius.
+
+    Returns:
+        ``[C, 2 half + 1, 2 half + 1]`` of each, float32, non-negative, summing to 1 where nothing is cut off.
+
+    Raises:
+        MemoryError: If there is too little.
+    """
+    count, colours = spots.reach.shape
+    sides = [2 * half + 1 for half in spots.half.tolist()]
+    areas = [colours * side * side for side in sides]
+    memory = torch.empty(sum(areas), dtype=torch.float32, device="cpu")
+    made = [part.view(colours, side, side) for part, side in zip(memory.split(areas), sides, strict=True)]
+    cells = torch.tensor([t.shape[-1] // 2 - 1 for t in spots.templates] or [0], dtype=torch.int32, device="cpu")
+    whole = [spots.index, *(t.to(torch.int32) for t in (spots.flipped, spots.half))]
+    numbers = [t.contiguous() for t in (spots.part, spots.finer, spots.reach, spots.fade)]
+    index, flipped, half = (t.contiguous() for t in whole)
+    pointers = [t.data_ptr() for t in (cells, index, *numbers, flipped, half)]
+    scene = _Spots(count, colours, _pointers(spots.templates), *pointers, squeeze, is_round, is_even)
+    _check(_engine().torchdof_kernels(ctypes.byref(scene), torch.get_num_threads(), _pointers(made)))
+    return made
+
+
 def ends(values: Tensor) -> tuple[float, float]:
     """Least and largest of some numbers, float32, on as many threads as PyTorch uses; NaN if one of them is NaN.
 
@@ -429,6 +515,9 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_convolve.argtypes = [pointer, ctypes.c_int32, ctypes.c_int32, pointer, ctypes.c_int32, pointer]
     library.torchdof_convolve.restype = None
     library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map), ctypes.POINTER(ctypes.c_int32)]
+    whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
+    library.torchdof_plan.argtypes = [pointer, *[whole] * 3, numbers, whole, numbers, whole, ctypes.POINTER(whole)]
+    library.torchdof_kernels.argtypes = [ctypes.POINTER(_Spots), ctypes.c_int32, ctypes.POINTER(pointer)]
     library.torchdof_ends.argtypes = [pointer, ctypes.c_int64, ctypes.c_int32, _Floats, _Floats]
     library.torchdof_instructions.restype = ctypes.c_char_p
     library.torchdof_use.argtypes = [ctypes.c_char_p]

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import is_differentiated, real_tensor, show, whole
+from ..validation import broadcast_shapes, is_differentiated, real_tensor, show, whole
 
 __all__ = ["Aperture"]
 
@@ -139,7 +139,7 @@ class Aperture:
             step_y: Height of the cells ``[...]``; the circle around the opening has radius 1.
             step_x: Their width ``[...]``.
         """
-        batch = torch.broadcast_shapes(step_y.shape, step_x.shape)
+        batch = broadcast_shapes(step_y.shape, step_x.shape)
         high, wide = (step.to(torch.float64).expand(batch).reshape(-1) for step in (step_y, step_x))
         count = 2 * half + 1
         if self.mask is not None:

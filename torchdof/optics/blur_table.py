@@ -126,7 +126,7 @@ class BlurTable:
         for sign in (-1, 1):
             self._sides[sign] = self._sides[sign] or self._sides[-sign]
         in_focus = [self._side_params(sign, torch.zeros(1)) for sign in (-1, 1)]
-        self._sharp_in_focus = not any(bool(p[name].any()) for p in in_focus for name in psf.LENGTHS & p.keys())
+        self.is_sharp_in_focus = not any(bool(p[name].any()) for p in in_focus for name in psf.LENGTHS & p.keys())
         self._try_kernels()
 
     @classmethod
@@ -338,15 +338,40 @@ class BlurTable:
         if not self.is_round:
             behind = (coc_px.detach() >= 0).to(kernels.device)[:, None, None, None]
             kernels = torch.where(behind, kernels, kernels.flip(-2, -1))
-        if self._sharp_in_focus:
+        if self.is_sharp_in_focus:
             return kernels
-        in_focus = psf.pixel_kernels(self.family, self.params(coc_px.new_zeros(()), width), aperture=self.aperture)
-        moved = 1.0 - in_focus.detach()[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]  # [1 or C]
-        times = _FADE_IN / moved.clamp_min(torch.finfo(torch.float64).tiny)
-        fade = (coc_px.to(torch.float64).square()[:, None] * times).clamp(max=1.0)[:, :, None, None]
+        fade = self.fade_in(coc_px.to(torch.float64)[:, None], self.moved_in_focus(width))[:, :, None, None]
         centre = torch.zeros_like(kernels)
         centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
         return torch.lerp(centre, kernels, fade)
+
+    def moved_in_focus(self, width: float) -> Tensor:
+        """Share ``[channels]`` of its light that the table's kernel in focus moves to other pixels."""
+        in_focus = psf.pixel_kernels(self.family, self.params(torch.zeros(()), width), aperture=self.aperture).detach()
+        return 1.0 - in_focus[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]
+
+    def fade_in(self, coc_px: Tensor, moved: Tensor) -> Tensor:
+        """Share of a kernel, the rest being a single pixel, of a table that has a blur of its own in focus.
+
+        Args:
+            coc_px: Signed coc in pixels, ``[n, 1]``.
+            moved: As :meth:`moved_in_focus` gives it, ``[channels]`` or ``[n, channels]``.
+
+        Returns:
+            ``[n, channels]``, 0 in focus to 1.
+        """
+        return (coc_px.square() * (_FADE_IN / moved.clamp_min(torch.finfo(torch.float64).tiny))).clamp(max=1.0)
+
+    def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Nodes of one side of focus, that in front of it for a sign of -1, by growing ``|coc|`` from 0.
+
+        Returns:
+            Unsigned coc ``[N]`` and parameters ``[channels, N]``, in the table's unit.
+        """
+        side = self._sides[sign]
+        if side is None:
+            raise AssertionError("a table has nodes on at least one side")
+        return side
 
     def reach_px(self, coc_px: float, width: float) -> float:
         """Radius in pixels that holds the kernels at ``+-coc_px``."""
@@ -589,10 +614,8 @@ class BlurTable:
 
     def _side_params(self, sign: int, distance: Tensor) -> dict[str, Tensor]:
         """Parameters at unsigned coc ``[...]``, in the table's unit, on one side of focus: ``[channels, ...]``."""
-        side = self._sides[sign]
-        if side is None:
-            raise AssertionError("a table has nodes on at least one side")
-        distances, nodes = side[0].to(distance.device), {k: v.to(distance.device) for k, v in side[1].items()}
+        distances, nodes = self.side_nodes(sign)
+        distances, nodes = distances.to(distance.device), {k: v.to(distance.device) for k, v in nodes.items()}
         upper = torch.searchsorted(distances, distance.detach().contiguous()).clamp(1, len(distances) - 1)
         lower = upper - 1
         fraction = ((distance - distances[lower]) / (distances[upper] - distances[lower])).clamp(max=1.0)

@@ -23,9 +23,10 @@ from torch import Tensor
 
 from .blur_table import BlurTable
 from .field import deviations
+from .kernel_bank import SPOT_MARGIN_PX
 from .kernel_cache import KernelCache
 
-__all__ = ["DISTANCES", "Shares", "layer_shares", "own_kernels", "placed", "placed_between", "ray_shares"]
+__all__ = ["DISTANCES", "Shares", "layer_shares", "placed", "placed_between", "ray_shares"]
 
 DISTANCES = 17
 """Distances from the middle of the frame to its corner at which shares are told."""
@@ -33,30 +34,12 @@ DISTANCES = 17
 _FINE = 4.0  # samples a pixel
 _MOST = 64  # samples on each side of the origin
 _LEAST_SEEN = 0.5  # px around a sample
-_MARGIN = 1.0  # px around a spot: none of its light is at the border of the samples
 _ASIDE = 1e-6  # half diagonals: the middle of the frame has an azimuth
 _SMALLEST = 1e-6  # px of blur, that a spot has a size
 _LEAST = 1e-6  # of a kernel; where less passes it stays whole
 _LEAST_SIZE = 0.5  # of a spot, which is made smaller by what pixels add to it
 _RAY_STEP = 1.09  # between radii of highlights for which shares are told
 _shares = KernelCache(128 * 2**20)
-
-
-def own_kernels(table: BlurTable, coc_px: Tensor, width: float, window: int | None = None) -> Tensor:
-    """Kernels ``[n, 1 or C, k, k]`` that shares are taken of: a table's own, or even light as far as spots reach.
-
-    Arguments are those of :meth:`torchdof.BlurTable.kernels`, which lenses that are alike everywhere have.
-    """
-    if table.field is None:
-        return table.kernels(coc_px, width, window=window)
-    per_unit = table.px_per_unit(width)
-    reach = table.field.reach(coc_px.detach() / per_unit) * (per_unit * coc_px.detach().abs().clamp(max=1.0))
-    reach = torch.where(coc_px.detach() == 0, 0.0, reach.to(torch.float64) + math.sqrt(2.0) * _MARGIN)
-    half = math.floor(float(reach.max()))
-    half = half if window is None else min(half, window // 2)
-    step = torch.arange(-half, half + 1, dtype=torch.float64, device=coc_px.device)
-    disc = (torch.hypot(step[:, None], step) <= reach[:, None, None]).to(torch.float64)
-    return (disc / disc.sum((-2, -1), keepdim=True)).unsqueeze(1).expand(-1, table.channels, -1, -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +115,7 @@ def _made(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int]) ->
     spread = deviations(boxes, light).square()
     smaller = (1.0 - added / spread.clamp_min(1e-12)).clamp_min(_LEAST_SIZE**2).sqrt()
     boxes = torch.cat([boxes[:, :1], boxes[:, 1:] * smaller], -1)
-    around = boxes + torch.tensor([0.0, _MARGIN, _MARGIN], dtype=torch.float64)
+    around = boxes + torch.tensor([0.0, SPOT_MARGIN_PX, SPOT_MARGIN_PX], dtype=torch.float64)
     rows, columns = (min(_MOST, math.ceil(_FINE * float(side))) for side in around[:, 1:].amax(0))
     along = torch.linspace(-1.0, 1.0, 2 * rows + 1, dtype=torch.float64) * around[:, 1:2] + around[:, :1]
     across = torch.linspace(0.0, 1.0, columns + 1, dtype=torch.float64) * around[:, 2:]

@@ -13,7 +13,7 @@ Gaussian of 1.3 px gives a kernel of standard deviation 1.3 px. Where phi's lobe
 neighbours make up for it (:func:`_settled`). Discs then come to within 0.3 dB of the non-negative kernel of least
 error, and for a length that goes to 0 the kernel goes to a single pixel with the length's square.
 
-The integral is a sum over square cells, 16 from the centre to the end of a small PSF and a pixel wide in a large one.
+The integral is a sum over square cells, 16 from the centre to the end of a small PSF and a pixel wide in a large one;
 Every family is a profile ``f(r)`` over the distance ``r`` from the centre; nothing but its cells knows that it is
 round. A cell's integral is exact for ``gaussian`` and ``disc``. For the others it is taken ring by ring: a cell is cut
 by circles into thin slices, the area of each slice is exact (circle against square), and within a slice ``f`` is
@@ -40,7 +40,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import WHOLE_NUMBERS, real_tensor, show
+from ..validation import WHOLE_NUMBERS, broadcast_shapes, real_tensor, show
 from .aperture import Aperture
 from .kernel_cache import KernelCache
 
@@ -49,12 +49,15 @@ __all__ = [
     "disc",
     "gaussian",
     "opening_radius",
+    "pixel_kernels",
     "profile",
     "radial",
-    "pixel_kernels",
+    "reach",
     "ring",
+    "sampled",
     "softm",
     "support",
+    "template",
 ]
 
 FAMILIES: dict[str, tuple[str, ...]] = {
@@ -212,15 +215,15 @@ def pixel_kernels(
     part = whole if window is None else min(whole, width_of(window, reach_px) // 2)
     half = whole if whole <= _ALWAYS_WHOLE else part
     lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in checked.items()}
-    reach = _reach(family, lengths, aperture)
-    high = wide = (reach / _CELLS).clamp(max=1.0)  # of a cell, in pixels
+    end = reach(family, lengths, aperture)
+    high = wide = (end / _CELLS).clamp(max=1.0)  # of a cell, in pixels
     if aperture is not None:
-        wide = (reach / aperture.squeeze / _CELLS).clamp(max=1.0)
+        wide = (end / aperture.squeeze / _CELLS).clamp(max=1.0)
     in_cells = {k: v / high if k in LENGTHS else v for k, v in lengths.items()}
     aspect = None if aperture is None else wide * aperture.squeeze / high  # of a cell, seen from a round lens
     farthest = math.ceil(min(_support(family, lengths, aperture), half + _AROUND))  # px, which are cells if many
     cells = _sharpened(_cells(family, in_cells, max(_CELLS, farthest) + 1, whole, aperture, aspect))
-    kernel = _settled(_interpolated(cells, high, wide, half + _AROUND))[..., _AROUND:-_AROUND, _AROUND:-_AROUND]
+    kernel = sampled(cells, high, wide, half)
     if half == whole:
         total = kernel.sum((-2, -1), keepdim=True)
     else:
@@ -230,6 +233,38 @@ def pixel_kernels(
     # too small to hold any light in float64, or all of it beyond size: a single pixel
     kernel = torch.where(total > 0, kernel / torch.where(total > 0, total, 1.0), centre)
     return kernel[..., half - part : half + part + 1, half - part : half + part + 1]
+
+
+def template(family: str, params: Mapping[str, Tensor], cells: int, aperture: Aperture | None = None) -> Tensor:
+    """Light of the cells of a PSF that is so many cells large from its centre to its end, whatever its size in pixels.
+
+    It is without the blur of being integrals, and what :func:`sampled` makes kernels of.
+
+    Args:
+        family: A key of :data:`FAMILIES`.
+        params: Checked parameters by name, ``[C]`` (``values``: ``[C, P]``), in any unit, float64.
+        cells: Number of cells from the centre to the end.
+        aperture: The opening that the profile is multiplied by; None is a round one.
+
+    Returns:
+        ``[C, 2 cells + 3, 2 cells + 3]``, float64, but for a factor.
+    """
+    lengths = {k: v.clamp_min(_SMALLEST) if k in ("sigma", "radius") else v for k, v in params.items()}
+    cell = reach(family, lengths, aperture) / cells
+    in_cells = {k: v / cell if k in LENGTHS else v for k, v in lengths.items()}
+    return _sharpened(_cells(family, in_cells, cells + 1, cells, aperture))
+
+
+def sampled(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tensor:
+    """Kernels of PSFs from the light of their cells, but for a factor: ``[..., 2 half + 1, 2 half + 1]``.
+
+    Args:
+        cells: Light of square cells around the centre, ``[..., n, n]``.
+        high: Height of a cell in pixels, ``[...]``.
+        wide: Its width.
+        half: Pixels on each side of the centre.
+    """
+    return _settled(_interpolated(cells, high, wide, half + _AROUND))[..., _AROUND:-_AROUND, _AROUND:-_AROUND]
 
 
 def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
@@ -260,7 +295,7 @@ def profile(family: str, r: Tensor, params: Mapping[str, Number]) -> Tensor:
     values, radius = checked["values"], checked["radius"]
     place = (r / radius).clamp(max=1.0) * (values.shape[-1] - 1)
     low = place.floor().long().clamp(max=values.shape[-1] - 2)
-    batch = torch.broadcast_shapes(values.shape[:-1], low.shape[:-1])
+    batch = broadcast_shapes(values.shape[:-1], low.shape[:-1])
     values, low = values.expand(*batch, -1), low.expand(*batch, -1)
     mixed = torch.lerp(values.gather(-1, low), values.gather(-1, low + 1), place - low)
     return torch.where(r <= radius, mixed, 0.0)
@@ -272,8 +307,8 @@ def support(family: str, params: Mapping[str, Number], aperture: Aperture | None
 
 
 def _support(family: str, checked: Mapping[str, Tensor], aperture: Aperture | None) -> float:
-    reach = float(_reach(family, checked, aperture).detach().max())
-    return reach if aperture is None else reach * aperture.widest
+    farthest = float(reach(family, checked, aperture).detach().max())
+    return farthest if aperture is None else farthest * aperture.widest
 
 
 def width_of(size: int | None, reach_px: float) -> int:
@@ -315,7 +350,7 @@ def _checked(family: str, params: Mapping[str, Number]) -> dict[str, Tensor]:
         raise ValueError(f"values must be [..., P] with P >= 2, got {list(checked['values'].shape)}")
     shapes = {k: tuple(v.shape[:-1] if k == "values" else v.shape) for k, v in checked.items()}
     try:
-        torch.broadcast_shapes(*shapes.values())
+        broadcast_shapes(*shapes.values())
     except RuntimeError:
         listed = ", ".join(f"{k} {list(v)}" for k, v in shapes.items())
         raise ValueError(f"parameters of {family} must broadcast against each other, got {listed}") from None
@@ -337,7 +372,7 @@ def _parameter(name: str, value: Number, device: torch.device) -> Tensor:
     return torch.tensor(value, dtype=torch.float64, device=device)
 
 
-def _reach(family: str, params: Mapping[str, Tensor], aperture: Aperture | None = None) -> Tensor:
+def reach(family: str, params: Mapping[str, Tensor], aperture: Aperture | None = None) -> Tensor:
     """Radius beyond which a profile holds next to no light, in the unit of its lengths, without squeeze: ``[...]``."""
     if aperture is not None and not aperture.is_round:
         return opening_radius(family, params)
@@ -385,7 +420,7 @@ def _cells(
     fine = count * half + count // 2
     in_parts = {k: v * count if k in LENGTHS else v for k, v in lengths.items()}
     light = _round_cells(family, in_parts, fine, slices // count, aspect)
-    lit = _round_cells("disc", {"radius": _reach(family, in_parts)}, fine, slices, aspect)  # where the profile has any
+    lit = _round_cells("disc", {"radius": reach(family, in_parts)}, fine, slices, aspect)  # where the profile has any
     share = aperture.shares(fine, 1.0 / (count * radius), wide / (count * radius))
     parts = torch.where(lit > 0, light / torch.where(lit > 0, lit, 1.0), 0.0) * share
     return parts.unflatten(-1, (-1, count)).unflatten(-3, (-1, count)).mean((-3, -1))
@@ -416,20 +451,34 @@ def _interpolated(cells: Tensor, high: Tensor, wide: Tensor, half: int) -> Tenso
     """Integrals of a PSF with the interpolator of each pixel: ``[..., 2 half + 1, 2 half + 1]``.
 
     The PSF is given in cells ``[..., n, n]`` of so many pixels ``[...]``. A pixel is at most twice what linear
-    interpolation would give it, which leaves out the interpolator's ripples where the PSF has no light.
+    interpolation would give it, which leaves out the interpolator's ripples where the PSF has no light. Cells larger
+    than a pixel are interpolated linearly.
     """
     n = cells.shape[-1] // 2
     if bool((high == 1.0).all() and (wide == 1.0).all()):  # an interpolator is 0 at other pixels
         return functional.pad(cells, (half - n,) * 4)
     pixel = torch.arange(-half, half + 1, dtype=torch.float64, device=cells.device)[:, None]
+    place = torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
     splines, lines = [], []
-    for cell in (high,) if wide is high else (high, wide):
-        place = cell[..., None, None] * torch.arange(-n, n + 1, dtype=torch.float64, device=cells.device)
-        away = (pixel - place).abs()  # [..., pixels, cells]
-        splines.append(_cardinal_spline(away))
-        lines.append((1.0 - away).clamp_min(0.0))
+    for size in (high,) if wide is high else (high, wide):
+        cell = size[..., None, None]
+        away = (pixel - cell * place).abs()  # [..., pixels, cells]
+        line = (1.0 - away / cell.clamp_min(1.0)).clamp_min(0.0)
+        lines.append(line)
+        splines.append(torch.where(cell > 1.0, line, _cardinal_spline(away) / _ripple(pixel, cell)))
     at_most = 2.0 * (lines[0] @ cells @ lines[-1].transpose(-2, -1)).clamp_min(0.0)
     return torch.minimum(splines[0] @ cells @ splines[-1].transpose(-2, -1), at_most)
+
+
+def _ripple(pixel: Tensor, cell: Tensor) -> Tensor:
+    """Sum of the interpolator of each pixel ``[pixels, 1]`` over cells of a size ``[..., 1, 1]``, times the size.
+
+    It is 1, and what the spectrum of the interpolator has at one cycle a cell: cells are samples of it.
+    """
+    cycles = 1.0 / cell.clamp(1.0 / 16.0, 1.0)  # a pixel; in smaller cells there is no ripple
+    power = torch.sinc(cycles) ** 4
+    spectrum = 3.0 * power / (2.0 + torch.cos(2.0 * math.pi * cycles))
+    return 1.0 + 2.0 * spectrum * torch.cos(2.0 * math.pi * cycles * pixel)
 
 
 def _cardinal_spline(t: Tensor) -> Tensor:
@@ -532,7 +581,7 @@ def _mass(
 
     That of a shaped one is summed over coarser cells.
     """
-    side = torch.full_like(_reach(family, lengths), half + 0.5)
+    side = torch.full_like(reach(family, lengths), half + 0.5)
     if aperture is not None and not aperture.is_round:
         pixels = (half + 0.5) / (_MASS_CELLS + 0.5)  # of a coarser cell
         coarse = {k: v / pixels if k in LENGTHS else v for k, v in lengths.items()}
@@ -543,9 +592,9 @@ def _mass(
         return 4.0 * torch.erf(side / root) * torch.erf(across / root)
     if family == "disc":
         return 4.0 * _corner_area(across, side, lengths["radius"])
-    reach = _reach(family, lengths)
-    share = torch.linspace(0.0, 1.0, _RINGS + 1, dtype=torch.float64, device=reach.device)
-    r = torch.minimum(2.0 * reach, torch.hypot(side, across)).detach()[..., None, None] * share  # [..., 1, rings]
+    end = reach(family, lengths)
+    share = torch.linspace(0.0, 1.0, _RINGS + 1, dtype=torch.float64, device=end.device)
+    r = torch.minimum(2.0 * end, torch.hypot(side, across)).detach()[..., None, None] * share  # [..., 1, rings]
     area = 4.0 * _corner_area(across[..., None, None], side[..., None, None], r).diff(dim=-1)
     return (_slice_means(family, lengths, r[..., :-1], r[..., 1:]) * area).sum((-2, -1))
 
@@ -580,7 +629,7 @@ def _table_integral(r: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     whole = torch.cat(
         [torch.zeros_like(values[..., :1]), torch.cumsum((values[..., 1:] + values[..., :-1]) / 2, -1)], -1
     )
-    batch = torch.broadcast_shapes(values.shape[:-1], low.shape[:-2])
+    batch = broadcast_shapes(values.shape[:-1], low.shape[:-2])
     flat = low.expand(*batch, *low.shape[-2:]).flatten(-2)
     start, left, right = (
         v.expand(*batch, -1).gather(-1, i).unflatten(-1, low.shape[-2:])

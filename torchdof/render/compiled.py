@@ -9,17 +9,14 @@ from torch import Tensor
 from .. import native
 from ..optics.aperture import Aperture
 from ..optics.blur_table import BlurTable
-from ..optics.kernel_cache import KernelCache
+from ..optics.kernel_bank import Spots, bank_of
 from ..optics.placed_kernels import Shares, ray_shares
 from ..options import Options
 from ..validation import is_in_memory, is_traced
 from . import headroom
-from .plan import KERNELS_PER_PX, Blur, Plan, kernels_for
+from .plan import KERNELS_PER_PX, Plan, layer_spots, longest_px
 
 __all__ = ["picture"]
-
-_AT_ONCE = 64  # kernels of highlights computed together
-_kernels = KernelCache(128 * 2**20)
 
 
 def picture(
@@ -44,10 +41,12 @@ def picture(
     if options.method != "layered" or is_traced() or not native.chosen() or not all(map(_is_plain, given)):
         return None
     height, width = int(light.shape[-2]), int(light.shape[-1])
-    blurs = plan.blurs(options.table, (height, width), torch.float32, torch.device("cpu"), coarse=True)
-    if max(blur.half for blur in blurs) > native.HALF_LARGEST:
+    lens_width, scales = plan.layer_sizes(options.table, (height, width), coarse=True)
+    spots = layer_spots(options.table, plan.coc_px, lens_width, scales, longest_px((height, width), scales))
+    if int(spots.half.max()) > native.HALF_LARGEST:
         return None
-    render = functools.partial(_render, plan, options, blurs)
+    layers = list(zip(_kernels(options.table, spots), scales, strict=True))
+    render = functools.partial(_render, plan, options, layers)
     if cover is not None:
         low, high = plan.coc_px[0], plan.coc_px[-1]
         coc = coc.clamp(low, high)
@@ -72,7 +71,7 @@ def _is_plain(values: Tensor) -> bool:
 def _render(
     plan: Plan,
     options: Options,
-    blurs: Sequence[Blur],
+    layers: Sequence[tuple[Tensor, int]],
     surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]],
     kind: native.Kind,
 ) -> Tensor:
@@ -84,14 +83,14 @@ def _render(
         native.render,
         kind=kind,
         nodes=plan.nodes,
-        layers=[(blur.kernel, blur.scale) for blur in blurs],
+        layers=layers,
         psfs=functools.partial(_psfs, options.table, int(width), int(max(height, width))),
         occlusion=options.occlusion,
         normalize=options.normalize,
         masked=kind != "stack" and not options.check,
         highlights=plan.rays,
         crisp_px=plan.crisp_px,
-        shares=[blur.shares.to(like) for blur in blurs if blur.shares is not None],
+        shares=plan.shares(options.table, [scale for _, scale in layers], (int(height), int(width)), like),
         ray_shares=functools.partial(_ray_shares, options.table, (int(height), int(width))),
         squeeze=float(aperture.squeeze),
     )
@@ -110,18 +109,11 @@ def _ray_shares(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -
 
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:
-    """Kernels ``[1 or C, k, k]`` of highlights whose coc is so many steps, each as small as it can be."""
-    lens = table.fingerprint()
+    """Kernels ``[1 or C, k, k]`` of highlights whose coc is so many steps."""
+    coc_px = torch.tensor(steps, dtype=torch.float64) / KERNELS_PER_PX
+    return _kernels(table, bank_of(table).spots(coc_px, width, longest=longest))
 
-    def made(keys: Sequence[tuple[str, int, int, int]]) -> list[Tensor]:
-        trimmed = []
-        for start in range(0, len(keys), _AT_ONCE):
-            coc_px = torch.tensor([step for _, step, _, _ in keys[start : start + _AT_ONCE]]) / KERNELS_PER_PX
-            for kernel in kernels_for(table, coc_px, width, longest).float():
-                half = kernel.shape[-1] // 2
-                rows = kernel.sum((0, 2)).nonzero()[:, 0]  # kernels are not negative
-                rim = min(int(rows[0]), 2 * half - int(rows[-1])) if len(rows) else half
-                trimmed.append(kernel[:, rim : 2 * half + 1 - rim, rim : 2 * half + 1 - rim].clone())
-        return trimmed
 
-    return _kernels.get_all([(lens, step, width, longest) for step in steps], made)
+def _kernels(table: BlurTable, spots: Spots) -> list[Tensor]:
+    bank = bank_of(table)
+    return native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)

@@ -1,9 +1,15 @@
 """Layers at a coarser resolution: the mean of blocks going down, linear interpolation coming up, and a smaller kernel.
 
-A layer at every ``s``-th pixel is averaged over blocks of ``s x s`` pixels, convolved, and interpolated linearly. For a
-Gaussian all three together have the width of the kernel that is meant if their second moments sum to it. For a disc,
-whose edge is what one sees, that leaves out too much. So the size is the one whose chain differs least from the kernel
-itself, by expectation over images whose power falls with the square of the frequency, as that of photographs does.
+A layer at every ``s``-th pixel is averaged over blocks of ``s x s`` pixels, convolved, and interpolated linearly. This
+adds ``v = 1/4 - 1/(12 s^2)`` to the variance of its kernel, in squares of its pixels. So a kernel of variance ``V`` is
+made smaller, by the factor
+
+    ``sqrt(1 - k v / V)``.
+
+For a Gaussian ``k`` is 1: second moments sum. A disc, whose edge is what one sees, would lose too much of its size by
+that. The best factor is that of the chain that differs least from the kernel itself, by expectation over images whose
+power falls with the square of the frequency, as that of photographs does. Over all radii and resolutions in use it is
+the one of a constant k to within 0.2 % of the radius (1/2 for a disc), which :func:`_correction` finds once for a lens.
 
 Reference:
     Field, "Relations between the statistics of natural images and the response properties of cortical cells", Journal
@@ -16,18 +22,15 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..optics.blur_table import BlurTable
-from ..optics.kernel_cache import KernelCache
+from ..optics.kernel_bank import KernelBank
 
 __all__ = ["downsampled", "shrink", "upsampled"]
 
-_PERIOD = 64  # coarse pixels of the period over which kernels are compared
-_LARGEST_PX = 10.0  # in coarse pixels; beyond, second moments do
-_STEP_PX = 0.25  # coarse pixels between radii that are fitted
-_CANDIDATES = 9
 _LEAST = 0.5  # a smaller kernel has nothing left to give
-_MOMENT_REACH = 64.0  # px; second moments of kernels that large are those of the continuous profile
-_factors = KernelCache(2**20)
+_CANDIDATES = 9
+_SCALE = 4  # at which the correction is found,
+_RADIUS_PX = 5.0  # for a coc of so many coarse pixels, or what reaches as far as the period allows
+_PERIOD = 32  # coarse pixels over which kernels are compared
 
 
 def downsampled(values: Tensor, scale: int) -> Tensor:
@@ -40,67 +43,65 @@ def upsampled(values: Tensor, scale: int) -> Tensor:
     return functional.interpolate(values, scale_factor=float(scale), mode="bilinear", align_corners=False)
 
 
-def shrink(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
-    """Size of a kernel that is used at every ``scale``-th pixel, as a share of the size that it stands for.
+def shrink(bank: KernelBank, coc_px: Tensor, width: float, scale: Tensor) -> Tensor:
+    """Size of kernels that are used at every ``scale``-th pixel, as a share of the size that they stand for.
 
-    It is a factor for the coc, at most 1. The coc, signed, and the width of the image are in coarse pixels; ``scale``
-    is a power of two, from 2.
+    Args:
+        bank: Of the lens.
+        coc_px: Signed coc ``[n]``, in pixels of the image, float64.
+        width: Width of the image in pixels.
+        scale: Powers of two ``[n]``, float64.
+
+    Returns:
+        Factors for the coc, ``[n]``: 1 where the scale is 1, else from 1/2 to 1.
     """
-    if abs(coc_px) > _LARGEST_PX or table.reach_px(coc_px, width) >= _PERIOD / 2 - 1:
-        return _by_moments(table, coc_px, width, scale)
-    step = math.copysign(round(abs(coc_px) / _STEP_PX) * _STEP_PX, coc_px)
-    return _factors.get((table.fingerprint(), step, width, scale), lambda: _fitted(table, step, width, scale))
+    if bank.is_even or not bool((scale > 1).any()):  # spots of a field are made smaller by themselves
+        return torch.ones_like(coc_px)
+    corrections = {sign: bank.kept(sign, _correction) for sign in {math.copysign(1.0, c) for c in coc_px.tolist()}}
+    correction = torch.tensor([corrections[math.copysign(1.0, c)] for c in coc_px.tolist()], dtype=torch.float64)
+    others = torch.where(scale > 1, 1 / 4 - 1 / (12 * scale**2), 0.0)
+    variance = bank.variance_px(coc_px, width, scale)
+    return (1.0 - correction * others / variance.clamp_min(1e-12)).clamp_min(_LEAST**2).sqrt()
 
 
 @torch.inference_mode()
-def _fitted(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
-    """The factor whose chain differs least from the kernel: the lowest point of a parabola through candidates."""
-    frequency = 2 * math.pi * torch.fft.fftfreq(_PERIOD * scale, dtype=torch.float64)
-    centres = (torch.arange(scale, dtype=torch.float64) - (scale - 1) / 2)[:, None]
+def _correction(bank: KernelBank, one_px: float, width: float) -> float:
+    """The ``k`` of a lens at a coc of one pixel, signed, in an image of a width: from the factor of least error."""
+    reach = float(bank.spots(torch.tensor([one_px]), width).reach.max()) * bank.widest
+    radius = min(_RADIUS_PX, (_PERIOD / 2 - 2) / reach)
+    coc, width = torch.tensor([one_px * radius], dtype=torch.float64), width * radius
+    frequency = 2 * math.pi * torch.fft.fftfreq(_PERIOD * _SCALE, dtype=torch.float64)
+    centres = (torch.arange(_SCALE, dtype=torch.float64) - (_SCALE - 1) / 2)[:, None]
     block = torch.cos(centres * frequency).mean(0)
-    offsets = (torch.arange(2 * scale, dtype=torch.float64) - scale + 0.5)[:, None]
-    linear = ((1 - offsets.abs() / scale) * torch.cos(offsets * frequency)).sum(0) / scale
+    offsets = (torch.arange(2 * _SCALE, dtype=torch.float64) - _SCALE + 0.5)[:, None]
+    linear = ((1 - offsets.abs() / _SCALE) * torch.cos(offsets * frequency)).sum(0) / _SCALE
     block, linear = (part[:, None] * part for part in (block, linear))
-    finest = 2 * math.pi / (8 * _PERIOD * scale)
+    finest = 2 * math.pi / (8 * _PERIOD * _SCALE)
     power = 1.0 / (frequency[:, None] ** 2 + frequency**2 + finest**2)
-    exact = _spectrum(table, coc_px * scale, width * scale, _PERIOD * scale)
+    exact = _spectra(bank, coc * _SCALE, width * _SCALE, _PERIOD * _SCALE)[0]
     # the chain is linear, but mixes the frequencies that are one to a coarse pixel
-    meant = _aliases(linear * exact * block * power, scale)
-    chain = _aliases(linear**2, scale) * _aliases(block**2 * power, scale)
-    least = _by_moments(table, coc_px, width, scale)
+    meant = _aliases(linear * exact * block * power)
+    chain = _aliases(linear**2) * _aliases(block**2 * power)
+    others = (1 / 4 - 1 / (12 * _SCALE**2)) / float(bank.variance_px(coc, width, torch.ones(1, dtype=torch.float64)))
+    least = math.sqrt(max(_LEAST**2, 1 - others))
     factors = torch.linspace(least, 1.0, _CANDIDATES, dtype=torch.float64)
-    errors = []
-    for factor in factors.tolist():
-        coarse = _spectrum(table, coc_px * factor, width, _PERIOD)
-        errors.append((coarse.abs() ** 2 * chain - 2 * (coarse.conj() * meant).real).sum())
+    coarse = _spectra(bank, coc * factors, width, _PERIOD)
+    errors = (coarse.abs() ** 2 * chain - 2 * (coarse.conj() * meant).real).sum((-2, -1))
     # the error of a disc ripples with where its edge lies between pixels: a parabola through it does not
     powers = torch.stack([factors**2, factors, torch.ones_like(factors)], 1)
-    bend, slope, _ = torch.linalg.lstsq(powers, torch.stack(errors)[:, None]).solution[:, 0].tolist()
-    return min(max(-slope / (2 * bend), least), 1.0) if bend > 0 else least
+    bend, slope, _ = torch.linalg.lstsq(powers, errors[:, None]).solution[:, 0].tolist()
+    best = min(max(-slope / (2 * bend), least), 1.0) if bend > 0 else least
+    return min((1.0 - best**2) / others, 1.0)
 
 
-def _spectrum(table: BlurTable, coc_px: float, width: float, length: int) -> Tensor:
-    """Spectrum of a kernel, the mean of its colours, over a period of so many pixels."""
-    kernel = table.kernels(torch.tensor([coc_px], dtype=torch.float64), width)[0].mean(0)
-    half = kernel.shape[-1] // 2
-    period = kernel.new_zeros(length, length)
-    period[: kernel.shape[-1], : kernel.shape[-1]] = kernel
-    return torch.fft.fft2(period.roll((-half, -half), (0, 1)))
+def _spectra(bank: KernelBank, coc_px: Tensor, width: float, length: int) -> Tensor:
+    """Spectra of kernels ``[n, length, length]``, the mean of their colours, over a period of so many pixels."""
+    kernels = bank.kernels(coc_px, width).mean(1)
+    side = kernels.shape[-1]
+    periods = functional.pad(kernels, (0, length - side, 0, length - side))
+    return torch.fft.fft2(periods.roll((-(side // 2), -(side // 2)), (1, 2)))
 
 
-def _aliases(values: Tensor, scale: int) -> Tensor:
-    """Sum over the frequencies that are one to every ``scale``-th pixel."""
-    return values.unflatten(0, (scale, _PERIOD)).unflatten(2, (scale, _PERIOD)).sum((0, 2))
-
-
-def _by_moments(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
-    """The factor that leaves out the second moments of averaging and interpolation."""
-    # second moment of the kernel, mean of both axes; that of a large one from a smaller one of the same shape
-    smaller = max(1.0, min(table.reach_px(coc_px, width) / _MOMENT_REACH, abs(coc_px)))
-    kernel = table.kernels(torch.tensor([coc_px / smaller], dtype=torch.float64), width / smaller)[0]
-    axis = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
-    lines = kernel.mean(0).sum(0), kernel.mean(0).sum(1)
-    variances = [(line * axis**2).sum() - (line * axis).sum() ** 2 for line in lines]
-    variance = smaller**2 * float(sum(variances)) / 2
-    others = 1 / 4 - 1 / (12 * scale**2)
-    return math.sqrt(max(_LEAST**2, 1 - others / variance))
+def _aliases(values: Tensor) -> Tensor:
+    """Sum over the frequencies that are one to every coarse pixel."""
+    return values.unflatten(0, (_SCALE, _PERIOD)).unflatten(2, (_SCALE, _PERIOD)).sum((0, 2))

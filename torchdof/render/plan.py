@@ -1,23 +1,24 @@
 """What a scene needs: the layers to render it with, for a tolerance, and their kernels."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from .. import native
 from ..optics.blur_table import BlurTable
+from ..optics.kernel_bank import Spots, bank_of
 from ..optics.kernel_cache import KernelCache
-from ..optics.placed_kernels import Shares, layer_shares, own_kernels
+from ..optics.placed_kernels import Shares, layer_shares
 from ..options import tolerance_of
-from ..validation import is_differentiated, is_traced, show
+from ..validation import is_differentiated, is_in_memory, is_traced, show
 from . import layer_cocs
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 
-__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for"]
+__all__ = ["KERNELS_PER_PX", "Blur", "Plan", "kernels_for", "layer_spots", "longest_px"]
 
 KERNELS_PER_PX = 32  # of radius, for highlights
 _FEWER_KERNELS_PER_PX = 4  # for those of a graph, which holds them all; costs up to 0.02 dB
@@ -25,7 +26,6 @@ _COARSE_FROM_PX = (7.2, 18.0, 36.0, 72.0)  # blurs from which each next half of 
 _LEAST_CUT = 24  # pixels of a layer: kernels are not cut for smaller frames, that a graph's do not depend on sizes
 _SMALL_RADII = 3.0  # a frame no larger than so many of its largest blurs is planned for less than the tolerance
 _FARTHEST_PX = 1e9  # of a layer; frames are smaller
-_kernels = KernelCache(256 * 2**20)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +95,8 @@ class Plan:
         such a frame is planned for less. For a plan that is to be ``still`` it is a whole power of 1/2 of the
         tolerance, lest layers move with the scene.
         """
+        if not still and coc_px.dtype == torch.float32 and is_in_memory(coc_px) and native.chosen():
+            return cls(*native.plan(coc_px, tolerance))
         coc_px = coc_px.detach()
         extent = layer_cocs.extent(coc_px)
         low, high = (from_blur_axis(end) for end in extent)
@@ -199,35 +201,37 @@ class Plan:
         to each side are left whole. Traced code holds them as constants, so a table that is tied to the width of the
         image ties it as well.
         """
-        width = 1 if table.unit == "relative" else int(size[1])
-        coarse = coarse and len(self.nodes) > 1  # a plane is exact
-        scales = tuple(self._scale(table.finest_px(coc, width)) if coarse else 1 for coc in self.coc_px)
+        width, scales = self.layer_sizes(table, size, coarse)
         if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
             shapes = _constant_shapes(table, self.coc_px, width, scales)
             flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
             parts = flat.split([math.prod(shape) for shape in shapes])
             bank = [_masked(k.reshape(shape), size, s) for k, shape, s in zip(parts, shapes, scales, strict=True)]
         elif is_traced():
-            lens = table.fingerprint()
-            whole = [_kernel(table, lens, c, width, s, None) for c, s in zip(self.coc_px, scales, strict=True)]
+            whole = _constant_bank(table, self.coc_px, width, scales)
             bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
-            lens = table.fingerprint()
-            bank = []
-            for coc, scale in zip(self.coc_px, scales, strict=True):
-                longest_px = max(-(-max(size) // scale), _LEAST_CUT)
-                reach = functools.partial(table.reach_px, coc / scale, width / scale)
-                reach_px = _kernels.get((lens, coc, width, scale), reach)
-                window = 2 * longest_px - 1 if reach_px > longest_px - 0.5 else None
-                bank.append(_kernel(table, lens, coc, width, scale, window).to(device, dtype))
-        blurs = [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+            made = _layer_kernels(table, self.coc_px, width, scales, longest_px(size, scales))
+            bank = [kernel.to(device, dtype) for kernel in made]
         if not table.depends_on_place:
-            return blurs
-        frame = (int(size[0]), int(size[1]))
-        return [
-            dataclasses.replace(blur, shares=layer_shares(table, coc, blur.scale, frame))
-            for blur, coc in zip(blurs, self.coc_px, strict=True)
-        ]
+            return [Blur(kernel, scale) for kernel, scale in zip(bank, scales, strict=True)]
+        shares = self.shares(table, scales, (int(size[0]), int(size[1])))
+        return [Blur(*each) for each in zip(bank, scales, shares, strict=True)]
+
+    def shares(
+        self, table: BlurTable, scales: Sequence[int], size: tuple[int, int], like: Tensor | None = None
+    ) -> list[Shares]:
+        """What the field leaves of each layer's kernel, in the type of a tensor; none of a lens that has no field."""
+        if not table.depends_on_place:
+            return []
+        shares = [layer_shares(table, coc, scale, size) for coc, scale in zip(self.coc_px, scales, strict=True)]
+        return shares if like is None else [each.to(like) for each in shares]
+
+    def layer_sizes(self, table: BlurTable, size: tuple[int, int], coarse: bool) -> tuple[int, tuple[int, ...]]:
+        """Width of the image that kernels depend on, 1 where they depend on none, and the resolution of each layer."""
+        width = 1 if table.unit == "relative" else int(size[1])
+        coarse = coarse and len(self.nodes) > 1  # a plane is exact
+        return width, tuple(self._scale(table.finest_px(coc, width)) if coarse else 1 for coc in self.coc_px)
 
     def _scale(self, coc_px: float) -> int:
         """Resolution a layer is convolved at: every ``scale``-th pixel, a power of two."""
@@ -236,50 +240,78 @@ class Plan:
         return 2 ** sum(reach >= start for start in _COARSE_FROM_PX)
 
 
+def longest_px(size: tuple[int, int], scales: Sequence[int]) -> list[int]:
+    """Pixels of the longer side of a frame of ``size`` at every ``scale``-th one, to which kernels are cut."""
+    return [max(-(-max(size) // scale), _LEAST_CUT) for scale in scales]
+
+
 def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_px: int = KERNELS_PER_PX) -> Tensor:
     """Kernels ``[n, 1 or C, k, k]``, float64, of single pixels, such as highlights, of signed coc ``[n]``.
 
     Each is interpolated between those of so many radii a pixel where no gradient asks for more. They are cut to what
     reaches within a frame whose longer side is ``longest`` pixels.
     """
-    if is_differentiated(coc_px) or table.is_differentiated:
-        kernels = own_kernels(table, coc_px, width)
+    if table.is_differentiated:
+        kernels = table.kernels(coc_px, width)
+    elif is_differentiated(coc_px):
+        kernels = bank_of(table).kernels(coc_px, width, longest=longest)
     else:
         steps = coc_px.double() * per_px
         below = steps.floor()
         radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
-        low, high = (own_kernels(table, radii.cpu() / per_px, width).to(coc_px.device)[i] for i in which)
-        kernels = torch.lerp(low, high, (steps - below)[:, None, None, None])
+        of_radii = bank_of(table).kernels(radii / per_px, width, longest=longest).to(coc_px.device)
+        kernels = torch.lerp(of_radii[which[0]], of_radii[which[1]], (steps - below)[:, None, None, None])
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
-    return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare]
+    return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare].to(coc_px.device)
 
 
-def _kernel(table: BlurTable, lens: str, coc_px: float, width: int, scale: int, window: int | None) -> Tensor:
-    """Kernel ``[1 or C, k, k]`` of a coc at every ``scale``-th pixel; ``lens`` is the table's fingerprint."""
+def _layer_cocs(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Signed coc ``[n]`` in image pixels, whose kernels layers at every ``scale``-th pixel use; the scale ``[n]``."""
+    coc, scale = (torch.tensor(values, dtype=torch.float64) for values in (coc_px, scales))
+    return coc * shrink(bank_of(table), coc, width, scale), scale
 
-    def made() -> Tensor:
-        with torch.inference_mode(False):  # what is kept must serve autograd as well
-            coc = coc_px / scale
-            if scale > 1 and table.field is None:  # averaging and interpolation blur as well
-                coc *= shrink(table, coc, width / scale, scale)
-            return own_kernels(table, torch.tensor([coc], dtype=torch.float64), width / scale, window)[0].clone()
 
-    if table.is_differentiated:
-        return made()
-    return _kernels.get((lens, coc_px, width, scale, window), made)
+def layer_spots(
+    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] | None
+) -> Spots:
+    """What the kernels of layers at every ``scale``-th pixel are made from, cut to frames of so many of these."""
+    coc, scale = _layer_cocs(table, coc_px, width, scales)
+    return bank_of(table).spots(coc, width, scale, None if longest is None else torch.tensor(longest))
+
+
+@torch.inference_mode(False)  # what is kept must serve autograd as well
+def _layer_kernels(
+    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] | None
+) -> list[Tensor]:
+    """Kernels ``[1 or C, k, k]`` of the same layers, float64."""
+    if table.is_differentiated:  # gradients to the aperture's rotation and squeeze need the PSF itself
+        coc, scale = _layer_cocs(table, coc_px, width, scales)
+        windows = [None if longest is None else 2 * n - 1 for n in longest or scales]
+        each = zip((coc / scale).split(1), scales, windows, strict=True)
+        return [table.kernels(coc_there, width / size, window=window)[0] for coc_there, size, window in each]
+    spots = layer_spots(table, coc_px, width, scales, longest)
+    made = bank_of(table).of_spots(spots)
+    spare = [made.shape[-1] // 2 - half for half in spots.half.tolist()]
+    return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]
+
+
+_constants = KernelCache(64 * 2**20)
+
+
+def _constant_bank(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> tuple[Tensor, ...]:
+    """Kernels of layers in what is traced, where they are constants: made before, and kept."""
+    key = (table.fingerprint(), tuple(coc_px), width, tuple(scales))
+    return _constants.get(key, lambda: tuple(_layer_kernels(table, coc_px, width, scales, None)))
 
 
 def _constant_shapes(
     table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]
 ) -> tuple[tuple[int, ...], ...]:
-    lens = table.fingerprint()
-    return tuple(tuple(_kernel(table, lens, c, width, s, None).shape) for c, s in zip(coc_px, scales, strict=True))
+    return tuple(tuple(kernel.shape) for kernel in _constant_bank(table, coc_px, width, scales))
 
 
 def _constant_kernels(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> Tensor:
-    lens = table.fingerprint()
-    kernels = [_kernel(table, lens, c, width, s, None) for c, s in zip(coc_px, scales, strict=True)]
-    return torch.cat([kernel.flatten() for kernel in kernels])
+    return torch.cat([kernel.flatten() for kernel in _constant_bank(table, coc_px, width, scales)])
 
 
 for _constant in (_constant_shapes, _constant_kernels):  # one result each, for a compiled graph holds one of a function

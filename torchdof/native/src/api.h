@@ -62,6 +62,28 @@ typedef struct {
   const volatile int32_t *cancelled;  // rendering stops soon after it becomes 1
 } torchdof_scene;
 
+// Layers for a frame, of which some maps of coc [maps, height, width] are given: their places on the blur axis, near to far, in
+// nodes, as many as fit into its capacity; count: how many there are. tolerance: made smaller for a small frame.
+TORCHDOF_API int32_t torchdof_plan(const float *coc, int32_t maps, int32_t height, int32_t width, double *tolerance,
+                                   int32_t threads, double *nodes, int32_t capacity, int32_t *count);
+
+// What kernels of some circles of confusion are made from, as Spots of optics/kernel_bank.py has it.
+typedef struct {
+  int32_t count, colours;         // kernels, and colours of each
+  const float *const *templates;  // each [colours, 2 n + 3, 2 n + 3], for its n
+  const int32_t *cells;           // n of each template
+  const int32_t *index;           // [count, 4]: templates of the nodes below and above, and the same of the finer level
+  const double *part, *finer;     // [count]: of the node above, and of the finer level
+  const double *reach, *fade;     // [count, colours]: radius in pixels, and share against a single pixel
+  const int32_t *flipped, *half;  // [count]: turned by half; pixels that it reaches to each side
+  double squeeze;                 // height of the blur over its width
+  int32_t round;                  // 1: symmetric about both axes
+  int32_t even;                   // 1: even light within the radius; templates are not looked at
+} torchdof_spots;
+
+// out[i]: [colours, 2 half[i] + 1, 2 half[i] + 1].
+TORCHDOF_API int32_t torchdof_kernels(const torchdof_spots *spots, int32_t threads, float *const *out);
+
 typedef struct torchdof_job torchdof_job;
 
 // The scene must stay as it is until torchdof_finish has returned.
@@ -104,7 +126,7 @@ TORCHDOF_API void torchdof_convolve(const float *in, int32_t height, int32_t wid
 
 // What a caller compares with its own idea of this file before it calls anything else: sizes of the two structures and,
 // in the upper half, a number that goes up with every other change of this file.
-#define TORCHDOF_REVISION 4
+#define TORCHDOF_REVISION 5
 TORCHDOF_API int64_t torchdof_interface(void);
 
 // "avx2" or "baseline".

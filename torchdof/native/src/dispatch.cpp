@@ -77,6 +77,19 @@ int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed) {
   return torchdof::guarded([&] { *changed = torchdof::chosen().repair_edges(*map); });
 }
 
+int32_t torchdof_plan(const float *coc, int32_t maps, int32_t height, int32_t width, double *tolerance, int32_t threads,
+                      double *nodes, int32_t capacity, int32_t *count) {
+  return torchdof::guarded([&] {
+    const std::vector<double> planned = torchdof::chosen().plan(coc, maps, height, width, *tolerance, threads);
+    *count = (int32_t)planned.size();
+    if (*count <= capacity) memcpy(nodes, planned.data(), planned.size() * sizeof(double));
+  });
+}
+
+int32_t torchdof_kernels(const torchdof_spots *spots, int32_t threads, float *const *out) {
+  return torchdof::guarded([&] { torchdof::chosen().make_kernels(*spots, threads, out); });
+}
+
 int32_t torchdof_ends(const float *values, int64_t count, int32_t threads, float *low, float *high) {
   return torchdof::guarded([&] { torchdof::chosen().ends(values, count, threads, low, high); });
 }

@@ -154,6 +154,36 @@ void Job::take_scene() {
     }
 }
 
+void find_ends(const float *values, int64_t count, int threads, float *low, float *high) {
+  constexpr int64_t PART = 1 << 16;
+  const int parts = (int)((count + PART - 1) / PART);
+  std::vector<float> lows(parts), highs(parts);
+  torchdof::parallel(threads, parts, nullptr, [&](int part, int) {
+    const float *const its_values = values + part * PART;
+    const int its_count = (int)std::min(PART, count - part * PART), whole = its_count / LANES * LANES;
+    vec its_lows = all(INFINITY), its_highs = all(-INFINITY), any_nan = {};
+    const auto look = [&](vec v) {
+      its_lows = least(v, its_lows);
+      its_highs = most(v, its_highs);
+      any_nan = v == v ? any_nan : all(1.0f);
+    };
+    for (int i = 0; i < whole; i += LANES) look(load<vec>(its_values + i));
+    for (int i = whole; i < its_count; i++) look(all(its_values[i]));
+    lows[part] = any_positive(any_nan) ? NAN : smallest(its_lows);
+    highs[part] = any_positive(any_nan) ? NAN : largest(its_highs);
+  });
+  *low = INFINITY;
+  *high = -INFINITY;
+  for (int part = 0; part < parts; part++) {
+    if (std::isnan(lows[part])) {
+      *low = *high = NAN;
+      return;
+    }
+    *low = std::min(*low, lows[part]);
+    *high = std::max(*high, highs[part]);
+  }
+}
+
 void Job::begin() {
   take_scene();
   if (scene.kind == TORCHDOF_STACK) return;
@@ -192,35 +222,6 @@ class JobOf : public AnyJob {
 
 namespace TORCHDOF_SIMD {
 static AnyJob *begin(const torchdof_scene &scene) { return new JobOf<Job>(scene); }
-static void ends(const float *values, int64_t count, int threads, float *low, float *high) {
-  constexpr int64_t PART = 1 << 16;
-  const int parts = (int)((count + PART - 1) / PART);
-  std::vector<float> lows(parts), highs(parts);
-  torchdof::parallel(threads, parts, nullptr, [&](int part, int) {
-    const float *const its_values = values + part * PART;
-    const int its_count = (int)std::min(PART, count - part * PART), whole = its_count / LANES * LANES;
-    vec its_lows = all(INFINITY), its_highs = all(-INFINITY), any_nan = {};
-    const auto look = [&](vec v) {
-      its_lows = least(v, its_lows);
-      its_highs = most(v, its_highs);
-      any_nan = v == v ? any_nan : all(1.0f);
-    };
-    for (int i = 0; i < whole; i += LANES) look(load<vec>(its_values + i));
-    for (int i = whole; i < its_count; i++) look(all(its_values[i]));
-    lows[part] = any_positive(any_nan) ? NAN : smallest(its_lows);
-    highs[part] = any_positive(any_nan) ? NAN : largest(its_highs);
-  });
-  *low = INFINITY;
-  *high = -INFINITY;
-  for (int part = 0; part < parts; part++) {
-    if (std::isnan(lows[part])) {
-      *low = *high = NAN;
-      return;
-    }
-    *low = std::min(*low, lows[part]);
-    *high = std::max(*high, highs[part]);
-  }
-}
 static void convolve_all(const float *in, int height, int width, const float *values, int half, float *out) {
   const Kernel kernel = make_kernel(values, half, true);
   const int rows = (height + 15) / 16 * 16, columns = (width + 15) / 16 * 16, pitch = columns + 2 * half + 16;
@@ -236,6 +237,6 @@ static void convolve_all(const float *in, int height, int width, const float *va
     }
 }
 extern const Variant variant;
-const Variant variant = {begin, repair_edges, ends, convolve_all};
+const Variant variant = {begin, repair_edges, find_ends, plan, make_kernels, convolve_all};
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -584,6 +584,15 @@ inline uint32_t strip_inputs(int x, int half) { return marks(x, x + STRIP_COLUMN
 // kernel's half more on each side and begins there. Input row i matters where rows[i] has one of the bits of `columns`.
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
 
+// Least and largest of numbers; NaN both if one of them is NaN.
+void find_ends(const float *values, int64_t count, int threads, float *low, float *high);
+
+// Places of the layers of some maps [maps, height, width] of one frame, and the tolerance they are for; plan.cpp
+std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads);
+
+// Kernels from the templates of a lens; kernels.cpp
+void make_kernels(const torchdof_spots &spots, int threads, float *const *out);
+
 // Depth edges; false if they are right as they are; edges.cpp
 bool repair_edges(const torchdof_map &map);
 

@@ -1,0 +1,115 @@
+"""Kernels from templates: those of the PSF itself, in both engines, at any size."""
+
+import threading
+
+import pytest
+import torch
+
+from torchdof import BlurTable, native
+from torchdof.optics.kernel_bank import bank_of
+
+TABLES = {
+    "disc": BlurTable.disc(),
+    "gaussian": BlurTable.gaussian(),
+    "polygon": BlurTable.polygon(5, 11.0),
+    "squeezed": BlurTable.polygon(3, 20.0, squeeze=1.6, rim=0.7),
+    "wide": BlurTable.polygon(6, squeeze=0.6),
+    "colours": BlurTable("disc", [-1.0, 1.0], {"radius": [[0.7, 1.0], [0.8, 1.1], [0.9, 1.2]]}),
+    "sato_j15": BlurTable.load("sato_j15"),
+    "lens": BlurTable.load("double_gauss_50mm_f2").replace(field=None),
+    "blurred in focus": BlurTable("gaussian", [-0.02, 0.0, 0.02], {"sigma": [0.01, 0.001, 0.01]}, unit="fraction"),
+}
+ALL = pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
+SMALL = torch.tensor([-5.1, -2.4, -0.7, -0.02, 0.0, 0.3, 1.0, 3.6], dtype=torch.float64)
+LARGE = torch.tensor([-61.0, -24.7, 13.1, 17.5, 45.9], dtype=torch.float64)
+
+
+def moments(kernel: torch.Tensor) -> torch.Tensor:
+    """Centroid and second moments along both axes of kernels ``[n, C, k, k]``: ``[4, n, C]``."""
+    step = torch.arange(kernel.shape[-1], dtype=kernel.dtype) - kernel.shape[-1] // 2
+    down, across = kernel.sum(-1), kernel.sum(-2)
+    return torch.stack([(line * step**power).sum(-1) for line in (down, across) for power in (1, 2)])
+
+
+@ALL
+def test_small_kernels_are_those_of_the_psf(table: BlurTable) -> None:
+    coc = SMALL / (1.0 if table.family in ("disc", "softm", "radial") else 3.0)  # others reach farther
+    kernels, expected = bank_of(table).kernels(coc, 400), table.kernels(coc, 400)
+    assert kernels.shape == expected.shape
+    # between two nodes of a table of many the profile is a mean of theirs
+    torch.testing.assert_close(kernels, expected, rtol=0.0, atol=1e-6 if len(table.coc) < 3 else 1e-3)
+
+
+@ALL
+def test_large_kernels_hold_their_light_where_the_psf_has_it(table: BlurTable) -> None:
+    kernels, expected = bank_of(table).kernels(LARGE, 400), table.kernels(LARGE, 400)
+    torch.testing.assert_close(kernels.sum((-2, -1)), torch.ones(len(LARGE), table.channels, dtype=torch.float64))
+    assert bool((kernels >= 0).all())
+    torch.testing.assert_close(moments(kernels), moments(expected), rtol=2e-3, atol=5e-3)
+    error = (kernels - expected).square().sum((-2, -1)).sqrt() / expected.square().sum((-2, -1)).sqrt()
+    assert float(error.max()) < (0.15 if table is TABLES["lens"] else 0.04)  # cells of the PSF are pixels, here smaller
+
+
+@ALL
+@pytest.mark.parametrize("longest", [None, 9])
+def test_both_engines_make_the_same_kernels(table: BlurTable, longest: int | None) -> None:
+    if not native.chosen():
+        pytest.skip("the compiled engine is not built")
+    bank, scale = bank_of(table), torch.tensor([1.0, 2.0, 4.0, 1.0, 16.0], dtype=torch.float64)
+    for coc in (SMALL, LARGE):
+        spots = bank.spots(coc, 400, scale[0] if len(coc) > len(scale) else scale, longest)
+        plain = bank.of_spots(spots)
+        made = native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
+        for kernel, other, half in zip(made, plain, spots.half.tolist(), strict=True):
+            spare = other.shape[-1] // 2 - half
+            expected = other[:, spare : other.shape[-1] - spare, spare : other.shape[-1] - spare].float()
+            torch.testing.assert_close(kernel, expected, rtol=0.0, atol=3e-6 * float(expected.max()))
+
+
+@ALL
+def test_kernels_change_continuously_with_the_radius(table: BlurTable) -> None:
+    coc = torch.linspace(2.0, 40.0, 77, dtype=torch.float64)
+    step = torch.tensor(1e-6, dtype=torch.float64)
+    for radius in coc.split(11):
+        one, other = (bank_of(table).kernels(radius * factor, 400) for factor in (1.0, 1.0 + step))
+        spare = (other.shape[-1] - one.shape[-1]) // 2
+        assert float((torch.nn.functional.pad(one, (spare,) * 4) - other).abs().sum((-2, -1)).max()) < 1e-3
+
+
+def test_cells_of_a_template_leave_no_ripples_in_a_large_kernel() -> None:
+    """A large Gaussian is a Gaussian at every pixel: the cells of its template do not show."""
+    coc = torch.tensor([10.3, 12.2, 27.0], dtype=torch.float64)
+    for radius, kernel in zip(coc, bank_of(TABLES["gaussian"]).kernels(coc, 400)[:, 0], strict=True):
+        step = torch.arange(kernel.shape[-1], dtype=torch.float64) - kernel.shape[-1] // 2
+        line = torch.exp(-0.5 * (step / (0.5 * radius)) ** 2)
+        expected = line[:, None] * line / (line[:, None] * line).sum()
+        middle = (step.abs()[:, None] < radius) & (step.abs() < radius)
+        torch.testing.assert_close(kernel[middle], expected[middle], rtol=6e-3, atol=0.0)
+
+
+def test_a_kernel_far_larger_than_the_frame_is_even_light() -> None:
+    (kernel,) = bank_of(TABLES["disc"]).kernels(torch.tensor([5000.0], dtype=torch.float64), 400, longest=30)
+    assert kernel.shape == (1, 59, 59)
+    torch.testing.assert_close(kernel, torch.full_like(kernel, 1.0 / (torch.pi * 5000.0**2)), rtol=2e-3, atol=0.0)
+
+
+def test_gradients_to_the_coc_are_those_of_the_kernel() -> None:
+    coc = torch.tensor([-3.3, 0.9, 7.7, 19.0], dtype=torch.float64, requires_grad=True)
+    weight = torch.rand(61, 61, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def seen(coc: torch.Tensor) -> torch.Tensor:
+        kernels = bank_of(TABLES["sato_j15"]).kernels(coc, 400, longest=31)
+        side = kernels.shape[-1]
+        return (kernels[:, 0] * weight[:side, :side]).sum((-2, -1))
+
+    assert torch.autograd.gradcheck(seen, coc, eps=1e-7, atol=1e-5)
+
+
+def test_threads_that_make_the_first_kernels_of_a_table_make_the_same() -> None:
+    table, made = BlurTable.polygon(7, 3.21, curvature=0.123), []
+    work = [threading.Thread(target=lambda: made.append(bank_of(table).kernels(LARGE, 400))) for _ in range(8)]
+    for thread in work:
+        thread.start()
+    for thread in work:
+        thread.join()
+    assert len(made) == 8 and all(torch.equal(made[0], other) for other in made)

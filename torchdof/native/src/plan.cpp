@@ -1,0 +1,112 @@
+// Places of a frame's layers on the blur axis; the formulas stand in render/layer_cocs.py and render/plan.py.
+#include "engine.h"
+
+#include "variants.h"
+
+namespace torchdof {
+namespace TORCHDOF_SIMD {
+namespace {
+
+constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
+constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
+constexpr double CROWD = 0.03;     // share of the border's pixels that are a place of their own,
+constexpr int LEAST_CROWD = 16;    // and so many at least
+constexpr double SMALL_RADII = 3;  // a frame no larger than so many of its largest blurs is planned for less
+
+double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
+
+double spacing(double x, double tolerance) {
+  const double times = tolerance * 255;
+  const double loose = times <= LOOSE ? std::pow(times, SPACING_POWER) : std::max(std::pow(LOOSE, SPACING_POWER), std::sqrt(times));
+  return std::max(finest(x), SPACING * loose * std::pow(std::max(std::fabs(x) + 0.5, 1.0), 0.75));
+}
+
+// Places in finest distances from focus, and back.
+double in_finest(double x) {
+  const double steps = std::min(std::fabs(x), WIDE) / FINEST + FINEST_PARTS * std::log(std::max(std::fabs(x) / WIDE, 1.0));
+  return std::copysign(steps, x);
+}
+double from_finest(double steps) {
+  if (std::fabs(steps) <= FINEST_PARTS) return steps * FINEST;
+  return std::copysign(WIDE * std::exp(std::fabs(steps) / FINEST_PARTS - 1), steps);
+}
+
+// Places at which much of the frame's border lies, the most crowded first.
+std::vector<double> border_nodes(std::vector<float> places) {
+  std::vector<double> nodes;
+  std::vector<int> bins(places.size());
+  for (size_t i = 0; i < places.size(); i++) bins[i] = (int)std::nearbyint(in_finest(places[i]) * 3);
+  const auto ends = std::minmax_element(bins.begin(), bins.end());
+  const int first = *ends.first, last = *ends.second;
+  std::vector<int> counts(last - first + 3), crowds(last - first + 1), order(crowds.size());
+  for (int bin : bins) counts[bin - first + 1]++;
+  for (size_t i = 0; i < crowds.size(); i++) crowds[i] = counts[i] + counts[i + 1] + counts[i + 2], order[i] = (int)i;
+  std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return crowds[a] > crowds[b]; });
+  const double least = std::max(CROWD * places.size(), (double)LEAST_CROWD);
+  for (int i : order) {
+    if (crowds[i] < least) break;
+    const double place = from_finest((first + i) / 3.0);
+    bool is_new = true;
+    for (double other : nodes) is_new &= std::fabs(place - other) > 0.6 * finest(place);
+    if (!is_new) continue;
+    std::vector<float> there;  // one that occurs: its pixels then lie in no other layer
+    for (size_t k = 0; k < bins.size(); k++)
+      if (std::abs(bins[k] - first - i) <= 1) there.push_back(places[k]);
+    std::nth_element(there.begin(), there.begin() + (there.size() - 1) / 2, there.end());
+    nodes.push_back(there[(there.size() - 1) / 2]);
+  }
+  return nodes;
+}
+
+}  // namespace
+
+std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads) {
+  float low, high;
+  const int64_t area = (int64_t)height * width;
+  find_ends(coc, maps * area, threads, &low, &high);
+  if (std::isnan(low)) {  // what is no number is in focus
+    low = high = 0;
+    for (int64_t i = 0; i < maps * area; i++) low = std::min(low, coc[i]), high = std::max(high, coc[i]);
+  }
+  const float reach = 4.0f * std::max(height, width) + 4.0f;
+  auto place = [&](float c) { return axis(std::isnan(c) ? 0.0f : clamp(c, -reach, reach), -INFINITY, INFINITY); };
+  const double nearest = place(low), farthest = place(high);
+  const double widest = std::max({-(double)coc_at(nearest), (double)coc_at(farthest), 1.0});  // px
+  tolerance *= std::min(1.0, std::min(height, width) / (SMALL_RADII * widest));
+  if (farthest <= nearest) return {nearest};
+  std::vector<float> border;
+  for (const float *map = coc; map < coc + maps * area; map += area) {
+    for (int x = 0; x < width; x++) border.insert(border.end(), {place(map[x]), place(map[area - width + x])});
+    for (int y = 0; y < height; y++) border.insert(border.end(), {place(map[(int64_t)y * width]), place(map[(int64_t)(y + 1) * width - 1])});
+  }
+  std::vector<double> fixed = {nearest, farthest};
+  auto to_fixed = [&](double node) {
+    double least = INFINITY;
+    for (double other : fixed) least = std::min(least, std::fabs(node - other));
+    return least;
+  };
+  for (double node : border_nodes(std::move(border))) {
+    const double step = finest(node);
+    if (!(spacing(node, tolerance) > 2.5 * step)) continue;
+    for (double beside : {node, node - step, node + step})
+      if (nearest < beside && beside < farthest && to_fixed(beside) > 0.6 * step) fixed.push_back(beside);
+  }
+  std::vector<double> nodes(fixed);
+  if (nearest < 0 && 0 < farthest) nodes.push_back(0);
+  for (int sign : {-1, 1})
+    for (double x = spacing(0, tolerance), limit = sign < 0 ? -nearest : farthest; x < limit; x += spacing(x, tolerance)) {
+      const double node = sign * x;
+      if (!(nearest < node && node < farthest)) continue;
+      double near = fixed[0];  // one that comes near a fixed one moves towards it, and in the end onto it
+      for (double other : fixed)
+        if (std::fabs(node - other) < std::fabs(node - near)) near = other;
+      const double gap = std::fabs(node - near) / spacing(node, tolerance);
+      nodes.push_back(near + (node - near) * std::min(std::max((gap - NEAR) / NEAR, 0.0), 1.0));
+    }
+  std::sort(nodes.begin(), nodes.end());
+  nodes.erase(std::unique(nodes.begin(), nodes.end()), nodes.end());
+  return nodes;
+}
+
+}  // namespace TORCHDOF_SIMD
+}  // namespace torchdof
