@@ -94,10 +94,6 @@ def _unchanged(*arguments: Any) -> Matted:
     return arguments[-1]
 
 
-def _not_joined(*arguments: Any) -> tuple[Matted, Tensor]:
-    return arguments[-1], torch.zeros_like(arguments[1])
-
-
 def _nothing_filled(
     light: Tensor, coc_px: Tensor, other: Tensor, other_coc_px: Tensor, other_weight: Tensor, *_: Any
 ) -> tuple[Tensor, Tensor, Tensor, None]:
@@ -130,15 +126,13 @@ def _drawn_out(light: Tensor, weight: Any, limit: Any, ends: tuple[int, int, int
 
 FILL_HIDDEN, SPLAT = surfaces.fill_hidden, highlights.splat
 EMITTERS = [(surfaces, "attribute_emitters", _unchanged)]
-STRANDS = [(surfaces, "strands_joined", _not_joined)]
-MATTING = [(surfaces, "matte", _whole_pixels), *STRANDS, *EMITTERS]
+MATTING = [(surfaces, "matte", _whole_pixels), *EMITTERS]
 FILL = [(surfaces, "fill_hidden", _nothing_filled)]
 RAYS = [(highlights, "extract", _in_layers)]
 PARTS: dict[str, list[tuple[Any, str, Any]]] = {
     "everything": [],
     "no matting of mixed pixels": MATTING,
     "emitters stay on the surface of their pixel": EMITTERS,
-    "strands thinner than a pixel left as dashes": STRANDS,
     "farther surfaces of mixed pixels by their share alone": [(surfaces, "_GOES_ON", math.inf)],
     "nothing filled in behind blurred foregrounds": FILL,
     "one hidden surface, no light behind it": [(surfaces, "fill_hidden", _nothing_behind)],

@@ -1,7 +1,6 @@
 """The compiled engine makes the picture that the plain one states."""
 
 import dataclasses
-import math
 import random
 import subprocess
 import sys
@@ -133,27 +132,6 @@ def random_scene(seed: int, height: int | None = None, width: int | None = None)
         options["background"] = torch.rand(image.shape)
         options["background_coc_px"] = torch.nan_to_num(coc) + radius * torch.rand(1)
     return Scene(image, coc, options)
-
-
-def strand_scene(seed: int, channels: int = 3) -> Scene:
-    """Strands thinner than a pixel across a frame with some pixels of no known depth, before a wall and a few lamps."""
-    torch.manual_seed(seed)
-    y, x = torch.arange(50.0)[:, None], torch.arange(70.0)
-    image = functional.interpolate(torch.rand(1, channels, 7, 9), size=(50, 70), mode="bicubic").clamp(0, 1)
-    image[..., ::17, ::23] *= 50.0
-    coc = 6.0 + 0.02 * x + 0.01 * y + torch.rand(1)
-    for angle, along, width_px, brightness in torch.rand(9, 4).tolist():
-        aside = ((x - 70 * along) * math.cos(3 * angle) + (y - 25) * math.sin(3 * angle)).abs()
-        image = image + (0.5 + 0.5 * width_px - aside).clamp(0, 0.2 + width_px).clamp(max=1.0) * (brightness - image)
-        coc = torch.where(aside < 0.2 + 0.4 * width_px, brightness - 3.0 * angle, coc)
-    return Scene(image, torch.where(torch.rand(coc.shape) < 0.01, torch.nan, coc)[None, None], {"check": False})
-
-
-@pytest.mark.parametrize("channels", [1, 3, 4])
-@pytest.mark.parametrize("seed", range(3))
-def test_engines_agree_on_strands(seed: int, channels: int, by_both: Any) -> None:
-    scene = strand_scene(seed, channels)
-    assert_same_picture(by_both(scene.blurred), scene.image)
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -374,7 +352,6 @@ def scenes() -> list[Scene]:
         Scene(image, coc, {"occlusion": False}),
         Scene(image, masked, {"check": False}),
         Scene(image, coc, {"background": image.flip(3), "background_coc_px": coc + 3.3}),
-        strand_scene(0),
     ]
 
 

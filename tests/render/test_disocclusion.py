@@ -26,7 +26,7 @@ def edge(weight: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Te
 
 def surfaces(image: Tensor, coc: Tensor, levels: int) -> tuple[Surface, Surface, Tensor]:
     """What each pixel shows and hides, and what is behind both."""
-    (own, other), _, behind = surfaces_of_image(image, coc, None, threshold(image), levels)
+    (own, other), behind = surfaces_of_image(image, coc, None, threshold(image), levels)
     return own, other, behind_pixels(behind, (image.shape[-2], image.shape[-1]))
 
 

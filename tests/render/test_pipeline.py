@@ -95,9 +95,7 @@ def test_layers_at_one_depth_cover_each_other_as_over_does() -> None:
 @pytest.mark.parametrize(("apart_px", "weight"), [(0.5, 0.0), (0.75, 0.25), (1.5, 1.0), (-3.0, 0.0)])
 def test_a_known_background_counts_from_half_a_pixel_behind_the_image_on(apart_px: float, weight: float) -> None:
     image, coc = torch.full((1, 1, 6, 8), 0.5), torch.full((1, 1, 6, 8), 2.0)
-    (*_, background), _ = _before_background(
-        Surface(image, coc), image, coc + apart_px, (-9.0, 9.0), torch.ones_like(coc), Options()
-    )
+    *_, background = _before_background(Surface(image, coc), image, coc + apart_px, (-9.0, 9.0), Options())
     torch.testing.assert_close(background.weight, torch.full_like(coc, weight))
 
 

@@ -1,7 +1,6 @@
 """What holds for any scene: pictures are continuous, stay within the range of the light and turn with the image."""
 
 import dataclasses
-import math
 import random
 from collections.abc import Sequence
 from typing import Any
@@ -52,9 +51,7 @@ def beside_the_edge_of_focus(coc_px: Tensor) -> Tensor:
     return torch.where((coc_px.abs() - SHARP_PX).abs() < 0.002, coc_px + 0.01, coc_px).contiguous()
 
 
-def random_scene(
-    seed: int, ways: Sequence[str] = WAYS, lamps: bool = True, multiple: int = 1, strands: bool = True
-) -> Scene:
+def random_scene(seed: int, ways: Sequence[str] = WAYS, lamps: bool = True, multiple: int = 1) -> Scene:
     """Images of noise, blocks, gradients and edges; coc of planes, discs, slopes, checkerboards, steps and noise.
 
     Args:
@@ -114,17 +111,6 @@ def random_scene(
         step = draw.choice([0.5, 0.999, 1.0, 1.5, 2.0, 2.001])
         coc_px = (draw.uniform(-radius, radius) + step * (x > width / 2) + 0.0 * y)[None, None]
 
-    if seed % 3 == 2 and strands:
-        crossing = random.Random(-seed)
-        for _ in range(crossing.randint(1, 6)):
-            angle, width_px = crossing.uniform(0.0, math.pi), crossing.uniform(0.3, 1.5)
-            aside = (x - crossing.random() * width) * math.cos(angle) + (y - crossing.random() * height) * math.sin(
-                angle
-            )
-            cover = (0.5 * (width_px + 1.0) - aside.abs()).clamp(0.0, min(width_px, 1.0))
-            image = image + cover * (crossing.random() - image)
-            coc_px = torch.where(aside.abs() < 0.5 * width_px, coc_px - crossing.uniform(0.5, 2.0 * radius), coc_px)
-
     if draw.random() < 0.3 and lamps:
         image = torch.where(uniform(1, 1, height, width) < 0.01, image * draw.choice([20.0, 200.0]), image)
     options: dict[str, Any] = {
@@ -173,9 +159,9 @@ def rms(difference: Tensor) -> float:
 def test_a_hair_of_depth_changes_the_picture_by_a_hair(
     seeds: range, depth_edges: str, tolerance: float, most_rms: float, most: float, dtype: torch.dtype
 ) -> None:
-    """Also where edges are repaired, but of strands: decisions fade in, or are off what scenes often hold."""
+    """Also where edges are repaired: decisions fade in, or are off what scenes often hold."""
     for seed in seeds:
-        scene = random_scene(seed, strands=depth_edges == "as given")
+        scene = random_scene(seed)
         scene.options["depth_edges"] = depth_edges
         noise = torch.rand(scene.coc_px.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         for step_px in (STEP_PX, -STEP_PX, (2.0 * noise - 1.0) * STEP_PX):
@@ -215,13 +201,10 @@ def test_exposure_decides_nothing(seeds: range, dtype: torch.dtype) -> None:
 def test_a_turned_scene_is_the_turned_picture(
     seeds: range, depth_edges: str, tolerance: float, multiple: int, dtype: torch.dtype
 ) -> None:
-    """Coarse layers are averaged over blocks from the first pixel on: there the sides are multiples of these.
-
-    Strands in front of a border are turned in float64, where rounding decides nothing beside them.
-    """
+    """Coarse layers are averaged over blocks from the first pixel on: there the sides are multiples of these."""
     turns = [lambda t: t.flip(-1), lambda t: t.flip(-2), lambda t: t.mT, lambda t: t.rot90(1, (-2, -1))]
     for seed in seeds:
-        scene = random_scene(seed, multiple=multiple, strands=dtype == torch.float64)
+        scene = random_scene(seed, multiple=multiple)
         scene.options["depth_edges"] = depth_edges
         out = scene.blurred(dtype, tolerance)
         for turn in turns:

@@ -15,27 +15,16 @@ from torch import Tensor
 
 from .. import pixels
 
-__all__ = [
-    "ALIKE",
-    "EDGE_PX",
-    "NEVER_PX",
-    "TRUST",
-    "Matted",
-    "attribute_emitters",
-    "falloff",
-    "matte",
-    "mean_of",
-    "other_light",
-]
+__all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
 
 NEVER_PX = 1e9
 """A coc that no pixel has."""
 
-EDGE_PX = 0.5  # difference in coc of neighbours from which on they may be two surfaces
+_EDGE_PX = 0.5  # difference in coc of neighbours from which on they may be two surfaces
 _UNCLEAN = 1e-2  # weight of a pixel that may be mixed itself
 _FALLOFF = math.exp(-1 / 4.5)
-TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
-ALIKE = 1.0 / 255.0  # contrast, as a share of the brightest light around, that is worth as much as none
+_TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
+_ALIKE = 1.0 / 255.0  # contrast, as a share of the brightest light around, that is worth as much as none
 _UNBOUNDED = 1e6  # times the brightest pixel around: so bright is neither part of a pixel
 _EMITTER_REACH = 3  # pixels around a highlight that tell on which surface it lies
 _DIM = 0.1  # times the light of a highlight's pixel: what is darker is as sure to be none of it
@@ -75,7 +64,7 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
     known = None if valid is None else valid > 0
     high, low = (c if known is None else torch.where(known, c, -NEVER_PX) for c in (coc_px.detach(), -coc_px.detach()))
     high, low = (functional.max_pool2d(c, 3, stride=1, padding=1) for c in (high, low))
-    is_edge = high + low > EDGE_PX
+    is_edge = high + low > _EDGE_PX
     edge_pixels = pixels.indices(is_edge if known is None else is_edge & known)
 
     # the two surfaces are as near and as far as the pixels around; no absolute level of light decides
@@ -90,37 +79,45 @@ def matte(light: Tensor, coc_px: Tensor, valid: Tensor | None = None) -> Matted:
         near, far = torch.where(window_known, near, NEVER_PX), torch.where(window_known, far, -NEVER_PX)
     near, far = near.amin(0), far.amax(0)
     is_near = own_coc - near < far - own_coc
-    edge = ((far - near) / EDGE_PX - 1.0).clamp(0.0, 1.0)  # how surely there are two
+    edge = ((far - near) / _EDGE_PX - 1.0).clamp(0.0, 1.0)  # how surely there are two
     edges = pixels.put(torch.zeros_like(coc_px), edge_pixels, edge)
     gap = (far - near).clamp_min(1e-6)
 
     # their light: means over pixels around that lie on one of them and are hardly mixed themselves
-    weight = (1.0 - pixels.pick(edges, window)[0] + _UNCLEAN) * falloff(light, 1)
+    weight = (1.0 - pixels.pick(edges, window)[0] + _UNCLEAN) * _falloff(light, 1)
     if valid is not None:
         weight = weight * pixels.pick(valid, window)[0]
     nearness = (far - window_coc) / gap
     near_weight, far_weight = weight * (4 * nearness - 2.8).clamp(0, 1), weight * (1.2 - 4 * nearness).clamp(0, 1)
-    back, back_variance = mean_of(window_light, far_weight)
+    back, back_variance = _mean_of(window_light, far_weight)
     # a thin foreground has no clean pixel: trust the one that differs most from what is behind
     differs = ((window_light - back[:, None]) ** 2).sum(0)
-    differs = (differs + ALIKE**2) / (differs.amax(0) + ALIKE**2)
+    differs = (differs + _ALIKE**2) / (differs.amax(0) + _ALIKE**2)
     clean = (0.1 * near_weight.sum(0) / _UNCLEAN - 1.0).clamp(0.0, 1.0)
-    front, front_variance = mean_of(window_light, near_weight * torch.lerp(differs, torch.ones_like(clean), clean))
+    front, front_variance = _mean_of(window_light, near_weight * torch.lerp(differs, torch.ones_like(clean), clean))
 
     # a = (I - B) (F - B) / (F - B)^2, as far as it can be trusted
     contrast = front - back
     strength = (contrast**2).sum(0)
     fitted = (((colour - back) * contrast).sum(0) / strength.clamp_min(1e-12)).clamp(0.0, 1.0)
     misfit = ((colour - back - fitted * contrast) ** 2).sum(0)
-    trust = strength / (strength + TRUST * (back_variance + front_variance + misfit) + ALIKE**2)
+    trust = strength / (strength + _TRUST * (back_variance + front_variance + misfit) + _ALIKE**2)
     # the pixel's depth must be that of one of the two: in between, a steep surface goes on
     sided = ((own_coc - near) - (far - own_coc)).abs() / gap
     certainty = edge * trust * (4.0 * sided - 2.0).clamp(0.0, 1.0)
     weight = torch.where(is_near, 1.0 - fitted, fitted).clamp(max=0.5) * certainty  # of the other surface
 
+    # what the mean colours do not explain goes to both; no light is lost, and none is brighter or darker than the image
     own_mean, other_mean = torch.where(is_near, front, back), torch.where(is_near, back, front)
-    moved = other_light(light, edge_pixels, brightest, colour, weight, own_mean, other_mean)
-    own = (colour - moved) / (1.0 - weight)
+    own_weight = 1.0 - weight
+    unexplained = colour - own_weight * own_mean - weight * other_mean
+    moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
+    item = pixels.places(edge_pixels, *coc_px.shape[-2:])[0]
+    range_of_image = light.amin((2, 3)), light.amax((2, 3))  # bounded: 0 of something infinite would be no number
+    least, most = ((extreme[item].t() / brightest).clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in range_of_image)
+    moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
+    moved = torch.minimum(moved.maximum(weight * least), weight * most)
+    own = (colour - moved) / own_weight
     other = torch.where(weight > 0, moved / weight.clamp_min(1e-12), 0.0)
     return Matted(
         pixels.put(light, edge_pixels, own * brightest),
@@ -161,7 +158,7 @@ def attribute_emitters(
     colour = pixels.pick(light, window) / scale
     seen, peaks, own_peak, limit = seen / scale, peaks / scale, own_peak / scale, limit / scale
     excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
-    window_coc, near_by = pixels.pick(coc_px, window)[0], falloff(light, _EMITTER_REACH)
+    window_coc, near_by = pixels.pick(coc_px, window)[0], _falloff(light, _EMITTER_REACH)
     counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
     touches = counted * (near_by > _FALLOFF**3)  # of the window the middle 3 x 3
     nearest = window_coc.amin(0)
@@ -211,45 +208,13 @@ def attribute_emitters(
     return Matted(*(pixels.put(maps, bright, values) for maps, values in changed))
 
 
-def other_light(
-    light: Tensor,
-    mixed: Tensor,
-    brightest: Tensor,
-    colour: Tensor,
-    weight: Tensor,
-    own_mean: Tensor,
-    other_mean: Tensor,
-) -> Tensor:
-    """Of the light of mixed pixels that of their other surfaces, which have a weight in them.
-
-    What the mean colours do not explain goes to both; no light is lost, and none is brighter or darker than the image.
-
-    Args:
-        light: Of the image, ``[B, C, H, W]``.
-        mixed: Indices of the pixels, ``[P]``.
-        brightest: Light of which the following are parts, ``[P]``.
-        colour: Of the pixels, ``[C, P]``.
-        weight: ``[P]``.
-        own_mean: Light of the surface that their depth shows, ``[C, P]``.
-        other_mean: The same of the other one.
-    """
-    own_weight = 1.0 - weight
-    unexplained = colour - own_weight * own_mean - weight * other_mean
-    moved = weight * (other_mean + unexplained * weight / (weight**2 + own_weight**2))
-    item = pixels.places(mixed, *light.shape[-2:])[0]
-    range_of_image = light.amin((2, 3)), light.amax((2, 3))  # bounded: 0 of something infinite would be no number
-    least, most = ((extreme[item].t() / brightest).clamp(-_UNBOUNDED, _UNBOUNDED) for extreme in range_of_image)
-    moved = torch.minimum(moved.maximum(colour - own_weight * most), colour - own_weight * least)
-    return torch.minimum(moved.maximum(weight * least), weight * most)
-
-
-def falloff(light: Tensor, reach: int) -> Tensor:
+def _falloff(light: Tensor, reach: int) -> Tensor:
     """Weights of the pixels of a window around its middle, ``[(2 reach + 1)^2, 1]``."""
     steps = range(-reach, reach + 1)
     return light.new_tensor([_FALLOFF ** (dy * dy + dx * dx) for dy in steps for dx in steps])[:, None]
 
 
-def mean_of(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def _mean_of(colour: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Weighted mean over n of colours ``[C, n, P]`` and their variance, summed over colours, ``[P]``."""
     total = weight.sum(0).clamp_min(1e-12)
     mean = (colour * weight).sum(1) / total

@@ -19,8 +19,7 @@ from .layer_weights import blur_axis
 from .matting import matte
 from .plan import Blur, Plan
 from .scatter import fold
-from .strands import strands_joined
-from .surfaces import Frame, Surface, framed, met_by_rays, surfaces_of_image
+from .surfaces import Frame, Surface, framed, surfaces_of_image
 
 __all__ = ["blur", "blur_attended", "blur_stack"]
 
@@ -154,15 +153,14 @@ def _render_item(
 
     # the surfaces of each pixel, and what is behind all of them
     surfaces, behind = [Surface(light, coc, weight)], None
-    shown = surfaces  # as rays meet them
     if behind_light is not None and behind_coc is not None and limit is not None:
-        surfaces, shown = _before_background(surfaces[0], behind_light, behind_coc, (low, high), limit, options)
+        surfaces = _before_background(surfaces[0], behind_light, behind_coc, (low, high), options)
     elif options.occlusion and limit is not None and splatted:
         widest = max(2.0, *(abs(c) for c in plan.coc_px))
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
-        surfaces, shown, behind = surfaces_of_image(light, coc, weight, limit, levels)
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels)
 
-    # the highlights of these, ray by ray; a known background is in nobody's way
+    # the highlights of these, ray by ray
     splats = None
     if limit is not None and splatted and plan.rays:
         # without occlusion only those that coarse layers would soften
@@ -171,6 +169,8 @@ def _render_item(
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
         extracted = [highlights.extract(s, limit, from_px, b, coc) for s, b in zip(surfaces, beside, strict=True)]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
+        # what may stand in their way, the image's own surface first; a known background is in nobody's
+        shown = surfaces if behind_light is None else surfaces[1::-1]
         splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px) if rays else None
 
     out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
@@ -180,17 +180,13 @@ def _render_item(
 
 
 def _before_background(
-    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: tuple[float, float], limit: Tensor, options: Options
-) -> tuple[list[Surface], list[Surface]]:
-    """Surfaces of an image in front of a known background, near to far, with coc within the layers' reach.
-
-    And those that rays meet, the image's own first. The limit is the light from which on pixels are highlights'.
-    """
+    surface: Surface, behind: Tensor, behind_coc: Tensor, reach: tuple[float, float], options: Options
+) -> list[Surface]:
+    """Surfaces of an image in front of a known background, near to far, with coc within the layers' reach."""
     light, coc, weight = surface
     valid = None if options.check else torch.isfinite(behind_coc) & torch.isfinite(behind).all(1, keepdim=True)
     behind_coc = behind_coc.clamp(*reach)
-    matted, joined = strands_joined(light, coc, limit, weight, matte(light, coc, weight))
-    own_light, other_light, other_coc, other_weight = matted
+    own_light, other_light, other_coc, other_weight = matte(light, coc, weight)
     # what shows past a nearer surface of a mixed pixel is the background's to tell
     own_weight, other_weight = 1.0 - other_weight, torch.where(other_coc < coc, other_weight, 0.0)
     if weight is not None:
@@ -201,7 +197,7 @@ def _before_background(
         behind, behind_coc, behind_weight = (torch.where(valid, t, 0.0) for t in (behind, behind_coc, behind_weight))
     own, other = Surface(own_light, coc, own_weight), Surface(other_light, other_coc, other_weight)
     background = Surface(behind, torch.maximum(behind_coc, coc), behind_weight)
-    return [other, own, background], met_by_rays(own, other, joined)
+    return [other, own, background]
 
 
 def _composite(

@@ -14,9 +14,8 @@ from .disocclusion import HIDDEN_WEIGHT, behind_pixels, behind_size, fill_hidden
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 from .matting import attribute_emitters, matte
 from .plan import Blur
-from .strands import strands_joined
 
-__all__ = ["Frame", "Placed", "Surface", "framed", "going_on", "met_by_rays", "surfaces_of_image"]
+__all__ = ["Frame", "Placed", "Surface", "framed", "going_on", "surfaces_of_image"]
 
 
 _HAIR = 0.06
@@ -215,58 +214,46 @@ def framed(
     return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)
 
 
-def met_by_rays(own: Surface, other: Surface, joined: Tensor) -> list[Surface]:
-    """The surfaces of pixels without the part ``[B, 1, H, W]`` of a strand that was joined in them.
-
-    The dashes that depth shows of a strand, at the centres of pixels, are as much as it covers: rays meet it there.
-    """
-    own_weight = torch.ones_like(joined) if own.weight is None else own.weight
-    other_weight = torch.zeros_like(joined) if other.weight is None else other.weight
-    joined = torch.minimum(joined, other_weight)
-    return [own._replace(weight=own_weight + joined), other._replace(weight=other_weight - joined)]
-
-
 def surfaces_of_image(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
-) -> tuple[list[Surface], list[Surface], Tensor]:
-    """What each pixel shows, and what is mixed into it or hidden behind it; as rays meet it; and light behind both.
+) -> tuple[list[Surface], Tensor]:
+    """What each pixel shows, and what is mixed into it or hidden behind it; and the light behind both.
 
     Arguments and what is behind are those of :func:`torchdof.render.disocclusion.fill_hidden`.
     """
     compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
     maps = (_operator if compiling else _matte_and_fill)(light, coc_px, valid, threshold, levels)
-    own_light, own_weight, other_light, other_coc, other_weight, joined, behind = maps
-    own, other = Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)
-    return [own, other], met_by_rays(own, other, joined), behind
+    own_light, own_weight, other_light, other_coc, other_weight, behind = maps
+    return [Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)], behind
 
 
 def _matte_and_fill(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
 ) -> tuple[Tensor, ...]:
-    matted, joined = strands_joined(light, coc_px, threshold, valid, matte(light, coc_px, valid))
+    matted = matte(light, coc_px, valid)
     own, other, other_coc, weight = attribute_emitters(light, coc_px, threshold, valid, matted)
     own_weight = 1.0 - weight
     other, other_coc, weight, behind = fill_hidden(own, coc_px, other, other_coc, weight, valid, threshold, levels)
     if valid is not None:
         own_weight, weight = own_weight * valid, weight * valid
-    return own, own_weight, other, other_coc, weight, joined, behind
+    return own, own_weight, other, other_coc, weight, behind
 
 
 # How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
 @torch.library.custom_op("torchdof::surfaces", mutates_args=())
 def _operator(
     light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     maps = (t.contiguous() for t in _matte_and_fill(light, coc_px, valid, threshold, levels))
-    own, own_weight, other, other_coc, other_weight, joined, behind = maps
-    return own, own_weight, other, other_coc, other_weight, joined, behind
+    own, own_weight, other, other_coc, other_weight, behind = maps
+    return own, own_weight, other, other_coc, other_weight, behind
 
 
 @_operator.register_fake
 def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int) -> tuple[Tensor, ...]:
     colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
     behind = light.new_empty(*light.shape[:2], *(behind_size(n, levels) for n in light.shape[-2:]))
-    return colour, single, *(torch.empty_like(t) for t in (colour, single, single, single)), behind
+    return colour, single, *(torch.empty_like(t) for t in (colour, single, single)), behind
 
 
 def _remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:

@@ -63,7 +63,6 @@ void Job::take_scene() {
   surfaces.block_rows = ceil_div(height, BLOCK);
   surfaces.block_columns = ceil_div(width, BLOCK);
   surfaces.blocks.resize((size_t)surfaces.block_rows * surfaces.block_columns);
-  surfaces.joined.resize(surfaces.blocks.size());
   surfaces.light = scene.light[0];
   surfaces.coc = scene.coc[0];
   const size_t area = surfaces.area();

@@ -159,7 +159,6 @@ class Surfaces {
   std::vector<const float *> lights, cocs, weights;                // of whole surfaces
   int block_rows, block_columns;
   std::vector<float *> blocks;  // null where the image says all
-  std::vector<Buffer<float>> joined;  // of blocks, where strands were joined: how much more of each pixel they cover then
 
   bool whole() const { return !lights.empty(); }
   size_t area() const { return (size_t)height * width; }

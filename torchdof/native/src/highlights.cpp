@@ -223,25 +223,13 @@ void Job::extract_highlights() {
 
 // The surfaces that pixels show, own and other, in a row of a block column from column x on, with the part of a pixel that
 // each covers: the weight (null: 1) beyond a least one, for what is hidden covers nothing. The body is told whether it is the
-// own one. Without the strands that were joined: rays meet these where depth shows them.
+// own one.
 template <typename Body>
 static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
   const int own = surfaces.whole() ? 1 : 0;  // before a known background the other surface comes first
-  const float *coc, *weight, *other_weight;
-  const float *joined = surfaces.joined[y / BLOCK * surfaces.block_columns + x / BLOCK].data();
-  if (joined && surfaces.row(1 - own, y, x, light, coc, other_weight)) joined += y % BLOCK * BLOCK;
-  for (int i : {own, 1 - own}) {
-    if (!surfaces.row(i, y, x, light, coc, weight)) continue;
-    float met[BLOCK];
-    if (joined) {
-      for (int j = 0; j < std::min(BLOCK, surfaces.width - x); j++) {
-        const float part = std::min(joined[j], other_weight[j]);
-        met[j] = weight[j] + (i == own ? part : -part);
-      }
-      weight = met;
-    }
-    body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
-  }
+  const float *coc, *weight;
+  for (int i : {own, 1 - own})
+    if (surfaces.row(i, y, x, light, coc, weight)) body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
 }
 
 // For each cell the number of rays on whose way to where they land it lies, as far as surfaces from a coc on may be in their way.

@@ -1,12 +1,16 @@
 // Matting: pixels at depth edges carry the light of two surfaces and the depth of one. The formulas are told in
 // render/matting.py.
-#include "matting.h"
+#include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
+constexpr float EDGE_PX = 0.5f;   // difference in coc of neighbours from which on they may be two surfaces
 constexpr float UNCLEAN = 1e-2f;  // weight of a pixel that may be mixed itself
+constexpr float TRUST = 4.0f;     // how much texture discredits the contrast of the two surfaces
+constexpr float ALIKE = 1.0f / 255;  // contrast, as a share of the brightest light around, that is worth as much as none
+constexpr float UNBOUNDED = 1e6f;  // times the brightest pixel around: so bright is neither part of a pixel
 constexpr int EMITTER_REACH = 3;  // pixels around a highlight that tell on which surface it lies
 constexpr float DIM = 0.1f;         // times the light of a highlight's pixel: what is darker is as sure to be none of it
 constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that an emitter of another surface may have
@@ -20,11 +24,12 @@ constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
 constexpr int EDGES = BLOCK + 2 * REACH;   // of the windows of edges and light
 constexpr int PITCH = 24;                  // of both
 
+float falloff_at(int dy, int dx) { return (float)std::exp(-(dy * dy + dx * dx) / 4.5); }
+
 struct Window {
   float coc[SIDE * PITCH], valid[SIDE * PITCH], edge[EDGES * PITCH];
   std::vector<float> light;  // [channels, EDGES, PITCH]
   std::vector<vec> around;   // light around some pixels, [channels, TAPS], and of their surfaces
-  std::unique_ptr<Strands> strands;
 };
 
 // How surely the pixels of a block, and those around it, lie beside another surface; false if none of the block does.
@@ -167,14 +172,19 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
   const vec aside = (here - near) - (far - here), sided = most(aside, -aside) * per_gap;
   const vec certainty = load<vec>(w.edge + first + tap(TAPS / 2)) * trust * clamp01(4.0f * sided - 2.0f);
   const vec weight = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * certainty, rest = 1.0f - weight;
-  const vec per_rest = 1.0f / rest, per_weight = 1.0f / most(weight, all(1e-12f));
+  const vec per_rest = 1.0f / rest, per_weight = 1.0f / most(weight, all(1e-12f)), of_each = weight / (weight * weight + rest * rest);
   auto put = [&](float *plane, vec value) {
     float *const to = plane + y * BLOCK + x;
     store(to, beside ? value : load<vec>(to));
   };
   for (int c = 0; c < C; c++) {
     const vec own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
-    const vec moved = other_light(job, c, colour[c], weight, own_mean, other_mean, per_scale);
+    const vec unexplained = colour[c] - rest * own_mean - weight * other_mean;
+    const vec darkest = most(job.light_least[c] * per_scale, all(-UNBOUNDED)), brightest = least(job.light_most[c] * per_scale, all(UNBOUNDED));
+    // what the mean colours do not explain goes to both; no light is lost, and none is brighter or darker than the image
+    vec moved = weight * (other_mean + unexplained * of_each);
+    moved = least(most(moved, colour[c] - rest * brightest), colour[c] - rest * darkest);
+    moved = least(most(moved, weight * darkest), weight * brightest);
     put(block.own + c * BLOCK_PIXELS, (colour[c] - moved) * per_rest * scale);
     put(block.other + c * BLOCK_PIXELS, weight > vec{} ? moved * per_weight * scale : vec{});
   }
@@ -365,7 +375,6 @@ void Job::split_mixed() {
       windows[worker].reset(new Window());
       windows[worker]->light.assign((size_t)channels * EDGES * PITCH, 0.0f);
       windows[worker]->around.resize((size_t)channels * (TAPS + 3));
-      windows[worker]->strands.reset(new Strands(channels));
     }
     Window &w = *windows[worker];
     for (int bx = 0; bx < columns; bx++) {
@@ -378,9 +387,7 @@ void Job::split_mixed() {
       if (!(high - low > EDGE_PX)) continue;
       const int y0 = by * BLOCK, x0 = bx * BLOCK;
       if (find_edges(*this, y0, x0, w)) split_block(*this, by, bx, w, falloff);
-      if (!(high - low > 1)) continue;
-      w.strands->join(*this, by, bx, low);
-      if (!emitters || !(block_peak[by * columns + bx] > least_threshold(*this, y0, x0))) continue;
+      if (!(high - low > 1) || !emitters || !(block_peak[by * columns + bx] > least_threshold(*this, y0, x0))) continue;
       const float least_limit = least_threshold(*this, y0, x0);
       for (int y = y0; y < std::min(height, y0 + BLOCK); y++)
         for (int x = x0; x < std::min(width, x0 + BLOCK); x++) attribute_emitter(*this, y, x, least_limit, around_emitter.data());
