@@ -72,7 +72,6 @@ def given(folder: Path) -> dict[str, Any]:
         "torchdof": torchdof,
         "image": image,
         "depth": 1 / values,
-        "values": values,
         "heart": torch.eye(9),
         "camera": camera,
         "dof": torchdof.DepthOfField(camera),
