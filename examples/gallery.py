@@ -198,8 +198,8 @@ def draw_fit(path: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         lens = Path(name) / "lens"
         simulator["write_captures"](lens, dot, 1.0, [0.7], lambda _: ("disc", {"radius": radius}), 640)
-        command = [sys.executable, "-m", "torchdof", "fit", lens, "-o", lens / "lens.json", "--plots", lens / "plots"]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        arguments = [str(lens), "-o", str(lens / "lens.json"), "--plots", str(lens / "plots")]
+        subprocess.run([sys.executable, "-m", "torchdof", "fit", *arguments], check=True, stdout=subprocess.DEVNULL)
         shown = {}
         for caption, file in {"in focus, 1 m": "1000mm.png", "out of focus, 0.7 m": "0700mm.png"}.items():
             part = read_image(lens / file).pixels[..., 90:150, 275:365]
