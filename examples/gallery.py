@@ -8,8 +8,10 @@ Usage: python examples/gallery.py --out docs/pictures
 import argparse
 import json
 import math
+import runpy
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +25,8 @@ from torchdof.depth import inspect_depth, read_depth
 from torchdof.depth.inspect import coc_colours, panels
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.io.sheet import write_sheet
-from torchdof.reference.scenes import read_scenes
+from torchdof.reference.degraded import degrade
+from torchdof.reference.scenes import Scene, read_scenes
 
 ROOT = Path(__file__).parents[1]
 MOTORCYCLE, SCENES = ROOT / "examples/data/motorcycle", ROOT / "tests/data/scenes"
@@ -53,6 +56,17 @@ def photograph(path: Path, pixels: Tensor) -> None:
 def half(pixels: Tensor) -> Tensor:
     """At half the resolution."""
     return functional.avg_pool2d(pixels, 2)
+
+
+def twice(pixels: Tensor) -> Tensor:
+    """At twice the resolution, each pixel a square."""
+    return functional.interpolate(pixels, scale_factor=2.0, mode="nearest")
+
+
+def inner(scene: Scene, pixels: Tensor) -> Tensor:
+    """A picture of a scene without its margin."""
+    m = scene.margin_px
+    return pixels[..., m : pixels.shape[-2] - m, m : pixels.shape[-1] - m]
 
 
 def draw_before(path: Path) -> None:
@@ -158,10 +172,40 @@ def draw_truth(path: Path) -> None:
     """A ray-traced cut-out: sharp, torchdof, and the path-traced picture through the lens."""
     (scene,) = read_scenes(SCENES / {"truth_lamps": "highlights", "truth_bars": "planes"}[path.stem])
     rendered = torchdof.depth_of_field(scene.image, scene.depth, scene.camera)
-    shown, m = {}, scene.margin_px
-    for name, pixels in {"sharp": scene.image, "torchdof": rendered, "path-traced": scene.truth}.items():
-        inner = pixels[..., m : pixels.shape[-2] - m, m : pixels.shape[-1] - m]
-        shown[name] = functional.interpolate(inner, scale_factor=2.0, mode="nearest")
+    pictures = {"sharp": scene.image, "torchdof": rendered, "path-traced": scene.truth}
+    write_sheet(path, {caption: twice(inner(scene, pixels)) for caption, pixels in pictures.items()})
+
+
+def draw_edges(path: Path) -> None:
+    """A ray-traced cut-out with depth of a quarter of the resolution, as given and repaired, and with exact depth."""
+    (scene,) = read_scenes(SCENES / "planes")
+    soft = degrade(scene.depth, "quarter-res")
+    pictures = {
+        "soft depth, as given": torchdof.depth_of_field(scene.image, soft, scene.camera, depth_edges="as given"),
+        "soft depth, repaired": torchdof.depth_of_field(scene.image, soft, scene.camera, depth_edges="auto"),
+        "exact depth": torchdof.depth_of_field(scene.image, scene.depth, scene.camera),
+        "path-traced": scene.truth,
+    }
+    write_sheet(path, {caption: twice(inner(scene, pixels)) for caption, pixels in pictures.items()})
+
+
+def draw_fit(path: Path) -> None:
+    """A dot in focus, the same dot out of focus, and what ``torchdof fit --plots`` draws of the two."""
+    simulator = runpy.run_path(str(ROOT / "tests/fit/simulator.py"))
+    camera = torchdof.Camera(focal_length_mm=50.0, f_number=2.8, focus_m=1.0)
+    radius = float(camera.coc_px(torch.full((1, 1, 1, 1), 0.7), 640).abs())
+    dot = simulator["Simulator"](level=0.7, snr_db=46, dot_radius=9.0, black=0.02)
+    with tempfile.TemporaryDirectory() as name:
+        lens = Path(name) / "lens"
+        simulator["write_captures"](lens, dot, 1.0, [0.7], lambda _: ("disc", {"radius": radius}), 640)
+        arguments = [str(lens), "-o", str(lens / "lens.json"), "--plots", str(lens / "plots")]
+        subprocess.run([sys.executable, "-m", "torchdof", "fit", *arguments], check=True, stdout=subprocess.DEVNULL)
+        shown = {}
+        for caption, file in {"in focus, 1 m": "1000mm.png", "out of focus, 0.7 m": "0700mm.png"}.items():
+            part = read_image(lens / file).pixels[..., 90:150, 275:365]
+            shown[caption] = functional.interpolate(part, size=(300, 450), mode="nearest")
+        (plot,) = (lens / "plots").glob("*700mm.png")
+        shown["fitted"] = functional.interpolate(read_image(plot).pixels[:, :3], (300, 450), mode="area")
     write_sheet(path, shown)
 
 
@@ -194,6 +238,8 @@ GALLERY: dict[str, Callable[[Path], None]] = {
     "bokeh.jpg": draw_bokeh,
     "field.jpg": draw_field,
     "layers.jpg": draw_layers,
+    "edges.jpg": draw_edges,
+    "fit.jpg": draw_fit,
     "truth_lamps.jpg": draw_truth,
     "truth_bars.jpg": draw_truth,
     "thin_lens.png": draw_thin_lens,

@@ -1,4 +1,4 @@
-"""Measures every hard case and writes the table of errors: `python tests/hard/write_table.py docs/hard_cases.md`."""
+"""Measures every hard case and writes the table of errors: `python tests/hard/write_table.py [out/hard_cases.md]`."""
 
 import argparse
 import importlib.util
@@ -20,7 +20,6 @@ import torch
 from torchdof import DepthOfField
 from torchdof.export import to_onnx
 
-MARK = "## What the hard cases found"
 TYPES = {"float32": torch.float32, "float16": torch.float16}
 ENGINES = ("torch", "native")
 HEAD = """# Hard cases and their measured errors
@@ -34,12 +33,11 @@ circle of confusion are in float32 throughout; only the light is in the type of 
 The column *onnxruntime* is the exported file ({layers} layers up to 6 px) on the same input in float32, against the
 module with the same layers in float64.
 
-Made by `python tests/hard/write_table.py docs/hard_cases.md` with PyTorch {torch} and onnxruntime {onnxruntime} on
+Made by `python tests/hard/write_table.py` with PyTorch {torch} and onnxruntime {onnxruntime} on
 {machine}, {threads} threads. `pytest -m hard` holds every number to its limit (float32, float16, onnxruntime).
 
 Tried: {count} cases, {measured} errors measured. Beside them `pytest -m hard` takes {tests} tests of hostile arguments,
-files, light, gradients and command lines, those of Hypothesis with 50 to 100 examples each, and `make fuzz` changed
-files to every reader and scenes to both engines: see below.
+files, light, gradients and command lines, those of Hypothesis with 50 to 100 examples each.
 """
 
 
@@ -95,9 +93,9 @@ def count_of_tests() -> int:
 
 
 def main() -> None:
-    """Writes the file named on the command line; what stands below its mark is kept."""
+    """Writes the file named on the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("out", type=Path)
+    parser.add_argument("out", type=Path, nargs="?", default=Path("out/hard_cases.md"))
     out = parser.parse_args().out
     cases, exported = beside("cases"), beside("exported")
     with tempfile.TemporaryDirectory() as folder:
@@ -119,8 +117,8 @@ def main() -> None:
         measured=len(cases.CASES) * (len(TYPES) * len(ENGINES) + 1),
         tests=count_of_tests(),
     )
-    kept = out.read_text(encoding="utf-8").partition(MARK)[2] if out.exists() else ""
-    out.write_text(head + rows + (f"\n{MARK}{kept}" if kept else ""), encoding="utf-8")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(head + rows, encoding="utf-8")
 
 
 if __name__ == "__main__":
