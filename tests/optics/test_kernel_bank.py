@@ -55,12 +55,12 @@ def test_large_kernels_hold_their_light_where_the_psf_has_it(table: BlurTable) -
 def test_both_engines_make_the_same_kernels(table: BlurTable, longest: int | None) -> None:
     if not native.chosen():
         pytest.skip("the compiled engine is not built")
-    bank, scale = bank_of(table), torch.tensor([1.0, 2.0, 4.0, 1.0, 16.0], dtype=torch.float64)
-    for coc in (SMALL, LARGE):
-        spots = bank.spots(coc, 400, scale[0] if len(coc) > len(scale) else scale, longest)
+    bank, scale = bank_of(table), [1.0, 2.0, 4.0, 1.0, 16.0]
+    for coc, scales in ((SMALL, []), (LARGE, scale)):
+        spots = bank.spots(coc, 400, scales, [longest] * len(coc) if longest else [])
         plain = bank.of_spots(spots)
         made = native.kernels(spots, squeeze=bank.squeeze, is_round=table.is_round, is_even=bank.is_even)
-        for kernel, other, half in zip(made, plain, spots.half.tolist(), strict=True):
+        for kernel, other, half in zip(made, plain, spots.half, strict=True):
             spare = other.shape[-1] // 2 - half
             expected = other[:, spare : other.shape[-1] - spare, spare : other.shape[-1] - spare].float()
             torch.testing.assert_close(kernel, expected, rtol=0.0, atol=3e-6 * float(expected.max()))
@@ -88,7 +88,7 @@ def test_cells_of_a_template_leave_no_ripples_in_a_large_kernel() -> None:
 
 
 def test_a_kernel_far_larger_than_the_frame_is_even_light() -> None:
-    (kernel,) = bank_of(TABLES["disc"]).kernels(torch.tensor([5000.0], dtype=torch.float64), 400, longest=30)
+    (kernel,) = bank_of(TABLES["disc"]).kernels(torch.tensor([5000.0], dtype=torch.float64), 400, longest=[30])
     assert kernel.shape == (1, 59, 59)
     torch.testing.assert_close(kernel, torch.full_like(kernel, 1.0 / (torch.pi * 5000.0**2)), rtol=2e-3, atol=0.0)
 
@@ -98,7 +98,7 @@ def test_gradients_to_the_coc_are_those_of_the_kernel() -> None:
     weight = torch.rand(61, 61, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
     def seen(coc: torch.Tensor) -> torch.Tensor:
-        kernels = bank_of(TABLES["sato_j15"]).kernels(coc, 400, longest=31)
+        kernels = bank_of(TABLES["sato_j15"]).kernels(coc, 400, longest=[31] * len(coc))
         side = kernels.shape[-1]
         return (kernels[:, 0] * weight[:side, :side]).sum((-2, -1))
 

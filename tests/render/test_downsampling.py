@@ -15,8 +15,7 @@ TABLES = {"disc": BlurTable.disc(), "gaussian": BlurTable.gaussian()}
 
 def shrink(table: BlurTable, coc_px: float, width: float, scale: int) -> float:
     """The factor for a coc and a width in coarse pixels."""
-    coc, scales = (torch.tensor([value], dtype=torch.float64) for value in (coc_px * scale, scale))
-    return float(downsampling.shrink(bank_of(table), coc, width * scale, scales))
+    return downsampling.shrink(bank_of(table), coc_px * scale, width * scale, scale)
 
 
 def photograph(size: int = 256) -> Tensor:

@@ -123,7 +123,7 @@ def _kernels(table: BlurTable, place: float, size: int) -> Tensor:
     y, x = (torch.tensor([place * side / math.hypot(*frame)]) for side in frame)
     kernels = []
     for coc in _COC_PX:
-        own = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=size // 2 + 1).float()
+        own = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=[size // 2 + 1]).float()
         shares = layer_shares(table, coc, 1, frame).to(own)
         kernel = placed(own, [(shares, own.new_ones(()))], y, x)[0]
         kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))

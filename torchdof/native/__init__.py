@@ -8,6 +8,7 @@ engine where it can serve, ``native`` refuses to go on without it, ``torch`` lea
 import ctypes
 import functools
 import importlib.resources
+import itertools
 import os
 import sys
 import threading
@@ -78,14 +79,37 @@ class _Shares(ctypes.Structure):
 class KernelSpots(Protocol):
     """What kernels are made from: :class:`torchdof.optics.kernel_bank.Spots`."""
 
-    templates: list[Tensor]
-    index: Tensor
-    part: Tensor
-    finer: Tensor
-    reach: Tensor
-    fade: Tensor
-    flipped: Tensor
-    half: Tensor
+    @property
+    def templates(self) -> list[Tensor]:
+        """Cells of the templates in use, float32."""
+
+    @property
+    def index(self) -> list[tuple[int, int, int, int]]:
+        """Which of these, four for each kernel."""
+
+    @property
+    def part(self) -> list[float]:
+        """How far each kernel lies on the way to the next node."""
+
+    @property
+    def finer(self) -> list[float]:
+        """Share of the finer templates."""
+
+    @property
+    def reach(self) -> list[list[float]]:
+        """Radius of each colour."""
+
+    @property
+    def fade(self) -> list[list[float]]:
+        """Share of each colour's kernel against a single pixel."""
+
+    @property
+    def flipped(self) -> list[bool]:
+        """Whether each is turned by half."""
+
+    @property
+    def half(self) -> list[int]:
+        """Pixels that each reaches to each side."""
 
 
 class _Spots(ctypes.Structure):
@@ -95,8 +119,9 @@ class _Spots(ctypes.Structure):
         ("count", ctypes.c_int32),
         ("colours", ctypes.c_int32),
         ("templates", ctypes.POINTER(ctypes.c_void_p)),
-        ("cells", ctypes.c_void_p),
-        *((name, ctypes.c_void_p) for name in ("index", "part", "finer", "reach", "fade", "flipped", "half")),
+        *((name, ctypes.POINTER(ctypes.c_int32)) for name in ("cells", "index")),
+        *((name, ctypes.POINTER(ctypes.c_double)) for name in ("part", "finer", "reach", "fade")),
+        *((name, ctypes.POINTER(ctypes.c_int32)) for name in ("flipped", "half")),
         ("squeeze", ctypes.c_double),
         ("round", ctypes.c_int32),
         ("even", ctypes.c_int32),
@@ -367,17 +392,17 @@ def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool
     Raises:
         MemoryError: If there is too little.
     """
-    count, colours = spots.reach.shape
-    sides = [2 * half + 1 for half in spots.half.tolist()]
+    count, colours = len(spots.reach), len(spots.reach[0])
+    sides = [2 * half + 1 for half in spots.half]
     areas = [colours * side * side for side in sides]
     memory = torch.empty(sum(areas), dtype=torch.float32, device="cpu")
     made = [part.view(colours, side, side) for part, side in zip(memory.split(areas), sides, strict=True)]
-    cells = torch.tensor([t.shape[-1] // 2 - 1 for t in spots.templates] or [0], dtype=torch.int32, device="cpu")
-    whole = [spots.index, *(t.to(torch.int32) for t in (spots.flipped, spots.half))]
-    numbers = [t.contiguous() for t in (spots.part, spots.finer, spots.reach, spots.fade)]
-    index, flipped, half = (t.contiguous() for t in whole)
-    pointers = [t.data_ptr() for t in (cells, index, *numbers, flipped, half)]
-    scene = _Spots(count, colours, _pointers(spots.templates), *pointers, squeeze, is_round, is_even)
+    cells = [template.shape[-1] // 2 - 1 for template in spots.templates]
+    reach, fade, index = (list(itertools.chain.from_iterable(each)) for each in (spots.reach, spots.fade, spots.index))
+    whole = [(ctypes.c_int32 * max(1, len(each)))(*each) for each in (cells, index, spots.flipped, spots.half)]
+    numbers = [(ctypes.c_double * len(each))(*each) for each in (spots.part, spots.finer, reach, fade)]
+    arrays = [*whole[:2], *numbers, *whole[2:]]
+    scene = _Spots(count, colours, _pointers(spots.templates), *arrays, squeeze, is_round, is_even)
     _check(_engine().torchdof_kernels(ctypes.byref(scene), torch.get_num_threads(), _pointers(made)))
     return made
 

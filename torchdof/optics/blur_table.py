@@ -24,7 +24,8 @@ _SMALLEST, _LARGEST = 1e-100, 1e100  # of parameters: their sums and products ar
 _STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
 _SEEN_PX = 1.5  # around a spot, in which pixels see some of it
 _RIM_POWER = 4.0  # of the radius, with which a rim grows
-_FADE_IN = 4.0  # times as fast as a disc's blur, whose moved light is the square of its radius in pixels
+FADE_IN = 4.0
+"""How much faster than a disc's blur the blur of a table in focus fades in, by the square of the coc in pixels."""
 _TRIED_AT_ONCE = 64
 _TRIED_PX = (0.5, 6.0)  # radii of the widest kernel tried
 
@@ -340,7 +341,8 @@ class BlurTable:
             kernels = torch.where(behind, kernels, kernels.flip(-2, -1))
         if self.is_sharp_in_focus:
             return kernels
-        fade = self.fade_in(coc_px.to(torch.float64)[:, None], self.moved_in_focus(width))[:, :, None, None]
+        times = FADE_IN / self.moved_in_focus(width).clamp_min(torch.finfo(torch.float64).tiny)
+        fade = (coc_px.to(torch.float64).square()[:, None] * times).clamp(max=1.0)[:, :, None, None]
         centre = torch.zeros_like(kernels)
         centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
         return torch.lerp(centre, kernels, fade)
@@ -349,18 +351,6 @@ class BlurTable:
         """Share ``[channels]`` of its light that the table's kernel in focus moves to other pixels."""
         in_focus = psf.pixel_kernels(self.family, self.params(torch.zeros(()), width), aperture=self.aperture).detach()
         return 1.0 - in_focus[:, in_focus.shape[-2] // 2, in_focus.shape[-1] // 2]
-
-    def fade_in(self, coc_px: Tensor, moved: Tensor) -> Tensor:
-        """Share of a kernel, the rest being a single pixel, of a table that has a blur of its own in focus.
-
-        Args:
-            coc_px: Signed coc in pixels, ``[n, 1]``.
-            moved: As :meth:`moved_in_focus` gives it, ``[channels]`` or ``[n, channels]``.
-
-        Returns:
-            ``[n, channels]``, 0 in focus to 1.
-        """
-        return (coc_px.square() * (_FADE_IN / moved.clamp_min(torch.finfo(torch.float64).tiny))).clamp(max=1.0)
 
     def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Nodes of one side of focus, that in front of it for a sign of -1, by growing ``|coc|`` from 0.

@@ -16,6 +16,7 @@ Between two nodes of a table the template is the mean of theirs, and its size th
 The compiled engine makes the same kernels from the same templates (``native/src/kernels.cpp``).
 """
 
+import bisect
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -24,8 +25,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..validation import is_differentiated
 from . import psf
-from .blur_table import BlurTable
+from .blur_table import FADE_IN, BlurTable
 from .kernel_cache import KernelCache
 
 __all__ = ["LEAST_CELLS", "SPOT_MARGIN_PX", "KernelBank", "Spots", "bank_of"]
@@ -45,27 +47,51 @@ _templates = KernelCache(128 * 2**20)
 
 
 class Spots(NamedTuple):
-    """What the kernels of some circles of confusion ``[n]`` are made from, with C colours.
+    """What the kernels of n circles of confusion are made from, with C colours: plain numbers, for n is small.
 
     Args:
         templates: Cells of the templates in use, each ``[C, 2 n + 3, 2 n + 3]``, float32.
-        index: Which of these, ``[n, 4]``: those of the nodes below and above, and of the next finer level the same.
-        part: How far each lies from the node below to the one above, 0 to 1, ``[n]``.
-        finer: Share of the finer level, 0 to 1, ``[n]``.
-        reach: Radius of the PSF in pixels, ``[n, C]``.
-        fade: Share of the kernel, the rest being a single pixel, ``[n, C]``.
-        flipped: Whether the kernel is turned by half, ``[n]``.
-        half: Pixels that the kernel reaches to each side, ``[n]``; what reaches farther is cut off.
+        index: Which of these, four for each kernel: those of the nodes below and above, and the same of the next finer
+            level.
+        part: How far each lies from the node below to the one above, 0 to 1.
+        finer: Share of the finer level, 0 to 1.
+        reach: Radius of the PSF in pixels, C for each kernel.
+        fade: Share of the kernel, the rest being a single pixel, C for each.
+        flipped: Whether the kernel is turned by half.
+        half: Pixels that the kernel reaches to each side; what reaches farther is cut off.
+        moves: What to add to ``part`` ``[n]`` and ``reach`` ``[n, C]``: zeros that have the gradients to the coc. None
+            where no gradient is taken.
     """
 
     templates: list[Tensor]
-    index: Tensor
-    part: Tensor
-    finer: Tensor
-    reach: Tensor
-    fade: Tensor
-    flipped: Tensor
-    half: Tensor
+    index: list[tuple[int, int, int, int]]
+    part: list[float]
+    finer: list[float]
+    reach: list[list[float]]
+    fade: list[list[float]]
+    flipped: list[bool]
+    half: list[int]
+    moves: tuple[Tensor, Tensor] | None
+
+
+class _Place(NamedTuple):
+    """Where a coc lies in a table, and how large its PSF is.
+
+    Args:
+        side: 0 in front of focus, 1 behind it.
+        node: The node below.
+        part: Part of the way to the next one.
+        reach: Radius of the PSF of each colour, in pixels.
+        part_slope: What the part gains with a pixel of ``|coc|``.
+        reach_slopes: What each reach gains with it.
+    """
+
+    side: int
+    node: int
+    part: float
+    reach: list[float]
+    part_slope: float
+    reach_slopes: list[float]
 
 
 def bank_of(table: BlurTable) -> "KernelBank":
@@ -107,81 +133,100 @@ class KernelBank:
         self.squeeze = 1.0 if table.aperture is None else float(table.aperture.squeeze)
         self.widest = max(1.0, 1.0 / self.squeeze)
         self._lens = table.fingerprint()
-        self._moved: dict[float, Tensor] = {}
+        self._moved: dict[float, list[float]] = {}
         self._found: dict[float, float] = {}
+        self._sums: dict[tuple[int, int], list[tuple[float, float]]] = {}
         with torch.inference_mode(False), torch.no_grad():
             sides = [table.side_nodes(sign) for sign in (-1, 1)]
-            self._distances, self._nodes = zip(*sides, strict=True)
-            self._reaches = [psf.reach(table.family, nodes, table.aperture) for nodes in self._nodes]  # [C, N]
+            reaches = [psf.reach(table.family, nodes, table.aperture) for _, nodes in sides]  # [C, N]
+        self._nodes = [nodes for _, nodes in sides]
+        self._distances: list[list[float]] = [distances.tolist() for distances, _ in sides]
+        self._reaches: list[list[list[float]]] = [each.tolist() for each in reaches]
         # a node without size has the shape of the next one
         self._shapes = [
-            [j + 1 if j + 1 < r.shape[1] and not bool(r[:, j].any()) else j for j in range(r.shape[1])]
-            for r in self._reaches
+            [j + 1 if j + 1 < each.shape[1] and not bool(each[:, j].any()) else j for j in range(each.shape[1])]
+            for each in reaches
         ]
         self._mirrored = self._nodes[0] is self._nodes[1]
 
-    def _place(self, coc_px: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Side (0 in front of focus), node below, part of the way to the next ``[n]``; reach in px ``[n, C]``."""
+    def _place(self, coc_px: float, width: float) -> _Place:
         per_unit = self.table.px_per_unit(width)
-        coc_px = coc_px.to("cpu", torch.float64)
-        signed = coc_px / per_unit
-        distance, behind = signed.abs(), signed.detach() >= 0
-        places = []
-        for distances, reaches in zip(self._distances, self._reaches, strict=True):
-            low = (torch.searchsorted(distances, distance.detach()) - 1).clamp(0, len(distances) - 2)
-            part = ((distance - distances[low]) / (distances[low + 1] - distances[low])).clamp(max=1.0)
-            reach = torch.lerp(reaches[:, low], reaches[:, low + 1], part)
-            reach = reach * (distance / distances[-1]).clamp_min(1.0) * per_unit
-            places.append((low, part, reach.t()))
-        near, far = places
-        node, part = (torch.where(behind, far[k], near[k]) for k in (0, 1))
-        reach = torch.where(behind[:, None], far[2], near[2])
+        side, distance = int(coc_px >= 0), abs(coc_px) / per_unit
+        nodes, reaches = self._distances[side], self._reaches[side]
+        low = min(max(bisect.bisect_left(nodes, distance) - 1, 0), len(nodes) - 2)
+        part, slope = (distance - nodes[low]) / (nodes[low + 1] - nodes[low]), 1.0 / (nodes[low + 1] - nodes[low])
+        if part > 1.0:  # beyond the last node lengths grow with the coc
+            sizes, slopes = [r[-1] * distance / nodes[-1] for r in reaches], [r[-1] / nodes[-1] for r in reaches]
+            part, slope = 1.0, 0.0
+        else:
+            slopes = [(r[low + 1] - r[low]) * slope for r in reaches]
+            sizes = [r[low] + part * (r[low + 1] - r[low]) for r in reaches]
         if self.table.field is not None:
-            seen = self.table.field.reach(signed.detach()) * (per_unit * coc_px.detach().abs().clamp(max=1.0))
-            reach = seen[:, None].expand_as(reach)
-        return behind.long(), node, part, reach
+            seen = float(self.table.field.reach(torch.tensor([coc_px / per_unit], dtype=torch.float64))[0])
+            sizes, slopes = [seen * min(abs(coc_px), 1.0)] * self.colours, [0.0] * self.colours
+        return _Place(side, low, part, [size * per_unit for size in sizes], slope / per_unit, slopes)
 
     def spots(
-        self, coc_px: Tensor, width: float, scale: Tensor | float = 1.0, longest: Tensor | int | None = None
+        self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
     ) -> Spots:
         """What kernels are made from.
 
         Args:
             coc_px: Signed coc ``[n]`` in pixels of the image.
             width: Width of the image in pixels.
-            scale: Kernels are for every ``scale``-th pixel, ``[n]`` or a number.
-            longest: Pixels of these that the longer side of the frame has, ``[n]`` or a number: kernels are cut to what
-                reaches from one to another. None leaves them whole.
+            scale: Kernels are for every ``scale``-th pixel, n of them; empty stands for 1.
+            longest: Pixels of these that the longer side of the frame has, n of them: kernels are cut to what reaches
+                from one to another. Empty leaves them whole.
         """
-        side, node, part, reach = self._place(coc_px, width)
-        scale = torch.as_tensor(scale, dtype=torch.float64).reshape(-1, 1)
-        in_px = reach.detach()
-        reach = reach / scale
-        if self.is_even:  # a spot, as pixels see it; in focus a single one
-            reach = torch.where(coc_px.detach().cpu()[:, None] == 0, 0.0, reach + math.sqrt(2.0) * SPOT_MARGIN_PX)
-            largest = reach.detach().amax(1)
-            half, level, finer = largest.floor(), torch.zeros_like(node), torch.zeros_like(largest)
-            index, templates = torch.zeros(len(node), 4, dtype=torch.int32), []
-        else:
-            reach = reach.clamp_min(_SMALLEST)
-            largest = reach.detach().amax(1) * self.widest
-            half = (largest - 1e-9).ceil().clamp_min(0)
-            level = (largest / LEAST_CELLS).log2().ceil().clamp(0, _LEVELS - 1)
-            cell = largest / (LEAST_CELLS * 2.0**level)
-            finer = torch.where(level < _LEVELS - 1, (cell - _FADES_FROM) / (1.0 - _FADES_FROM), 0.0).clamp(0.0, 1.0)
-            index, templates = self._index(side.tolist(), node.tolist(), level.long().tolist(), (finer > 0).tolist())
-        if longest is not None:
-            half = torch.minimum(half, torch.as_tensor(longest, dtype=torch.float64) - 1.0)
-        flipped = (side == 0) & (not self.table.is_round)
-        fade = self._fade(coc_px.to("cpu", torch.float64)[:, None] / scale, width, scale)
-        return Spots(templates, index, part, finer, reach, fade.expand_as(in_px), flipped, half.long())
+        cocs = coc_px.detach().to("cpu", torch.float64).tolist() if isinstance(coc_px, Tensor) else list(coc_px)
+        scales = list(scale) or [1.0] * len(cocs)
+        places = [self._place(coc, width) for coc in cocs]
+        keys: dict[tuple[int, int, int], int] = {}
+
+        def index_of(side: int, node: int, level: int) -> int:
+            key = (1 if self._mirrored else side, self._shapes[side][node], level)
+            return keys.setdefault(key, len(keys))
+
+        spots = Spots([], [], [], [], [], [], [], [], None)
+        for coc, size, place in zip(cocs, scales, places, strict=True):
+            reach, finer, index = [r / size for r in place.reach], 0.0, (0, 0, 0, 0)
+            if self.is_even:  # a spot, as pixels see it; in focus a single one
+                reach = [0.0 if coc == 0 else r + math.sqrt(2.0) * SPOT_MARGIN_PX for r in reach]
+                half = math.floor(max(reach))
+            else:
+                reach = [max(r, _SMALLEST) for r in reach]
+                largest = max(reach) * self.widest
+                half = max(0, math.ceil(largest - 1e-9))
+                level = min(max(0, math.ceil(math.log2(largest / LEAST_CELLS))), _LEVELS - 1)
+                if level < _LEVELS - 1:
+                    cell = largest / (LEAST_CELLS << level)
+                    finer = min(max((cell - _FADES_FROM) / (1.0 - _FADES_FROM), 0.0), 1.0)
+                ends = [
+                    (place.side, place.node + above, level + up) for up in range(1 + (finer > 0)) for above in (0, 1)
+                ]
+                found = [index_of(*end) for end in ends]
+                index = (found[0], found[1], found[-2], found[-1])
+            spots.index.append(index)
+            spots.part.append(place.part)
+            spots.finer.append(finer)
+            spots.reach.append(reach)
+            spots.fade.append(self._fade(coc / size, width / size))
+            spots.flipped.append(place.side == 0 and not self.table.is_round)
+            spots.half.append(half)
+        wanted = [(self._lens, *key) for key in keys]
+        made = _templates.get_all(wanted, lambda missing: [self._template(*key[1:]) for key in missing])
+        halves = [min(half, n - 1) for half, n in zip(spots.half, longest, strict=True)] if longest else spots.half
+        moves = None
+        if isinstance(coc_px, Tensor) and is_differentiated(coc_px):
+            distance = coc_px.to("cpu", torch.float64).abs()
+            moved = distance - distance.detach()
+            slopes = [[slope / size for slope in p.reach_slopes] for p, size in zip(places, scales, strict=True)]
+            part = moved * torch.tensor([p.part_slope for p in places], dtype=torch.float64)
+            moves = (part, moved[:, None] * torch.tensor(slopes, dtype=torch.float64))
+        return spots._replace(templates=made, half=halves, moves=moves)
 
     def kernels(
-        self,
-        coc_px: Tensor,
-        width: float,
-        scale: Tensor | float = 1.0,
-        longest: Tensor | int | None = None,
+        self, coc_px: Tensor | Sequence[float], width: float, scale: Sequence[float] = (), longest: Sequence[int] = ()
     ) -> Tensor:
         """Kernels ``[n, C, k, k]``, float64 on the CPU, as :meth:`torchdof.BlurTable.kernels` has them.
 
@@ -192,32 +237,36 @@ class KernelBank:
 
     def of_spots(self, spots: Spots) -> Tensor:
         """The kernels of :meth:`kernels`, from what :meth:`spots` gives."""
-        half = int(spots.half.max())
+        half = max(spots.half)
+        numbers = (spots.part, spots.finer, spots.reach, spots.fade, spots.half)
+        parts, finer, reach, fade, halves = (torch.tensor(each, dtype=torch.float64) for each in numbers)
+        if spots.moves is not None:
+            parts, reach = parts + spots.moves[0], reach + spots.moves[1]
         step = torch.arange(-half, half + 1, dtype=torch.float64)
-        outside = torch.maximum(step.abs(), step.abs()[:, None]) > spots.half[:, None, None]
         if self.is_even:
-            disc = (torch.hypot(step[:, None], step) <= spots.reach[:, :, None, None]).to(torch.float64)
+            disc = (torch.hypot(step[:, None], step) <= reach[:, :, None, None]).to(torch.float64)
             made = disc / disc.sum((-2, -1), keepdim=True)
         else:
-            shape = (len(spots.part), self.colours, 2 * half + 1, 2 * half + 1)
-            made = torch.zeros(shape, dtype=torch.float64)
-            for key, which in _groups(spots.index.tolist()):
+            made = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64)
+            for key in set(spots.index):
+                which = torch.tensor([i for i, other in enumerate(spots.index) if other == key])
                 low, high, fine_low, fine_high = (spots.templates[i].double() for i in key)
-                reach, part = spots.reach[which], spots.part[which][:, None, None, None]
-                cut = spots.half[which, None] < reach.detach() * self.widest - 1e-9
-                kernel = self._sampled(torch.lerp(low, high, part), reach, half, cut)
-                finer = spots.finer[which][:, None, None, None]
-                if bool((finer > 0).any()):
-                    fine = self._sampled(torch.lerp(fine_low, fine_high, part), reach, half, cut)
-                    kernel = torch.lerp(kernel, fine, finer)
-                made = made.index_put((torch.tensor(which),), kernel)
+                sizes, part = reach[which], parts[which][:, None, None, None]
+                cut = halves[which, None] < sizes.detach() * self.widest - 1e-9
+                kernel = self._sampled(torch.lerp(low, high, part), sizes, half, cut)
+                if bool((finer[which] > 0).any()):
+                    fine = self._sampled(torch.lerp(fine_low, fine_high, part), sizes, half, cut)
+                    kernel = torch.lerp(kernel, fine, finer[which][:, None, None, None])
+                made = made.index_put((which,), kernel)
+        outside = torch.maximum(step.abs(), step.abs()[:, None]) > halves[:, None, None]
         made = torch.where(outside[:, None], 0.0, made)
-        made = torch.where(spots.flipped[:, None, None, None], made.flip(-2, -1), made)
-        if bool((spots.fade.detach() == 1.0).all()):
+        if any(spots.flipped):
+            made = torch.where(torch.tensor(spots.flipped)[:, None, None, None], made.flip(-2, -1), made)
+        if bool((fade == 1.0).all()):
             return made
         centre = torch.zeros_like(made)
         centre[..., half, half] = 1.0
-        return torch.lerp(centre, made, spots.fade[:, :, None, None])
+        return torch.lerp(centre, made, fade[:, :, None, None])
 
     def _sampled(self, cells: Tensor, reach: Tensor, half: int, cut: Tensor) -> Tensor:
         """Kernels ``[n, C, 2 half + 1, 2 half + 1]`` from templates ``[n, C, cells, cells]`` and reach ``[n, C]``.
@@ -231,17 +280,26 @@ class KernelBank:
         light = torch.where(cut, light, kernel.sum((-2, -1)))
         return kernel / light[..., None, None]
 
-    def variance_px(self, coc_px: Tensor, width: float, scale: Tensor) -> Tensor:
-        """Second moment ``[n]`` of kernels, mean of both axes and of colours, in squares of ``scale`` pixels."""
-        side, node, part, reach = self._place(coc_px.detach(), width)
-        index, templates = self._index(side.tolist(), node.tolist(), [0] * len(part), [False] * len(part))
-        step = torch.arange(-LEAST_CELLS - 1.0, LEAST_CELLS + 2.0, dtype=torch.float64) / LEAST_CELLS
-        square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
-        cells = torch.stack(templates).double()  # [templates, C, cells, cells]
-        light, moment = cells.sum((-2, -1)), (cells * square).sum((-2, -1))
-        low, high = index[:, 0], index[:, 1]
-        moment, light = (torch.lerp(sums[low], sums[high], part[:, None]) for sums in (moment, light))
-        return (moment / light * (reach / scale[:, None]) ** 2).mean(1)
+    def variance_px(self, coc_px: float, width: float, scale: float) -> float:
+        """Second moment of a kernel, mean of both axes and of colours, in squares of ``scale`` pixels."""
+        place = self._place(coc_px, width)
+        low, high = (self._light_and_moment(place.side, place.node + above) for above in (0, 1))
+        total = 0.0
+        for (light, moment), (light_above, moment_above), reach in zip(low, high, place.reach, strict=True):
+            moment, light = (a + place.part * (b - a) for a, b in ((moment, moment_above), (light, light_above)))
+            total += moment / light * (reach / scale) ** 2
+        return total / self.colours
+
+    def _light_and_moment(self, side: int, node: int) -> list[tuple[float, float]]:
+        """Sum of a template of each colour, and its second moment for a reach of 1."""
+        key = (1 if self._mirrored else side, self._shapes[side][node])
+        if key not in self._sums:
+            template = _templates.get((self._lens, *key, 0), lambda: self._template(*key, 0)).double()
+            step = torch.arange(-LEAST_CELLS - 1.0, LEAST_CELLS + 2.0, dtype=torch.float64) / LEAST_CELLS
+            square = 0.5 * (step[:, None] ** 2 + step**2 / self.squeeze**2)
+            light, moment = template.sum((-2, -1)).tolist(), (template * square).sum((-2, -1)).tolist()
+            self._sums[key] = list(zip(light, moment, strict=True))
+        return self._sums[key]
 
     def kept(self, sign: float, find: Callable[["KernelBank", float, float], float]) -> float:
         """A number that a function finds of the blur on one side of focus, found once.
@@ -255,24 +313,6 @@ class KernelBank:
             self._found[sign] = find(self, sign, 1.0 if self.table.unit == "relative" else 1.0 / last)
         return self._found[sign]
 
-    def _index(
-        self, side: Sequence[int], node: Sequence[int], level: Sequence[int], finer: Sequence[bool]
-    ) -> tuple[Tensor, list[Tensor]]:
-        """Templates, and which of them each of n kernels needs, ``[n, 4]``."""
-        keys: dict[tuple[int, int, int], int] = {}
-
-        def index_of(k: int, j: int, of_level: int) -> int:
-            key = (1 if self._mirrored else k, self._shapes[k][j], of_level)
-            return keys.setdefault(key, len(keys))
-
-        rows = []
-        for k, j, of_level, is_finer in zip(side, node, level, finer, strict=True):
-            row = [index_of(k, j, of_level), index_of(k, j + 1, of_level)]
-            rows.append(row + ([index_of(k, j, of_level + 1), index_of(k, j + 1, of_level + 1)] if is_finer else row))
-        wanted = [(self._lens, *key) for key in keys]
-        made = _templates.get_all(wanted, lambda missing: [self._template(*key[1:]) for key in missing])
-        return torch.tensor(rows, dtype=torch.int32), made
-
     @torch.inference_mode(False)
     @torch.no_grad()
     def _template(self, side: int, node: int, level: int) -> Tensor:
@@ -280,26 +320,12 @@ class KernelBank:
         params = {name: values[:, node] for name, values in self._nodes[side].items()}
         return psf.template(self.table.family, params, LEAST_CELLS << level, self.table.aperture).float().contiguous()
 
-    def _fade(self, coc_px: Tensor, width: float, scale: Tensor) -> Tensor:
-        """Share of a kernel, the rest being a single pixel, ``[n, C]``: below 1 near the focus of a blurred table."""
+    def _fade(self, coc_px: float, width: float) -> list[float]:
+        """Share of a kernel of each colour, the rest being a single pixel: less than 1 where a blur in focus fades in."""
         if self.table.is_sharp_in_focus or self.is_even:
-            return torch.ones(1, 1, dtype=torch.float64)
-        sizes = scale.flatten().tolist()
-        moved = {size: self._moved_in_focus(width / size) for size in set(sizes)}
-        return self.table.fade_in(coc_px, torch.stack([moved[size] for size in sizes]))
-
-    def _moved_in_focus(self, width: float) -> Tensor:
-        """Share ``[C]`` of its light that the kernel in focus moves to other pixels."""
+            return [1.0] * self.colours
         if width not in self._moved:
             if len(self._moved) >= _WIDTHS:
                 self._moved.clear()
-            self._moved[width] = self.table.moved_in_focus(width)
-        return self._moved[width]
-
-
-def _groups(rows: list[list[int]]) -> list[tuple[tuple[int, ...], list[int]]]:
-    """Equal rows, and where they stand."""
-    places: dict[tuple[int, ...], list[int]] = {}
-    for i, row in enumerate(rows):
-        places.setdefault(tuple(row), []).append(i)
-    return list(places.items())
+            self._moved[width] = self.table.moved_in_focus(width).tolist()
+        return [min(coc_px**2 * FADE_IN / max(moved, 1e-300), 1.0) for moved in self._moved[width]]

@@ -43,7 +43,7 @@ def picture(
     height, width = int(light.shape[-2]), int(light.shape[-1])
     lens_width, scales = plan.layer_sizes(options.table, (height, width), coarse=True)
     spots = layer_spots(options.table, plan.coc_px, lens_width, scales, longest_px((height, width), scales))
-    if int(spots.half.max()) > native.HALF_LARGEST:
+    if max(spots.half) > native.HALF_LARGEST:
         return None
     layers = list(zip(_kernels(options.table, spots), scales, strict=True))
     render = functools.partial(_render, plan, options, layers)
@@ -110,8 +110,8 @@ def _ray_shares(table: BlurTable, size: tuple[int, int], steps: Sequence[int]) -
 
 def _psfs(table: BlurTable, width: int, longest: int, steps: Sequence[int]) -> list[Tensor]:
     """Kernels ``[1 or C, k, k]`` of highlights whose coc is so many steps."""
-    coc_px = torch.tensor(steps, dtype=torch.float64) / KERNELS_PER_PX
-    return _kernels(table, bank_of(table).spots(coc_px, width, longest=longest))
+    coc_px = [step / KERNELS_PER_PX for step in steps]
+    return _kernels(table, bank_of(table).spots(coc_px, width, longest=[longest] * len(coc_px)))
 
 
 def _kernels(table: BlurTable, spots: Spots) -> list[Tensor]:

@@ -17,6 +17,7 @@ Reference:
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
@@ -43,33 +44,30 @@ def upsampled(values: Tensor, scale: int) -> Tensor:
     return functional.interpolate(values, scale_factor=float(scale), mode="bilinear", align_corners=False)
 
 
-def shrink(bank: KernelBank, coc_px: Tensor, width: float, scale: Tensor) -> Tensor:
-    """Size of kernels that are used at every ``scale``-th pixel, as a share of the size that they stand for.
+def shrink(bank: KernelBank, coc_px: float, width: float, scale: int) -> float:
+    """Size of a kernel that is used at every ``scale``-th pixel, as a share of the size that it stands for.
 
     Args:
         bank: Of the lens.
-        coc_px: Signed coc ``[n]``, in pixels of the image, float64.
+        coc_px: Signed coc, in pixels of the image.
         width: Width of the image in pixels.
-        scale: Powers of two ``[n]``, float64.
+        scale: A power of two.
 
     Returns:
-        Factors for the coc, ``[n]``: 1 where the scale is 1, else from 1/2 to 1.
+        A factor for the coc: 1 where the scale is 1, else from 1/2 to 1.
     """
-    if bank.is_even or not bool((scale > 1).any()):  # spots of a field are made smaller by themselves
-        return torch.ones_like(coc_px)
-    corrections = {sign: bank.kept(sign, _correction) for sign in {math.copysign(1.0, c) for c in coc_px.tolist()}}
-    correction = torch.tensor([corrections[math.copysign(1.0, c)] for c in coc_px.tolist()], dtype=torch.float64)
-    others = torch.where(scale > 1, 1 / 4 - 1 / (12 * scale**2), 0.0)
-    variance = bank.variance_px(coc_px, width, scale)
-    return (1.0 - correction * others / variance.clamp_min(1e-12)).clamp_min(_LEAST**2).sqrt()
+    if bank.is_even or scale == 1:  # spots of a field are made smaller by themselves
+        return 1.0
+    others = bank.kept(math.copysign(1.0, coc_px), _correction) * (1 / 4 - 1 / (12 * scale**2))
+    return math.sqrt(max(1.0 - others / bank.variance_px(coc_px, width, scale), _LEAST**2))
 
 
 @torch.inference_mode()
 def _correction(bank: KernelBank, one_px: float, width: float) -> float:
     """The ``k`` of a lens at a coc of one pixel, signed, in an image of a width: from the factor of least error."""
-    reach = float(bank.spots(torch.tensor([one_px]), width).reach.max()) * bank.widest
+    reach = max(bank.spots([one_px], width).reach[0]) * bank.widest
     radius = min(_RADIUS_PX, (_PERIOD / 2 - 2) / reach)
-    coc, width = torch.tensor([one_px * radius], dtype=torch.float64), width * radius
+    coc, width = one_px * radius, width * radius
     frequency = 2 * math.pi * torch.fft.fftfreq(_PERIOD * _SCALE, dtype=torch.float64)
     centres = (torch.arange(_SCALE, dtype=torch.float64) - (_SCALE - 1) / 2)[:, None]
     block = torch.cos(centres * frequency).mean(0)
@@ -78,14 +76,14 @@ def _correction(bank: KernelBank, one_px: float, width: float) -> float:
     block, linear = (part[:, None] * part for part in (block, linear))
     finest = 2 * math.pi / (8 * _PERIOD * _SCALE)
     power = 1.0 / (frequency[:, None] ** 2 + frequency**2 + finest**2)
-    exact = _spectra(bank, coc * _SCALE, width * _SCALE, _PERIOD * _SCALE)[0]
+    exact = _spectra(bank, [coc * _SCALE], width * _SCALE, _PERIOD * _SCALE)[0]
     # the chain is linear, but mixes the frequencies that are one to a coarse pixel
     meant = _aliases(linear * exact * block * power)
     chain = _aliases(linear**2) * _aliases(block**2 * power)
-    others = (1 / 4 - 1 / (12 * _SCALE**2)) / float(bank.variance_px(coc, width, torch.ones(1, dtype=torch.float64)))
+    others = (1 / 4 - 1 / (12 * _SCALE**2)) / bank.variance_px(coc, width, 1.0)
     least = math.sqrt(max(_LEAST**2, 1 - others))
     factors = torch.linspace(least, 1.0, _CANDIDATES, dtype=torch.float64)
-    coarse = _spectra(bank, coc * factors, width, _PERIOD)
+    coarse = _spectra(bank, [coc * factor for factor in factors.tolist()], width, _PERIOD)
     errors = (coarse.abs() ** 2 * chain - 2 * (coarse.conj() * meant).real).sum((-2, -1))
     # the error of a disc ripples with where its edge lies between pixels: a parabola through it does not
     powers = torch.stack([factors**2, factors, torch.ones_like(factors)], 1)
@@ -94,7 +92,7 @@ def _correction(bank: KernelBank, one_px: float, width: float) -> float:
     return min((1.0 - best**2) / others, 1.0)
 
 
-def _spectra(bank: KernelBank, coc_px: Tensor, width: float, length: int) -> Tensor:
+def _spectra(bank: KernelBank, coc_px: Sequence[float], width: float, length: int) -> Tensor:
     """Spectra of kernels ``[n, length, length]``, the mean of their colours, over a period of so many pixels."""
     kernels = bank.kernels(coc_px, width).mean(1)
     side = kernels.shape[-1]

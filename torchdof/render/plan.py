@@ -254,44 +254,42 @@ def kernels_for(table: BlurTable, coc_px: Tensor, width: int, longest: int, per_
     if table.is_differentiated:
         kernels = table.kernels(coc_px, width)
     elif is_differentiated(coc_px):
-        kernels = bank_of(table).kernels(coc_px, width, longest=longest)
+        kernels = bank_of(table).kernels(coc_px, width, longest=[longest] * len(coc_px))
     else:
         steps = coc_px.double() * per_px
         below = steps.floor()
         radii, which = torch.unique(torch.stack([below, below + 1.0]), return_inverse=True)
-        of_radii = bank_of(table).kernels(radii / per_px, width, longest=longest).to(coc_px.device)
+        of_radii = bank_of(table).kernels(radii / per_px, width, longest=[longest] * len(radii)).to(coc_px.device)
         kernels = torch.lerp(of_radii[which[0]], of_radii[which[1]], (steps - below)[:, None, None, None])
     spare = max(0, kernels.shape[-1] // 2 - (longest - 1))
     return kernels[..., spare : kernels.shape[-1] - spare, spare : kernels.shape[-1] - spare].to(coc_px.device)
 
 
-def _layer_cocs(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Signed coc ``[n]`` in image pixels, whose kernels layers at every ``scale``-th pixel use; the scale ``[n]``."""
-    coc, scale = (torch.tensor(values, dtype=torch.float64) for values in (coc_px, scales))
-    return coc * shrink(bank_of(table), coc, width, scale), scale
-
-
 def layer_spots(
-    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] | None
+    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] = ()
 ) -> Spots:
     """What the kernels of layers at every ``scale``-th pixel are made from, cut to frames of so many of these."""
-    coc, scale = _layer_cocs(table, coc_px, width, scales)
-    return bank_of(table).spots(coc, width, scale, None if longest is None else torch.tensor(longest))
+    bank = bank_of(table)
+    sizes = [coc * shrink(bank, coc, width, scale) for coc, scale in zip(coc_px, scales, strict=True)]
+    return bank.spots(sizes, width, scales, longest)
 
 
 @torch.inference_mode(False)  # what is kept must serve autograd as well
 def _layer_kernels(
-    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] | None
+    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int], longest: Sequence[int] = ()
 ) -> list[Tensor]:
     """Kernels ``[1 or C, k, k]`` of the same layers, float64."""
+    bank = bank_of(table)
     if table.is_differentiated:  # gradients to the aperture's rotation and squeeze need the PSF itself
-        coc, scale = _layer_cocs(table, coc_px, width, scales)
-        windows = [None if longest is None else 2 * n - 1 for n in longest or scales]
-        each = zip((coc / scale).split(1), scales, windows, strict=True)
-        return [table.kernels(coc_there, width / size, window=window)[0] for coc_there, size, window in each]
+        kernels = []
+        for k, (coc, scale) in enumerate(zip(coc_px, scales, strict=True)):
+            coarse = torch.tensor([coc * shrink(bank, coc, width, scale) / scale], dtype=torch.float64)
+            window = 2 * longest[k] - 1 if longest else None
+            kernels.append(table.kernels(coarse, width / scale, window=window)[0])
+        return kernels
     spots = layer_spots(table, coc_px, width, scales, longest)
-    made = bank_of(table).of_spots(spots)
-    spare = [made.shape[-1] // 2 - half for half in spots.half.tolist()]
+    made = bank.of_spots(spots)
+    spare = [made.shape[-1] // 2 - half for half in spots.half]
     return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]
 
 
@@ -301,7 +299,7 @@ _constants = KernelCache(64 * 2**20)
 def _constant_bank(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> tuple[Tensor, ...]:
     """Kernels of layers in what is traced, where they are constants: made before, and kept."""
     key = (table.fingerprint(), tuple(coc_px), width, tuple(scales))
-    return _constants.get(key, lambda: tuple(_layer_kernels(table, coc_px, width, scales, None)))
+    return _constants.get(key, lambda: tuple(_layer_kernels(table, coc_px, width, scales)))
 
 
 def _constant_shapes(
