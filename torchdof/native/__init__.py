@@ -23,6 +23,7 @@ __all__ = [
     "HALF_LARGEST",
     "Kind",
     "chosen",
+    "coc_px",
     "convolve",
     "describe",
     "ends",
@@ -41,6 +42,7 @@ HALF_LARGEST = 64
 
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
+_SMALL_FRAME = 2**16  # pixels; up to there no thread of its own is started, which costs a tenth of a millisecond
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _REVISION = 5  # of ``src/api.h``
 
@@ -305,7 +307,7 @@ def render(
         finally:
             engine.torchdof_free(job)
 
-    _interruptible(run, cancelled)
+    _interruptible(run, cancelled, height * width)
     return out
 
 
@@ -347,8 +349,30 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
     def run() -> None:
         _check(_engine().torchdof_repair_edges(ctypes.byref(scene), ctypes.byref(changed)))
 
-    _interruptible(run, cancelled)
+    _interruptible(run, cancelled, height * width)
     return out if changed.value else nearness
+
+
+def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:
+    """Signed circle of confusion of depths, what :meth:`torchdof.Camera.coc_px` computes for a lens without tilt.
+
+    Args:
+        depth: Metres, any shape, float32; NaN comes out where one is not > 0.
+        scale: Pixels of radius for each dioptre that a depth is away from focus.
+        nearest_m: Nearest distance in focus.
+        farthest_m: Farthest distance in focus.
+
+    Returns:
+        The depths' shape, float32, in pixels.
+
+    Raises:
+        MemoryError: If there is too little.
+    """
+    depth = depth.contiguous()
+    out, threads = torch.empty_like(depth), torch.get_num_threads()
+    arguments = (depth.numel(), scale, nearest_m, farthest_m, threads, out.data_ptr())
+    _check(_engine().torchdof_coc(depth.data_ptr(), *arguments))
+    return out
 
 
 def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
@@ -430,13 +454,13 @@ def convolve(values: Tensor, kernel: Tensor) -> Tensor:
     return out
 
 
-def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32) -> None:
-    """Run something that takes long outside of Python; Ctrl-C stops it.
+def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32, pixels: int) -> None:
+    """Run something that takes long outside of Python, for so many pixels; Ctrl-C stops it.
 
     Only the main thread hears of signals, and only between two steps of Python. So there the work goes to another
-    thread, and the main thread waits for it, which signals can interrupt.
+    thread, and the main thread waits for it, which signals can interrupt. A small frame is over before anybody would.
     """
-    if threading.current_thread() is not threading.main_thread():
+    if pixels <= _SMALL_FRAME or threading.current_thread() is not threading.main_thread():
         run()
         return
     failure: list[BaseException] = []
@@ -541,6 +565,8 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
     library.torchdof_convolve.restype = None
     library.torchdof_repair_edges.argtypes = [ctypes.POINTER(_Map), ctypes.POINTER(ctypes.c_int32)]
     whole, numbers = ctypes.c_int32, ctypes.POINTER(ctypes.c_double)
+    real = ctypes.c_float
+    library.torchdof_coc.argtypes = [pointer, ctypes.c_int64, real, real, real, whole, pointer]
     library.torchdof_plan.argtypes = [pointer, *[whole] * 3, numbers, whole, numbers, whole, ctypes.POINTER(whole)]
     library.torchdof_kernels.argtypes = [ctypes.POINTER(_Spots), ctypes.c_int32, ctypes.POINTER(pointer)]
     library.torchdof_ends.argtypes = [pointer, ctypes.c_int64, ctypes.c_int32, _Floats, _Floats]

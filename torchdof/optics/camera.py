@@ -27,7 +27,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..validation import floating, is_traced, pixels_wide, real_tensor, show, whole
+from .. import native
+from ..validation import floating, is_in_memory, is_traced, pixels_wide, real_tensor, show, whole
 
 __all__ = ["CAMERA_NUMBERS", "Camera"]
 
@@ -163,6 +164,9 @@ class Camera:
             raise ValueError(f"depth must be a floating-point tensor in metres, got {got}; convert it with .float()")
         if depth.layout != torch.strided:
             raise ValueError(f"depth must be a dense tensor in metres, got {depth.layout}; convert it with .to_dense()")
+        compiled = self._compiled_coc_px(depth, width)
+        if compiled is not None:
+            return compiled
         z = depth if depth.dtype in (torch.float32, torch.float64) else depth.float()
         known = z > 0
         z = torch.where(known, z, 1.0)
@@ -174,6 +178,17 @@ class Camera:
             near, far = (_dioptres_behind(z, _column(end, z)) + shift for end in self.focus_range_m)
             dioptres = near.clamp(max=0.0) + far.clamp_min(0.0)
         return torch.where(known, scale * dioptres, torch.nan)
+
+    def _compiled_coc_px(self, depth: Tensor, width: int) -> Tensor | None:
+        """The same by the compiled engine, where plain numbers are asked for; None where they are not."""
+        if is_traced() or depth.dtype != torch.float32 or not is_in_memory(depth) or not native.chosen():
+            return None
+        ends = self.focus_range_m or (self.focus_m, self.focus_m)
+        numbers = [self.aperture_radius_m * self.focal_px(width), *ends, self.tilt_deg, self.swing_deg]
+        if any(isinstance(n, Tensor) and (n.numel() > 1 or not is_in_memory(n)) for n in numbers):
+            return None
+        scale, nearest, farthest, tilt, swing = (float(n) for n in numbers)
+        return native.coc_px(depth, scale, nearest, farthest) if tilt == swing == 0.0 else None
 
     def _tilted_dioptres(self, depth: Tensor, width: int) -> Tensor | float:
         """What a tilted lens adds to the inverse of the focus distance at each pixel ``[B, 1, H, W]``, in 1/m."""

@@ -321,7 +321,7 @@ class KernelBank:
         return psf.template(self.table.family, params, LEAST_CELLS << level, self.table.aperture).float().contiguous()
 
     def _fade(self, coc_px: float, width: float) -> list[float]:
-        """Share of a kernel of each colour, the rest being a single pixel: less than 1 where a blur in focus fades in."""
+        """Share of a kernel of each colour, the rest being a single pixel: below 1 where a blur in focus fades in."""
         if self.table.is_sharp_in_focus or self.is_even:
             return [1.0] * self.colours
         if width not in self._moved:

@@ -62,6 +62,11 @@ typedef struct {
   const volatile int32_t *cancelled;  // rendering stops soon after it becomes 1
 } torchdof_scene;
 
+// out = scale (1 / s - 1 / z): signed coc of depths z [count] in metres, for a focus at s; what lies between two distances is in
+// focus. NaN where a depth is not > 0.
+TORCHDOF_API int32_t torchdof_coc(const float *depth, int64_t count, float scale, float nearest, float farthest, int32_t threads,
+                                  float *out);
+
 // Layers for a frame, of which some maps of coc [maps, height, width] are given: their places on the blur axis, near to far, in
 // nodes, as many as fit into its capacity; count: how many there are. tolerance: made smaller for a small frame.
 TORCHDOF_API int32_t torchdof_plan(const float *coc, int32_t maps, int32_t height, int32_t width, double *tolerance,

@@ -77,6 +77,10 @@ int32_t torchdof_repair_edges(const torchdof_map *map, int32_t *changed) {
   return torchdof::guarded([&] { *changed = torchdof::chosen().repair_edges(*map); });
 }
 
+int32_t torchdof_coc(const float *depth, int64_t count, float scale, float nearest, float farthest, int32_t threads, float *out) {
+  return torchdof::guarded([&] { torchdof::chosen().coc_of_depth(depth, count, scale, nearest, farthest, threads, out); });
+}
+
 int32_t torchdof_plan(const float *coc, int32_t maps, int32_t height, int32_t width, double *tolerance, int32_t threads,
                       double *nodes, int32_t capacity, int32_t *count) {
   return torchdof::guarded([&] {

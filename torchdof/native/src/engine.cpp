@@ -236,6 +236,6 @@ static void convolve_all(const float *in, int height, int width, const float *va
     }
 }
 extern const Variant variant;
-const Variant variant = {begin, repair_edges, find_ends, plan, make_kernels, convolve_all};
+const Variant variant = {begin, repair_edges, find_ends, coc_of_depth, plan, make_kernels, convolve_all};
 }  // namespace TORCHDOF_SIMD
 }  // namespace torchdof

@@ -586,6 +586,9 @@ void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t c
 // Least and largest of numbers; NaN both if one of them is NaN.
 void find_ends(const float *values, int64_t count, int threads, float *low, float *high);
 
+// Signed coc of a frame's depths, all between two distances in focus; plan.cpp
+void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out);
+
 // Places of the layers of some maps [maps, height, width] of one frame, and the tolerance they are for; plan.cpp
 std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads);
 

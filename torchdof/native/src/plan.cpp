@@ -1,4 +1,5 @@
-// Places of a frame's layers on the blur axis; the formulas stand in render/layer_cocs.py and render/plan.py.
+// The circle of confusion of a frame, and the places of its layers on the blur axis; the formulas stand in optics/camera.py,
+// render/layer_cocs.py and render/plan.py.
 #include "engine.h"
 
 #include "variants.h"
@@ -58,7 +59,22 @@ std::vector<double> border_nodes(std::vector<float> places) {
   return nodes;
 }
 
+// 1 / s - 1 / z, exactly 0 at z = s.
+float dioptres_behind(float z, float s) { return std::isfinite(z) && std::isfinite(s) ? (z - s) / z / s : 1 / s - 1 / z; }
+
 }  // namespace
+
+void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out) {
+  constexpr int64_t PART = 1 << 15;
+  torchdof::parallel(threads, (int)((count + PART - 1) / PART), nullptr, [&](int part, int) {
+    for (int64_t i = part * PART; i < std::min(count, (part + 1) * PART); i++) {
+      const float z = depth[i];
+      float dioptres = dioptres_behind(z, nearest);
+      if (nearest != farthest) dioptres = std::min(dioptres, 0.0f) + std::max(dioptres_behind(z, farthest), 0.0f);
+      out[i] = z > 0 ? scale * dioptres : NAN;
+    }
+  });
+}
 
 std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads) {
   float low, high;

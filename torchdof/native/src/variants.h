@@ -25,6 +25,7 @@ struct Variant {
   AnyJob *(*begin)(const torchdof_scene &scene);
   bool (*repair_edges)(const torchdof_map &map);
   void (*ends)(const float *values, int64_t count, int threads, float *low, float *high);
+  void (*coc_of_depth)(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out);
   std::vector<double> (*plan)(const float *coc, int maps, int height, int width, double &tolerance, int threads);
   void (*make_kernels)(const torchdof_spots &spots, int threads, float *const *out);
   void (*convolve)(const float *in, int height, int width, const float *kernel, int half, float *out);
