@@ -37,8 +37,8 @@ __all__ = [
 Kind = Literal["image", "background", "stack"]
 """What surfaces are: one image; an image and what lies behind it; any number that cover each other, near to far."""
 
-HALF_LARGEST = 64
-"""Kernels reach at most so many pixels of their layer's resolution to each side; larger ones are Fourier's."""
+HALF_LARGEST = 256
+"""Kernels reach at most so many pixels of their layer's resolution to each side; larger ones are the plain engine's."""
 
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
