@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import sys
 import tarfile
 from collections.abc import Callable
@@ -127,6 +128,18 @@ def test_broken_inputs_are_left_out_and_listed(
     summary = summary_of(tmp_path / "out")
     assert (summary.samples, summary.shards) == (2, 1) and summary.seconds > 0
     assert [image for image, _ in summary.broken] == [pairs[k].image for k in (1, 3, 4)]
+
+
+@pytest.mark.parametrize("format", ["webdataset", "parquet"])
+def test_names_that_are_no_utf_8_are_told_by_their_bytes(format: Any, pairs: list[Pair], tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow" if format == "parquet" else "webdataset")
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    (tmp_path / "images").rename(folder)
+    (folder / "1.png").write_bytes(b"no picture")
+    told = made(tmp_path / "out", shard_rows(pairs_in(folder, tmp_path / "depths")), format=format)
+    assert told["image"][0] == f"{tmp_path}/caf\\xe9/0.png"
+    assert [error == "" for error in told["error"]] == [True, False, True, True, True] and told["error"][1].encode()
+    assert summary_of(tmp_path / "out").broken[0][0].endswith("caf\\xe9/1.png")
 
 
 def test_a_shard_that_is_complete_is_not_made_again(pairs: list[Pair], tmp_path: Path) -> None:

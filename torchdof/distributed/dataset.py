@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..io.atomic import whole_file
+from ..io.atomic import write_text
 from ..validation import whole
 from .shards import SUFFIXES, Format, Pair, RenderShards, samples_of, shard_rows
 
@@ -181,7 +181,7 @@ def summary_of(out: str | os.PathLike[str]) -> Summary:
 def _same_as_before(path: Path, settings: dict[str, Any]) -> None:
     """Refuse to go on in a folder that was begun with other settings, or note them."""
     if not path.is_file():
-        _write(path, json.dumps(settings, indent=1))
+        write_text(path, json.dumps(settings, indent=1))
     try:
         before = json.loads(path.read_bytes())
         differing = [name for name, value in settings.items() if before.get(name) != value]
@@ -204,10 +204,5 @@ def _describe(out: Path, summary: Summary, settings: dict[str, Any]) -> None:
         **settings,
     }
     lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in facts.items()]
-    _write(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
-    _write(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))
-
-
-def _write(path: Path, text: str) -> None:
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
+    write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))

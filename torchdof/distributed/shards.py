@@ -27,7 +27,7 @@ from ..depth.holes import resolve_holes
 from ..depth.reading import read_depth
 from ..depth.relative import from_relative
 from ..depth.size import at_size_of
-from ..io.atomic import whole_file
+from ..io.atomic import whole_file, write_text
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.transfer import Transfer
 from ..module import depth_of_field
@@ -227,12 +227,13 @@ class RenderShards:
             except (OSError, ValueError, MemoryError, RuntimeError) as broken:  # torch's allocator raises the last
                 error = str(broken) or type(broken).__name__
             seconds = round(time.process_time() - start, 4)
-            rows.append({"key": sample["key"], "image": sample["image"], "error": error, "seconds": seconds})
+            rows.append(
+                {"key": sample["key"], "image": _text(sample["image"]), "error": _text(error), "seconds": seconds}
+            )
         with whole_file(path) as part:
             (_write_tar if self.format == "webdataset" else _write_parquet)(part, records)
             notes = {"bytes": part.stat().st_size, "samples": rows}
-            with whole_file(path.with_suffix(".json")) as text:  # a shard that is there has its notes
-                text.write_text(json.dumps(notes, indent=1), encoding="utf-8")
+            write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # a shard that is there has its notes
         return rows
 
     def _sample(
@@ -265,8 +266,8 @@ class RenderShards:
             "table": options.table.name or options.table.family,
             "table_fingerprint": options.table.fingerprint(),
             "aperture": None if options.table.aperture is None else repr(options.table.aperture),
-            "image": image,
-            "depth": depth,
+            "image": _text(image),
+            "depth": depth and _text(depth),
             "height": blurred.shape[-2],
             "width": blurred.shape[-1],
             "largest_coc_px": float(camera.coc_px(metres, blurred.shape[-1]).abs().nan_to_num().max()),
@@ -284,6 +285,11 @@ def _read_relative(
     values = read_values(path, channel)
     metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
     return resolve_holes(metres, path, fill)[0]
+
+
+def _text(name: str) -> str:
+    """The name of a file as UTF-8 holds it: of other bytes, their numbers."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _plain(arguments: Mapping[str, Any]) -> dict[str, Any]:
