@@ -60,4 +60,4 @@ def test_changed_chunks_of_a_png_can_have_right_checksums(tmp_path: Path) -> Non
         except (OSError, ValueError) as error:
             said.append(str(error))
     assert any("filter" in line for line in said) or any("invalid" in line for line in said)
-    assert sum("CRC error" in line for line in said) < len(said) / 2
+    assert sum("checksum" in line for line in said) < len(said) / 2

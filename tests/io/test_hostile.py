@@ -301,13 +301,12 @@ for suffix in sys.argv[1:]:
 """
 
 
-def test_no_library_but_libpng_prints_a_line_of_its_own_about_a_damaged_picture(tmp_path: Path) -> None:
+def test_no_library_prints_a_line_of_its_own_about_a_damaged_picture(tmp_path: Path) -> None:
     for suffix in KINDS:
         write_image(tmp_path / f"whole{suffix}", tiny())
     call = [sys.executable, "-c", SILENT, *KINDS]
     run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert (run.returncode, run.stdout) == (0, "")
-    assert [line for line in run.stderr.splitlines() if not line.startswith("libpng ")] == [*KINDS]
+    assert (run.returncode, run.stdout, run.stderr.split()) == (0, "", [*KINDS])
 
 
 def two_parts(path: Path) -> None:

@@ -8,8 +8,10 @@ import contextlib
 import dataclasses
 import mmap
 import os
+import struct
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +26,7 @@ __all__ = [
     "MOST_ATTRIBUTES",
     "Part",
     "PixelType",
+    "check_chunks",
     "existing",
     "first_line",
     "named_in_utf8",
@@ -110,6 +113,7 @@ def read_parts(path: Path) -> list[Part]:
     """
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
+    check_chunks(path)
     _check_attributes(path)
     try:
         with named_in_utf8(path) as name:
@@ -156,6 +160,24 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
             number += 1
     finally:
         source.close()
+
+
+def check_chunks(path: Path) -> None:
+    """Refuse a PNG that is cut short or has a wrong checksum: its library would print a line of its own about it.
+
+    Raises:
+        OSError: Naming the part that is damaged.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        place, name = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
+        while name != b"IEND":
+            length, name = struct.unpack(">I4s", content[place : place + 8].ljust(8, b"\0"))
+            end = place + 8 + length
+            if end + 4 > len(content):
+                raise OSError(f"{path}: is damaged or cut short (it ends in its part {name!r})")
+            if zlib.crc32(content[place + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
+                raise OSError(f"{path}: is damaged or cut short (its part {name!r} has another checksum)")
+            place = end + 4
 
 
 def _check_attributes(path: Path) -> None:

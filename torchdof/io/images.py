@@ -21,7 +21,7 @@ from ..validation import real_tensor
 from . import foreign
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
-from .decode import Part, PixelType, existing, first_line, named_in_utf8, read_array, read_parts
+from .decode import Part, PixelType, check_chunks, existing, first_line, named_in_utf8, read_array, read_parts
 from .transfer import Transfer, decode, default_transfer, encode
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
@@ -42,7 +42,6 @@ _STORED: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.i
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
 _HOLDS_ALPHA = (".exr", ".png", ".tif", ".tiff")
 _HOLDS_GREY = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
-_PNG_END = b"IEND\xaeB`\x82"  # which OpenImageIO does not read
 _LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
 
 
@@ -316,6 +315,7 @@ def _is_whole(name: str) -> bool:
     last = source.read_scanline(source.spec().y + source.spec().height - 1, 0, "float")
     problem = source.geterror()
     source.close()
-    with open(name, "rb") as file:
-        file.seek(-8, os.SEEK_END)
-        return last is not None and not problem and (not name.endswith(".png") or file.read() == _PNG_END)
+    with contextlib.suppress(OSError):
+        check_chunks(Path(name))  # OpenImageIO does not read the last one
+        return last is not None and not problem
+    return False
