@@ -32,7 +32,7 @@ FLOORS = {
         *("validation", "exporting", "pixels", "io", "optics", "depth", "options", "render", "reference", "module"),
     },
     "augmentation": {"validation", "io", "optics", "options", "module"},
-    "distributed": {"validation", "io", "optics", "depth", "options", "augmentation"},
+    "distributed": {"validation", "io", "optics", "depth", "options", "module", "augmentation"},
     "bench": {"validation", "io", "optics", "depth", "options", "render", "reference", "module", "export"},
     "cli": {
         *("validation", "native", "io", "optics", "depth", "options", "render", "reference", "module"),

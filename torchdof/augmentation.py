@@ -106,7 +106,17 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
         """Draws ``focus_m`` [m], ``f_number`` and ``table`` (which of several), each ``[B]``."""
-        drawn = super().generate_parameters(batch_shape)
+        return self._in_units(super().generate_parameters(batch_shape))
+
+    def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """The parameters of one image by a generator of the caller's, each ``[1]``; the process's stays as it is."""
+        ends = {name: low_and_high for low_and_high, name, _, _ in self._param_generator.samplers}
+        return self._in_units(
+            {name: low + (high - low) * torch.rand(1, generator=generator) for name, (low, high) in ends.items()}
+        )
+
+    def _in_units(self, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Metres, f-numbers and the numbers of tables of what was drawn evenly."""
         return {
             "focus_m": (1.0 / drawn["focus"]).clamp(*self.focus_m),
             "f_number": torch.exp2(drawn["f_number"] / 2).clamp(*self.f_number),
@@ -146,7 +156,8 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         try:
             return super().forward(input, params, **kwargs)
         finally:
-            self._params.pop("depth", None)  # it is an input, not a parameter: nothing keeps it, nothing repeats it
+            if params is not None:  # depth is an input, not a parameter: nothing keeps it, nothing repeats it
+                params.pop("depth", None)
 
     def _forward_dict(
         self, sample: Mapping[str, Any], params: dict[str, Tensor] | None, **kwargs: Any

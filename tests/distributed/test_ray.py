@@ -47,18 +47,19 @@ def test_killed_and_resumed_it_ends_with_the_same_shards(photos: Path) -> None:
         time.sleep(0.02)
     os.killpg(first.pid, signal.SIGKILL)
     first.wait()
+    time.sleep(2)  # workers of the dead cluster end; what they still write is whole
     done = {path.name: path.stat().st_mtime_ns for path in shards.glob("shard-*.tar")}
     assert 2 <= len(done) < 12
-
-    time.sleep(2)  # workers of the dead cluster end; what they still write is whole
-    done |= {path.name: path.stat().st_mtime_ns for path in shards.glob("shard-*.tar")}
+    cut = sorted(done)[0]
+    os.truncate(shards / cut, 1000)  # what a disk may do to a file
+    del done[cut]
     told = subprocess.run(command, env=home, capture_output=True, text=True, timeout=240, check=True).stdout
     print(told)
     assert f"{len(done)} of 12 shards are there already" in told
     assert told.count(" is complete") == 12 - len(done)
     assert "left out: " in told and "05.png" in told and "images/s" in told
     assert all((shards / name).stat().st_mtime_ns == made for name, made in done.items())
-    assert "| samples | 23, 1 of each image |" in (shards / "README.md").read_text()
+    assert "| samples | 23 |" in (shards / "README.md").read_text()
     assert (shards / "broken.txt").read_text().count("05.png") >= 1
 
     (photos / "alone").mkdir()

@@ -2,7 +2,11 @@
 
 import io
 import json
+import os
+import sys
 import tarfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +57,10 @@ def picture(data: bytes, tmp_path: Path, suffix: str = ".png") -> Tensor:
 def test_a_shard_holds_each_sample_with_its_parameters(pairs: list[Pair], tmp_path: Path) -> None:
     told = made(tmp_path / "out", shard_rows(pairs, per_shard=5), picture=".exr")
     files = members(tmp_path / "out" / "shard-000000.tar")
-    assert [*files][:4] == [f"00000000.{name}" for name in ("blurred.exr", "sharp.exr", "depth.npy", "json")]
-    assert len(files) == 4 * 5 and told["error"].tolist() == [""] * 5
+    assert {*files} == {
+        f"{k:08d}.{name}" for k in range(5) for name in ("blurred.exr", "sharp.exr", "depth.npy", "json")
+    }
+    assert told["error"].tolist() == [""] * 5
     for k, pair in enumerate(pairs):
         key = f"{k:08d}"
         facts = json.loads(files[f"{key}.json"])
@@ -74,7 +80,9 @@ def test_what_is_in_a_shard_depends_on_its_row_and_the_seed_alone(pairs: list[Pa
     assert len(rows) == 5
     made(tmp_path / "forwards", rows)
     torch.manual_seed(99)
+    before = torch.get_rng_state()
     made(tmp_path / "backwards", rows[::-1])
+    assert torch.equal(torch.get_rng_state(), before)
     made(tmp_path / "other", rows, seed=1)
     for row in rows:
         name = f"shard-{row['shard']:06d}.tar"
@@ -83,7 +91,58 @@ def test_what_is_in_a_shard_depends_on_its_row_and_the_seed_alone(pairs: list[Pa
         assert whole != (tmp_path / "other" / name).read_bytes()
 
 
-def test_a_shard_that_is_there_is_not_made_again(pairs: list[Pair], tmp_path: Path) -> None:
+def test_threads_make_the_shards_that_one_would(pairs: list[Pair], tmp_path: Path) -> None:
+    rows = shard_rows(pairs, per_shard=1, copies=5)
+    made(tmp_path / "alone", rows)
+    (tmp_path / "threads").mkdir()
+    render = RenderShards(tmp_path / "threads", RandomDepthOfField(**BLUR))
+    before, interval = torch.get_rng_state(), sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # as often in each other's way as can be
+    try:
+        with ThreadPoolExecutor(8) as pool:
+            assert all(told["error"] == "" for told in pool.map(lambda row: render(batch([row])), rows))
+    finally:
+        sys.setswitchinterval(interval)
+    assert torch.equal(torch.get_rng_state(), before)
+    for path in (tmp_path / "alone").glob("*.tar"):
+        assert path.read_bytes() == (tmp_path / "threads" / path.name).read_bytes()
+
+
+def test_broken_inputs_are_left_out_and_listed(
+    pairs: list[Pair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path(pairs[1].image).write_bytes(b"no picture")
+    np.save(str(pairs[3].depth), np.zeros((12, 16)))
+
+    def allocate(image: Tensor, *arguments: Any, **options: Any) -> Tensor:
+        if torch.equal(image, read_image(pairs[4].image).pixels):
+            torch.empty(2**50)  # torch's allocator raises RuntimeError
+        return depth_of_field(image, *arguments, **options)
+
+    monkeypatch.setattr(torchdof.distributed.shards, "depth_of_field", allocate)
+    told = made(tmp_path / "out", shard_rows(pairs, per_shard=5), depth={"unknown": 0.0})
+    for k, error in {1: "cannot be read", 3: "have no depth", 4: "allocate"}.items():
+        assert error in told["error"][k]
+    names = {name.split(".")[0] for name in members(tmp_path / "out" / "shard-000000.tar")}
+    assert names == {"00000000", "00000002"}
+    summary = summary_of(tmp_path / "out")
+    assert (summary.samples, summary.shards) == (2, 1) and summary.seconds > 0
+    assert [image for image, _ in summary.broken] == [pairs[k].image for k in (1, 3, 4)]
+
+
+@pytest.mark.parametrize("format", ["webdataset", "parquet"])
+def test_names_that_are_no_utf_8_are_told_by_their_bytes(format: Any, pairs: list[Pair], tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow" if format == "parquet" else "webdataset")
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    (tmp_path / "images").rename(folder)
+    (folder / "1.png").write_bytes(b"no picture")
+    told = made(tmp_path / "out", shard_rows(pairs_in(folder, tmp_path / "depths")), format=format)
+    assert told["image"][0] == f"{tmp_path}/caf\\xe9/0.png"
+    assert [error == "" for error in told["error"]] == [True, False, True, True, True] and told["error"][1].encode()
+    assert summary_of(tmp_path / "out").broken[0][0].endswith("caf\\xe9/1.png")
+
+
+def test_a_shard_that_is_complete_is_not_made_again(pairs: list[Pair], tmp_path: Path) -> None:
     rows = shard_rows(pairs, per_shard=3)
     first = made(tmp_path / "out", rows)
     times = [path.stat().st_mtime_ns for path in sorted((tmp_path / "out").iterdir())]
@@ -92,16 +151,30 @@ def test_a_shard_that_is_there_is_not_made_again(pairs: list[Pair], tmp_path: Pa
     assert again["key"].tolist() == first["key"].tolist() and again["shard"].tolist() == [0, 0, 0, 1, 1]
 
 
-def test_broken_inputs_are_left_out_and_listed(pairs: list[Pair], tmp_path: Path) -> None:
-    Path(pairs[1].image).write_bytes(b"no picture")
-    np.save(str(pairs[3].depth), np.zeros((12, 16)))
-    told = made(tmp_path / "out", shard_rows(pairs, per_shard=5), depth={"unknown": 0.0})
-    assert ["cannot be read" in told["error"][1], bool(told["error"][3])] == [True, True]
-    names = {name.split(".")[0] for name in members(tmp_path / "out" / "shard-000000.tar")}
-    assert names == {"00000000", "00000002", "00000004"}
-    summary = summary_of(tmp_path / "out")
-    assert (summary.samples, summary.shards) == (3, 1) and summary.seconds > 0
-    assert [image for image, _ in summary.broken] == [pairs[1].image, pairs[3].image]
+@pytest.mark.parametrize("format", ["webdataset", "parquet"])
+@pytest.mark.parametrize(
+    ("damage", "suffix"),
+    [
+        (lambda path: path.write_bytes(b""), ".json"),
+        (lambda path: path.write_text("[]"), ".json"),
+        (lambda path: path.unlink(), ".json"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-600]), ""),
+        (lambda path: path.write_bytes(b""), ""),
+    ],
+    ids=["empty notes", "other notes", "no notes", "cut", "empty"],
+)
+def test_a_damaged_shard_is_made_again(
+    format: Any, damage: Callable[[Path], object], suffix: str, pairs: list[Pair], tmp_path: Path
+) -> None:
+    pytest.importorskip("pyarrow" if format == "parquet" else "webdataset")
+    rows = shard_rows(pairs, per_shard=3)
+    made(tmp_path / "out", rows, format=format)
+    first = next(path for path in sorted((tmp_path / "out").iterdir()) if path.suffix != ".json")
+    whole = first.read_bytes()
+    damage(first.with_suffix(suffix) if suffix else first)
+    assert (summary_of(tmp_path / "out").shards, summary_of(tmp_path / "out").samples) == (1, 2)
+    assert made(tmp_path / "out", rows, format=format)["error"].tolist() == [""] * 5
+    assert first.read_bytes() == whole and summary_of(tmp_path / "out").samples == 5
 
 
 def test_a_shard_is_written_whole_or_not_at_all(
@@ -114,11 +187,7 @@ def test_a_shard_is_written_whole_or_not_at_all(
     monkeypatch.setattr(torchdof.distributed.shards, "_write_tar", stopped)
     with pytest.raises(KeyboardInterrupt):
         made(tmp_path / "out", shard_rows(pairs))
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["shard-000000.json"]
-    assert summary_of(tmp_path / "out").shards == 0
-    monkeypatch.undo()
-    assert made(tmp_path / "out", shard_rows(pairs))["error"].tolist() == [""] * 5
-    assert summary_of(tmp_path / "out").shards == 1
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_cameras_may_be_given(pairs: list[Pair], tmp_path: Path) -> None:
@@ -150,11 +219,12 @@ def test_parquet_holds_the_same(pairs: list[Pair], tmp_path: Path) -> None:
     rows = shard_rows(pairs)
     made(tmp_path / "tar", rows)
     made(tmp_path / "parquet", rows, format="parquet")
-    table = parquet.read_table(tmp_path / "parquet" / "shard-000000.parquet").to_pylist()
     files = members(tmp_path / "tar" / "shard-000000.tar")
-    for row in table:
-        assert row["blurred.png"] == files[f"{row['key']}.blurred.png"]
-        assert row["focus_m"] == json.loads(files[f"{row['key']}.json"])["focus_m"]
+    for row in parquet.read_table(tmp_path / "parquet" / "shard-000000.parquet").to_pylist():
+        key = row.pop("key")
+        for name in ("blurred.png", "sharp.png", "depth.npy"):
+            assert row.pop(name) == files[f"{key}.{name}"]
+        assert row == json.loads(files[f"{key}.json"])
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it leaves its files to be closed
@@ -170,27 +240,37 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("call", "error", "message"),
     [
-        ({"format": "zip"}, "format must be 'webdataset' or 'parquet'"),
-        ({"keep": []}, "keep must be some of blurred, sharp, depth"),
-        ({"keep": "blurred"}, "keep must be some of"),
-        ({"picture": ".jpg"}, "picture must be"),
-        ({"blur": "disc"}, "blur must be a RandomDepthOfField"),
-        ({"depth": {"scal": 2.0}}, "depth must be some of kind, scale, offset, .* got scal"),
-        ({"depth": {"kind": "relative"}}, "depth must be some of kind, near_m, .*, with near_m and far_m, got kind"),
-        ({"seed": -1}, "seed must be a whole number"),
-        ({"threads": 0}, "threads must be a whole number"),
+        (lambda f: RenderShards(f, format="zip"), ValueError, "format must be 'webdataset' or 'parquet'"),
+        (lambda f: RenderShards(f, keep=[]), ValueError, "keep must be some of blurred, sharp, depth"),
+        (lambda f: RenderShards(f, keep="blurred"), ValueError, "keep must be some of"),
+        (lambda f: RenderShards(f, picture=".jpg"), ValueError, "picture must be"),
+        (lambda f: RenderShards(f, "disc"), ValueError, "blur must be a RandomDepthOfField"),
+        (lambda f: RenderShards(f, depth={"scal": 2.0}), ValueError, "depth must be some of kind, scale, .*'scal'"),
+        (lambda f: RenderShards(f, depth={"kind": "relative"}), ValueError, "some of kind, near_m, .*: .*'near_m'"),
+        (lambda f: RenderShards(f, seed=-1), ValueError, "seed must be a whole number"),
+        (lambda f: RenderShards(f, threads=0), ValueError, "threads must be a whole number"),
+        (lambda f: RenderShards(f / "none"), FileNotFoundError, "there is no such folder; make it first"),
+        (lambda f: summary_of(f / "none"), FileNotFoundError, "there is no such folder"),
+        (lambda f: pairs_in(f), FileNotFoundError, "no images here"),
+        (lambda f: Pair("a.png", focus_m=-1.0), ValueError, "focus_m must be a number"),
+        (lambda f: shard_rows([]), ValueError, "pairs must be at least one"),
     ],
 )
-def test_wrong_arguments_are_refused_by_name(arguments: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        RenderShards(tmp_path, **arguments)
+def test_wrong_arguments_are_refused_by_name(
+    call: Callable[[Path], object], error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=message):
+        call(tmp_path)
 
 
-def test_a_folder_must_be_there(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="there is no such folder; make it first"):
-        RenderShards(tmp_path / "none")
+def test_a_format_whose_package_is_missing_is_refused_before_anything_is_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"parquet needs pyarrow: pip install 'torchdof\[ray\]'"):
+        RenderShards(tmp_path, format="parquet")
 
 
 def test_pairs_are_found_by_their_names(pairs: list[Pair], tmp_path: Path) -> None:
@@ -202,9 +282,6 @@ def test_pairs_are_found_by_their_names(pairs: list[Pair], tmp_path: Path) -> No
     (tmp_path / "images" / "2.png").unlink()
     with pytest.raises(ValueError, match=r"3.png: .*found 3.npy and 3.npz"):
         pairs_in(tmp_path / "images", tmp_path / "depths")
-    with pytest.raises(FileNotFoundError, match="no images here"):
-        pairs_in(tmp_path)
-    with pytest.raises(ValueError, match="focus_m must be a number"):
-        Pair("a.png", focus_m=-1.0)
-    with pytest.raises(ValueError, match="pairs must be at least one"):
-        shard_rows([])
+    (tmp_path / "images" / "4.jpg").touch()
+    with pytest.raises(ValueError, match="4.jpg: there is 4.png of the same name; keep one of them"):
+        pairs_in(tmp_path / "images")

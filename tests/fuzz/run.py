@@ -54,8 +54,10 @@ def work(pipe: Connection, folder: str) -> None:
         os.ftruncate(printed, 0)
         os.lseek(printed, 0, os.SEEK_SET)
         wrong = beside("targets").finding(targets[name], Path(path))
-        if wrong is None and os.fstat(printed).st_size:
-            wrong = "printed: " + os.pread(printed, 200, 0).decode(errors="replace").strip()
+        lines = os.pread(printed, 10_000, 0).decode(errors="replace").splitlines()
+        lines = [line for line in lines if line and not line.startswith("libpng ")]
+        if wrong is None and lines:
+            wrong = f"printed: {lines[0][:200]}"
         pipe.send(wrong)
 
 

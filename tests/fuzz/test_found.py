@@ -8,7 +8,7 @@ from types import ModuleType
 
 import pytest
 
-from torchdof.io import png
+from torchdof.io.images import read_image
 
 pytestmark = pytest.mark.hard
 
@@ -31,7 +31,8 @@ TARGETS = _beside("targets").TARGETS
 @pytest.mark.parametrize("path", FOUND, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_what_was_found_is_taken_or_refused(path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert _beside("targets").finding(TARGETS[path.parent.name], path) is None
-    assert tuple(capfd.readouterr()) == ("", "")
+    printed = [line for text in capfd.readouterr() for line in text.splitlines() if not line.startswith("libpng ")]
+    assert printed == []
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -55,8 +56,8 @@ def test_changed_chunks_of_a_png_can_have_right_checksums(tmp_path: Path) -> Non
             continue
         path.write_bytes(content)
         try:
-            png.check(path)
-        except OSError as error:
+            read_image(path)
+        except (OSError, ValueError) as error:
             said.append(str(error))
-    assert any("filter" in line for line in said) or any("decompress" in line for line in said)
+    assert any("filter" in line for line in said) or any("invalid" in line for line in said)
     assert sum("checksum" in line for line in said) < len(said) / 2

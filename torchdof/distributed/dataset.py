@@ -9,12 +9,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..io.atomic import whole_file
+from ..io.atomic import write_text
 from ..validation import whole
-from .pairs import Pair
-from .shards import Format, RenderShards, shard_name, shard_rows
+from .shards import SUFFIXES, Format, Pair, RenderShards, samples_of, shard_rows
 
-__all__ = ["Summary", "make_dataset", "summary_of"]
+__all__ = ["Summary", "make_dataset", "pairs_in", "summary_of"]
+
+_IMAGES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".hdr", ".pfm")
+_DEPTHS = (".npy", ".npz", ".exr", ".png", ".tif", ".tiff", ".pfm")
+_CARD = """# Defocus data set
+
+Sharp photographs, their depth in metres along the optical axis, and the same photographs as a lens with a random focus
+(even in 1 / metres) and opening (even in stops) would have taken them; each sample holds its own parameters.
+Made by torchdof.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +40,42 @@ class Summary:
     shards: int
     broken: list[tuple[str, str]]
     seconds: float
+
+
+def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | None = None) -> list[Pair]:
+    """The images of a folder, each with the depth file of another that has its name but for the suffix; full paths.
+
+    Args:
+        images: Folder of images.
+        depths: Folder of depth maps; None takes the depth channels of the images.
+
+    Raises:
+        FileNotFoundError: If a folder is not there or holds no image.
+        ValueError: If an image has no depth, or several.
+    """
+    photographs, maps = _by_stem(images, _IMAGES), {} if depths is None else _by_stem(depths, _DEPTHS)
+    if not photographs:
+        raise FileNotFoundError(f"{images}: no images here ({' '.join(_IMAGES)})")
+    pairs = []
+    for stem, (image, *others) in photographs.items():
+        found = maps.get(stem, [])
+        if others:
+            raise ValueError(f"{image}: there is {others[0].name} of the same name; keep one of them")
+        if depths is not None and len(found) != 1:
+            listed = " and ".join(path.name for path in found) or "none"
+            raise ValueError(f"{image}: needs one depth map {stem}.* in {depths}, found {listed}")
+        pairs.append(Pair(str(image), str(found[0]) if found else None))
+    return pairs
+
+
+def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, list[Path]]:
+    if not Path(folder).is_dir():
+        raise FileNotFoundError(f"{folder}: there is no such folder")
+    found: dict[str, list[Path]] = {}
+    for path in sorted(Path(folder).absolute().iterdir()):
+        if path.suffix.lower() in suffixes and not path.name.startswith("."):
+            found.setdefault(path.stem, []).append(path)
+    return found
 
 
 def make_dataset(
@@ -77,121 +121,88 @@ def make_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     rows = shard_rows(pairs, per_shard, copies)
-    settings = RenderShards(
-        out, blur, format=format, **render
-    ).settings()  # wrong ones are refused here, not in a worker
+    settings = RenderShards(out, blur, format=format, **render).settings()  # wrong ones are refused before Ray starts
     listed = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
     settings = {"images": len(pairs), "copies": copies, "per_shard": per_shard, "sha256_of_samples": listed, **settings}
+    settings = json.loads(json.dumps(settings))  # with lists for tuples
     _same_as_before(out / "plan.json", settings)
-    missing = [row for row in rows if not (out / shard_name(row["shard"], format)).is_file()]
+    missing = [row for row in rows if samples_of(out / _name(row, format)) is None]
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
-    made, seconds = 0, 0.0
     if missing:
         if not ray.is_initialized():
             ray.init(include_dashboard=False)
         cores = int(ray.cluster_resources().get("CPU", 0))
         if workers > cores:
             raise ValueError(f"workers must be at most the cores of the Ray cluster, {cores}, got {workers}")
-        start = time.perf_counter()
-        made = _run(ray, missing, out, blur, workers, format, say, render)
-        seconds = time.perf_counter() - start
+        ray.data.DataContext.get_current().enable_progress_bars = False  # each shard is told instead
+        start, made = time.perf_counter(), 0
+        left = {row["shard"]: len(json.loads(row["samples"])) for row in missing}
+        told = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
+            RenderShards,
+            fn_constructor_args=(str(out.resolve()), blur),
+            fn_constructor_kwargs={"format": format, "threads": 1, **render},
+            batch_size=1,
+            compute=ray.data.ActorPoolStrategy(size=min(workers, len(missing))),
+            num_cpus=1,
+        )
+        for row in told.iter_rows():
+            made += not row["error"]
+            left[row["shard"]] -= 1
+            if not left[row["shard"]]:
+                say(f"{_name(row, format)} is complete")
+        pace = made / (time.perf_counter() - start)
+        say(f"{made} samples in {made / pace:.1f} s: {pace:.2f} images/s, {pace / workers:.2f} a worker")
     summary = summary_of(out)
     _describe(out, summary, settings)
-    if made:
-        say(
-            f"{made} samples in {seconds:.1f} s: {made / seconds:.2f} images/s, {made / seconds / workers:.2f} a worker"
-        )
     for image, problem in summary.broken:
         say(f"left out: {problem}" if problem.startswith(image) else f"left out: {image}: {problem}")
     return summary
 
 
-def _run(
-    ray: Any,
-    missing: list[dict[str, Any]],
-    out: Path,
-    blur: Any,
-    workers: int,
-    format: Format,
-    say: Callable[[str], object],
-    render: dict[str, Any],
-) -> int:
-    """Has Ray make shards; the number of samples written."""
-    ray.data.DataContext.get_current().enable_progress_bars = False  # each shard is told instead
-    arguments = {"format": format, "threads": 1, **render}
-    rows = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
-        RenderShards,
-        fn_constructor_args=(str(out.resolve()), blur),
-        fn_constructor_kwargs=arguments,
-        batch_size=1,
-        compute=ray.data.ActorPoolStrategy(size=min(workers, len(missing))),
-        num_cpus=1,
-    )
-    made, left = 0, {row["shard"]: len(json.loads(row["samples"])) for row in missing}
-    for row in rows.iter_rows():
-        made += not row["error"]
-        left[row["shard"]] -= 1
-        if not left[row["shard"]]:
-            say(f"{shard_name(row['shard'], format)} is complete")
-    return made
+def _name(row: dict[str, Any], format: Format) -> str:
+    return f"shard-{row['shard']:06d}{SUFFIXES[format]}"
 
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
-    """What is in the folder of a data set, complete or not.
+    """What is in the complete shards of a folder.
 
     Raises:
         FileNotFoundError: If there is no such folder.
     """
     if not Path(out).is_dir():
         raise FileNotFoundError(f"{out}: there is no such folder")
-    shards = [path for path in sorted(Path(out).glob("shard-*")) if path.suffix in (".tar", ".parquet")]
-    rows = [row for path in shards for row in json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))]
+    shards = [path for path in sorted(Path(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
+    noted = [samples for samples in map(samples_of, shards) if samples is not None]
+    rows = [row for samples in noted for row in samples]
     broken = [(row["image"], row["error"]) for row in rows if row["error"]]
-    return Summary(len(rows) - len(broken), len(shards), broken, sum(row["seconds"] for row in rows))
+    return Summary(len(rows) - len(broken), len(noted), broken, sum(row["seconds"] for row in rows))
 
 
-def _same_as_before(path: Path, plan: dict[str, Any]) -> None:
+def _same_as_before(path: Path, settings: dict[str, Any]) -> None:
     """Refuse to go on in a folder that was begun with other settings, or note them."""
-    text = json.dumps(plan, indent=1)
-    if path.is_file():
-        before = json.loads(path.read_text(encoding="utf-8"))
-        differing = [name for name in plan if before.get(name) != json.loads(text)[name]]
-        if differing:
-            raise ValueError(
-                f"{path.parent}: was begun with other settings ({', '.join(differing)}); go on with those in "
-                f"{path.name}, or use another folder"
-            )
-        return
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    if not path.is_file():
+        write_text(path, json.dumps(settings, indent=1))
+    try:
+        before = json.loads(path.read_bytes())
+        differing = [name for name, value in settings.items() if before.get(name) != value]
+    except (ValueError, AttributeError):
+        raise ValueError(f"{path}: cannot be read; put it back, or use another folder") from None
+    if differing:
+        raise ValueError(
+            f"{path.parent}: was begun with other settings ({', '.join(differing)}); go on with those in {path.name}, "
+            "or use another folder"
+        )
 
 
 def _describe(out: Path, summary: Summary, settings: dict[str, Any]) -> None:
     """The data set's card, and the list of what was left out."""
-    with whole_file(out / "broken.txt") as part:
-        part.write_text("".join(f"{image}\t{error}\n" for image, error in summary.broken), encoding="utf-8")
-    pace = f"{summary.seconds / summary.samples:.3f} s" if summary.samples else "no time"
-    focus, opening = settings["focus_m"], settings["f_number"]
-    text = f"""# Defocus data set
-
-Sharp photographs, their depth, and the same photographs as a lens with a random focus and opening would have taken
-them.
-
-| what | how much |
-| --- | --- |
-| samples | {summary.samples}, {settings["copies"]} of each image |
-| shards | {summary.shards}, {settings["format"]} |
-| inputs left out | {len(summary.broken)}, listed in broken.txt |
-| time | {pace} of one core a sample |
-| focus | {focus[0]:g} to {focus[1]:g} m, evenly in 1 / metres |
-| opening | f/{opening[0]:g} to f/{opening[1]:g}, evenly in stops |
-| camera | {settings["camera"]}, but for focus and opening |
-| lenses | {", ".join(settings["tables"])} |
-| seed | {settings["seed"]} |
-
-Each sample has its parameters (focus, f-number, focal length, sensor, lens, tolerance, seed, version) in its `json`
-{"file" if settings["format"] == "webdataset" else "columns"}. Depth is in metres along the optical axis.
-Made by torchdof.
-"""
-    with whole_file(out / "README.md") as part:
-        part.write_text(text, encoding="utf-8")
+    facts = {
+        "samples": summary.samples,
+        "shards": summary.shards,
+        "inputs left out": f"{len(summary.broken)}, listed in broken.txt",
+        "time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample",
+        **settings,
+    }
+    lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in facts.items()]
+    write_text(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
+    write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))

@@ -1,19 +1,20 @@
 """One shard of a data set: images read, blurred by random or given cameras, and written whole or not at all.
 
-A shard is named by its number and what is in it depends on nothing but its row and the seed. So a run that was stopped
+A shard is named by its number, and what is in it depends on nothing but its row and the seed. So a run that was stopped
 goes on with the shards that are missing, and ends with the files that it would have ended with undisturbed.
 """
 
 import dataclasses
 import hashlib
 import importlib.metadata
+import importlib.util
+import inspect
 import io
 import json
 import os
-import tarfile
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,30 +27,48 @@ from ..depth.holes import resolve_holes
 from ..depth.reading import read_depth
 from ..depth.relative import from_relative
 from ..depth.size import at_size_of
-from ..io.atomic import whole_file
+from ..io.atomic import whole_file, write_text
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.transfer import Transfer
-from ..validation import show, whole
-from .pairs import Pair
+from ..module import depth_of_field
+from ..validation import number, show, whole
 
-__all__ = ["Format", "RenderShards", "shard_name", "shard_rows"]
+__all__ = ["SUFFIXES", "Format", "Pair", "RenderShards", "samples_of", "shard_rows"]
 
 Format = Literal["webdataset", "parquet"]
 
-_SUFFIXES: dict[str, str] = {"webdataset": ".tar", "parquet": ".parquet"}
-_METRIC = ("kind", "scale", "offset", "unknown", "fov_x_deg", "fill", "channel")
-_RELATIVE = ("kind", "near_m", "far_m", "relative_kind", "value_range", "unknown", "fill", "channel")
+SUFFIXES = {"webdataset": ".tar", "parquet": ".parquet"}
+_WRITERS = {"webdataset": "webdataset", "parquet": "pyarrow"}
 _KEPT = ("blurred", "sharp", "depth")
 
 
-def shard_name(shard: int, format: Format) -> str:
-    """File name of a shard.
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """An image and its depth.
+
+    Args:
+        image: Image file.
+        depth: Depth file; None takes the depth channel of the image.
+        focus_m: Distance in focus in metres; None draws one.
+        f_number: F-number; None draws one.
+
+    Raises:
+        ValueError: If a number is not positive.
 
     Example:
-        >>> shard_name(12, "webdataset")
-        'shard-000012.tar'
+        >>> Pair("a.png", "a.npy", focus_m=2.0).f_number is None
+        True
     """
-    return f"shard-{shard:06d}{_SUFFIXES[format]}"
+
+    image: str
+    depth: str | None = None
+    focus_m: float | None = None
+    f_number: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("focus_m", "f_number"):
+            if getattr(self, name) is not None:
+                number(name, getattr(self, name), low=0.0, infinite=name == "focus_m")
 
 
 def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> list[dict[str, Any]]:
@@ -74,19 +93,25 @@ def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> l
         raise ValueError("pairs must be at least one Pair, got none")
     whole("per_shard", per_shard, 1, 10**9)
     whole("copies", copies, 1, 10**9)
-    samples = [
-        {"key": f"{n * copies + copy:08d}", **dataclasses.asdict(pair)}
-        for n, pair in enumerate(pairs)
-        for copy in range(copies)
-    ]
+    repeated = (dataclasses.asdict(pair) for pair in pairs for _ in range(copies))
+    samples = [{"key": f"{n:08d}", **sample} for n, sample in enumerate(repeated)]
     parts = [samples[start : start + per_shard] for start in range(0, len(samples), per_shard)]
     return [{"shard": number, "samples": json.dumps(part)} for number, part in enumerate(parts)]
+
+
+def samples_of(shard: Path) -> list[dict[str, Any]] | None:
+    """What is noted of the samples of a shard; None if the shard is not there or not complete."""
+    try:
+        notes = json.loads(shard.with_suffix(".json").read_bytes())
+        return list(notes["samples"]) if notes["bytes"] == shard.stat().st_size else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 class RenderShards:
     """Makes shards: a callable for ``ray.data.Dataset.map_batches``, which needs nothing of Ray itself.
 
-    Each row of a batch is a shard of :func:`shard_rows`. A shard that is there already is not made again. An input that
+    Each row of a batch is a shard of :func:`shard_rows`. A shard that is complete is not made again. An input that
     cannot be read or rendered is left out and listed in ``shard-NNNNNN.json`` beside the shard, with its error.
 
     A WebDataset shard holds for each key ``KEY.blurred.png``, ``KEY.sharp.png``, ``KEY.depth.npy`` (metres, float32)
@@ -98,7 +123,7 @@ class RenderShards:
         depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`; or, of depth
             without a scale, ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}``, with ``relative_kind``,
             ``value_range`` and ``unknown`` as in :func:`torchdof.depth.from_relative`, and ``fill`` and ``channel``.
-        format: "webdataset" or "parquet" (which needs pyarrow).
+        format: "webdataset" or "parquet"; they need the packages webdataset and pyarrow.
         keep: What is written of each sample: of "blurred", "sharp" and "depth".
         seed: Of the draws; a sample's own draw depends on it and on its key alone.
         transfer: How images are encoded; None takes integers as sRGB and floats as linear.
@@ -108,6 +133,7 @@ class RenderShards:
     Raises:
         ValueError: If an argument is not as described.
         FileNotFoundError: If there is no such folder.
+        ModuleNotFoundError: If the package that writes the format is not installed.
 
     Example:
         >>> import tempfile
@@ -136,8 +162,10 @@ class RenderShards:
         self.out = Path(out)
         if not self.out.is_dir():
             raise FileNotFoundError(f"{out}: there is no such folder; make it first")
-        if format not in _SUFFIXES:
+        if format not in SUFFIXES:
             raise ValueError(f"format must be 'webdataset' or 'parquet', got {show(format)}")
+        if importlib.util.find_spec(_WRITERS[format]) is None:
+            raise ModuleNotFoundError(f"{format} needs {_WRITERS[format]}: pip install 'torchdof[ray]'")
         if not keep or isinstance(keep, str) or not set(keep) <= set(_KEPT):
             raise ValueError(f"keep must be some of {', '.join(_KEPT)}, got {show(keep)}")
         if picture not in (".png", ".exr"):
@@ -146,14 +174,15 @@ class RenderShards:
         if not isinstance(self.blur, RandomDepthOfField):
             raise ValueError(f"blur must be a RandomDepthOfField, got {show(blur)}")
         self.depth = dict(depth or {})
-        known = _RELATIVE if self.depth.get("kind") == "relative" else _METRIC
-        if not set(self.depth) <= {*known} or (known is _RELATIVE and not {"near_m", "far_m"} <= set(self.depth)):
-            needed = ", with near_m and far_m" if known is _RELATIVE else ""
-            raise ValueError(f"depth must be some of {', '.join(known)}{needed}, got {', '.join(map(str, self.depth))}")
+        self._read_depth = _read_relative if self.depth.get("kind") == "relative" else read_depth
+        known = inspect.signature(self._read_depth)
+        try:
+            known.bind("", **self.depth)
+        except TypeError as error:
+            raise ValueError(f"depth must be some of {', '.join([*known.parameters][1:])}: {error}") from None
         self.format: Format = format
-        self.keep = tuple(keep)
+        self.keep, self.transfer, self.picture = tuple(keep), transfer, picture
         self.seed = whole("seed", seed, 0, 2**62)
-        self.transfer, self.picture = transfer, picture
         if threads is not None:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
@@ -172,132 +201,118 @@ class RenderShards:
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
-            rows += self._make(int(shard), json.loads(str(samples)))
-        columns = {"shard": np.int64, "key": object, "image": object, "error": object, "seconds": np.float64}
-        return {name: np.array([row[name] for row in rows], dtype=kind) for name, kind in columns.items()}
+            path = self.out / f"shard-{int(shard):06d}{SUFFIXES[self.format]}"
+            for row in samples_of(path) or self._make(path, json.loads(str(samples))):
+                rows.append({"shard": int(shard), **row})
+        return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
     def settings(self) -> dict[str, Any]:
         """All that the shards depend on beside their rows, as JSON holds it."""
-        tables = {item.table.fingerprint(): item.table.name or item.table.family for item in self.blur.renderings}
-        options = self.blur.renderings[0].arguments()
+        lenses = [rendering.table for rendering in self.blur.renderings]
         return {
-            "format": self.format,
-            "keep": [*self.keep],
-            "picture": self.picture,
-            "transfer": self.transfer,
-            "seed": self.seed,
-            "focus_m": [*self.blur.focus_m],
-            "f_number": [*self.blur.f_number],
+            **{name: getattr(self, name) for name in ("format", "keep", "picture", "transfer", "seed", "depth")},
+            **{name: getattr(self.blur, name) for name in ("focus_m", "f_number")},
             "camera": repr(self.blur.camera),
-            "tables": [*tables.values()],
-            "table_fingerprints": [*tables],
-            "options": {name: value for name, value in options.items() if name != "table"},
-            "depth": self.depth,
+            "lenses": {table.fingerprint(): table.name or table.family for table in lenses},
+            "options": _plain(self.blur.renderings[0].arguments()),
         }
 
-    def _make(self, shard: int, samples: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Render one shard and write it, or read what was written of it."""
-        path = self.out / shard_name(shard, self.format)
-        notes = path.with_suffix(".json")
-        if path.is_file() and notes.is_file():
-            return list(json.loads(notes.read_text(encoding="utf-8")))
+    def _make(self, path: Path, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Render one shard and write it."""
         records, rows = [], []
         for sample in samples:
-            start = time.process_time()
-            error = ""
+            start, error = time.process_time(), ""
             try:
-                records.append(self._sample(sample))
-            except (OSError, ValueError, MemoryError) as broken:
+                records.append(self._sample(**sample))
+            except (OSError, ValueError, MemoryError, RuntimeError) as broken:  # torch's allocator raises the last
                 error = str(broken) or type(broken).__name__
-            seconds = time.process_time() - start
-            rows.append({"shard": shard, "key": sample["key"], "image": sample["image"], "error": error})
-            rows[-1]["seconds"] = round(seconds, 4)
-        with whole_file(notes) as part:
-            part.write_text(json.dumps(rows, indent=1), encoding="utf-8")
-        with whole_file(path) as part:  # last: a shard that is there is complete
+            seconds = round(time.process_time() - start, 4)
+            rows.append(
+                {"key": sample["key"], "image": _text(sample["image"]), "error": _text(error), "seconds": seconds}
+            )
+        with whole_file(path) as part:
             (_write_tar if self.format == "webdataset" else _write_parquet)(part, records)
+            notes = {"bytes": part.stat().st_size, "samples": rows}
+            write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # a shard that is there has its notes
         return rows
 
-    def _sample(self, sample: Mapping[str, Any]) -> dict[str, Any]:
+    def _sample(
+        self, key: str, image: str, depth: str | None, focus_m: float | None, f_number: float | None
+    ) -> dict[str, Any]:
         """One sample by the names of its files, beside its parameters."""
-        source = read_image(sample["image"], self.transfer)
-        depth = at_size_of(source.pixels, self._metres(sample["depth"] or sample["image"]))
-        drawn = self._drawn(sample, tuple(source.pixels.shape))
-        with torch.no_grad():
-            blurred = self.blur(source.pixels, depth, params=drawn, transfer="linear")
-        camera = self.blur.camera.replace(focus_m=drawn["focus_m"], f_number=drawn["f_number"])
+        source = read_image(image, self.transfer)
+        metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
+        own = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
+        drawn = self.blur.draw(torch.Generator().manual_seed(int.from_bytes(own[:8], "little") >> 1))
+        camera = self.blur.camera.replace(
+            focus_m=float(drawn["focus_m"]) if focus_m is None else focus_m,
+            f_number=float(drawn["f_number"]) if f_number is None else f_number,
+        )
         options = self.blur.renderings[int(drawn["table"])]
-        record: dict[str, Any] = {"key": sample["key"]}
-        pictures = {"blurred": blurred, "sharp": source.pixels}
-        for name in (name for name in self.keep if name in pictures):
-            record[name + self.picture] = self._encoded(pictures[name], source.channels)
-        if "depth" in self.keep:
-            file = io.BytesIO()
-            np.save(file, depth[0, 0].numpy())
-            record["depth.npy"] = file.getvalue()
+        with torch.no_grad():
+            blurred = depth_of_field(source.pixels, metres, camera, **options.arguments())
+        record: dict[str, Any] = {}
+        for name in self.keep:
+            if name == "depth":
+                file = io.BytesIO()
+                np.save(file, metres[0, 0].numpy())
+                record["depth.npy"] = file.getvalue()
+            else:
+                pixels = blurred if name == "blurred" else source.pixels
+                record[name + self.picture] = _encoded(Picture(pixels, source.channels), self.picture)
         record["json"] = {
-            "image": sample["image"],
-            "depth": sample["depth"],
-            "height": blurred.shape[-2],
-            "width": blurred.shape[-1],
-            "focus_m": float(drawn["focus_m"]),
-            "f_number": float(drawn["f_number"]),
-            "focal_length_mm": float(camera.focal_length_mm),
-            "sensor_width_mm": float(camera.sensor_width_mm),
-            "focus_breathing": camera.focus_breathing,
+            **_plain(vars(camera)),
+            **_plain(options.arguments()),
             "table": options.table.name or options.table.family,
             "table_fingerprint": options.table.fingerprint(),
             "aperture": None if options.table.aperture is None else repr(options.table.aperture),
-            "camera": repr(camera),
-            "tolerance": options.tolerance,
-            "occlusion": options.occlusion,
-            "method": options.method,
-            "depth_edges": options.depth_edges,
-            "largest_coc_px": float(camera.coc_px(depth, blurred.shape[-1]).abs().nan_to_num().max()),
+            "image": _text(image),
+            "depth": depth and _text(depth),
+            "height": blurred.shape[-2],
+            "width": blurred.shape[-1],
+            "largest_coc_px": float(camera.coc_px(metres, blurred.shape[-1]).abs().nan_to_num().max()),
             "seed": self.seed,
             "torchdof": importlib.metadata.version("torchdof"),
         }
-        return record
+        return {"key": key, **record}
 
-    def _metres(self, path: str) -> Tensor:
-        """Depth from a file, ``[1, 1, h, w]``, without holes."""
-        how = dict(self.depth)
-        if how.get("kind") != "relative":
-            return read_depth(path, **how)
-        fill, channel = how.pop("fill", None), how.pop("channel", None)
-        how["kind"] = how.pop("relative_kind", "disparity")
-        return resolve_holes(from_relative(read_values(path, channel), **how), path, fill)[0]
 
-    def _drawn(self, sample: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Tensor]:
-        """The parameters of a sample: its own draw, with what is given put in its place."""
-        own = hashlib.sha256(f"{self.seed} {sample['key']}".encode()).digest()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int.from_bytes(own[:8], "little") >> 1)
-            drawn = self.blur.generate_parameters(shape)
-        for name in ("focus_m", "f_number"):
-            if sample[name] is not None:
-                drawn[name] = torch.tensor([sample[name]])
-        return {**drawn, "batch_prob": torch.ones(1)}
+def _read_relative(
+    path: str, kind: str, near_m: float, far_m: float, relative_kind: Any = "disparity",
+    value_range: Any = None, unknown: float | None = None, fill: Any = None, channel: str | None = None,
+) -> Tensor:  # fmt: skip
+    """Depth without a scale from a file to metres, ``[1, 1, H, W]``, without holes."""
+    values = read_values(path, channel)
+    metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
+    return resolve_holes(metres, path, fill)[0]
 
-    def _encoded(self, pixels: Tensor, channels: tuple[str, ...]) -> bytes:
-        """The bytes of a picture's file."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"picture{self.picture}"
-            write_image(path, Picture(pixels, channels))
-            return path.read_bytes()
+
+def _text(name: str) -> str:
+    """The name of a file as UTF-8 holds it: of other bytes, their numbers."""
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def _plain(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers and words of a camera or of options, as JSON holds them."""
+    numbers = {name: float(value) if isinstance(value, Tensor) else value for name, value in arguments.items()}
+    return {name: value for name, value in numbers.items() if name != "table"}
+
+
+def _encoded(picture: Picture, suffix: str) -> bytes:
+    """The bytes of a picture's file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"picture{suffix}"
+        write_image(path, picture)
+        return path.read_bytes()
 
 
 def _write_tar(path: Path, records: Sequence[dict[str, Any]]) -> None:
     """A WebDataset shard; the same records give the same bytes."""
-    with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as tar:
+    import webdataset
+
+    with webdataset.TarWriter(str(path), mtime=0) as tar:
         for record in records:
-            for name, value in record.items():
-                if name == "key":
-                    continue
-                data = json.dumps(value).encode() if name == "json" else value
-                member = tarfile.TarInfo(f"{record['key']}.{name}")
-                member.size = len(data)
-                tar.addfile(member, io.BytesIO(data))
+            tar.write({name if name != "key" else "__key__": value for name, value in record.items()})
 
 
 def _write_parquet(path: Path, records: Sequence[dict[str, Any]]) -> None:

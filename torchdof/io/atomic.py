@@ -1,27 +1,25 @@
 """A file is written whole or not at all: under another name in the same folder, renamed once it is complete.
 
-What is written goes by the name ``.NAME.OWNER.part.SUFFIX``. It vanishes on any error, Ctrl-C and SIGTERM included. A
-process that is killed outright leaves it behind: the next one that writes to the folder removes it.
+That name vanishes on any error, Ctrl-C, SIGTERM and SIGHUP included. A process that is killed outright leaves it
+behind; the first that writes to the folder a day later removes it.
 """
 
 import contextlib
-import hashlib
+import functools
 import os
-import re
 import signal
-import socket
 import threading
+import time
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import NoReturn
 
-__all__ = ["whole_file"]
+__all__ = ["whole_file", "write_text"]
 
-_PART = re.compile(r"\..*\.(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-(?P<start>\d+)-[0-9a-f]{8}\.part(\.[^.]*)?", re.DOTALL)
+_DAY = 86_400.0  # seconds
 _ENDS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-_tidied: set[str] = set()
-_unfinished: set[Path] = set()
 
 
 @contextlib.contextmanager
@@ -48,80 +46,46 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise IsADirectoryError(f"{path}: is a folder; name a file in it")
     if not os.access(target.parent, os.W_OK):
         raise PermissionError(f"{path}: may not write to the folder {target.parent}")
-    if str(target.parent) not in _tidied:  # once: a folder of many frames takes long to list
-        _tidied.add(str(target.parent))
-        _tidy(target.parent)
-    owner = f"{_place()}-{os.getpid()}-{_start(os.getpid())}-{uuid.uuid4().hex[:8]}"
-    part = target.with_name(f".{target.stem[:80]}.{owner}.part{target.suffix}")
-    try:
-        with _removed_on_termination(part):
+    _remove_abandoned(target.parent)
+    part = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
+    with _unwound_on_termination():
+        try:
             yield part
             with part.open("rb+") as file:
                 os.fsync(file.fileno())
             os.replace(part, target)
-    finally:
-        part.unlink(missing_ok=True)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Writes a text file in UTF-8, whole or not at all."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@functools.cache  # once: a folder of many frames takes long to list
+def _remove_abandoned(folder: Path) -> None:
+    """Removes what processes that were killed had not finished writing."""
+    for part in folder.glob("." + "[0-9a-f]" * 32 + ".part*"):
+        with contextlib.suppress(OSError):
+            if time.time() - part.stat().st_mtime > _DAY:
+                part.unlink()
 
 
 @contextlib.contextmanager
-def _removed_on_termination(part: Path) -> Iterator[None]:
-    """While it lasts, SIGTERM and SIGHUP remove a file before they end the process, unless somebody handles them."""
-    _unfinished.add(part)
-    heard = []
-    if threading.current_thread() is threading.main_thread():  # no other hears of signals
-        heard = [number for number in _ENDS if signal.getsignal(number) == signal.SIG_DFL]
+def _unwound_on_termination() -> Iterator[None]:
+    """SIGTERM and SIGHUP as ``SystemExit``, which tidies up behind itself, unless somebody handles them."""
+
+    def leave(number: int, _: FrameType | None) -> NoReturn:
+        raise SystemExit(128 + number)  # the status that a shell tells of a process that the signal ended
+
+    main = threading.current_thread() is threading.main_thread()  # no other hears of signals
+    heard = [number for number in _ENDS if main and signal.getsignal(number) == signal.SIG_DFL]
     try:
         for number in heard:
-            signal.signal(number, _end)
+            signal.signal(number, leave)
         yield
     finally:
         for number in heard:
             signal.signal(number, signal.SIG_DFL)
-        _unfinished.discard(part)
-
-
-def _end(number: int, _: FrameType | None) -> None:
-    """Removes what is being written, then ends the process as the signal would have."""
-    for part in list(_unfinished):
-        part.unlink(missing_ok=True)
-    signal.signal(number, signal.SIG_DFL)
-    os.kill(os.getpid(), number)
-
-
-def _tidy(folder: Path) -> None:
-    """Removes what processes of this machine that are gone had not finished writing."""
-    if os.name != "posix":  # elsewhere nobody can be asked whether they live
-        return
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            named = _PART.fullmatch(entry.name)
-            if named is None or named["place"] != _place() or int(named["pid"]) == os.getpid():
-                continue
-            if not _alive(int(named["pid"])) or _start(int(named["pid"])) != named["start"]:
-                with contextlib.suppress(OSError):
-                    os.unlink(entry.path)
-
-
-def _place() -> str:
-    """Where a process number means something: this machine and, in a container, its own numbering."""
-    numbering = ""
-    with contextlib.suppress(OSError):
-        numbering = os.readlink("/proc/self/ns/pid")
-    return hashlib.sha256(f"{socket.gethostname()} {numbering}".encode()).hexdigest()[:8]
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
-
-
-def _start(process: int) -> str:
-    """When a process began, in ticks since the machine started, which tells two of one number apart; 0 if unknown."""
-    with contextlib.suppress(OSError, IndexError):
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[19]
-    return "0"

@@ -1,33 +1,44 @@
 """What an image file or array holds, as stored: every channel's numbers, before they mean light or depth.
 
-OpenImageIO is imported when a file is read, so that ``import torchdof`` stays light.
+What a header promises is held against limits and free memory before anything is decoded. OpenImageIO is imported when a
+file is read, so that ``import torchdof`` stays light.
 """
 
+import contextlib
 import dataclasses
+import mmap
 import os
 import struct
-import tokenize
+import tempfile
 import zipfile
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from ..validation import show
-from . import exr, png
 from .memory import free_bytes
 from .metadata import kept_metadata
 
-__all__ = ["Part", "PixelType", "existing", "first_line", "read_array", "read_parts"]
+__all__ = [
+    "MOST_ATTRIBUTES",
+    "Part",
+    "PixelType",
+    "check_chunks",
+    "existing",
+    "first_line",
+    "named_in_utf8",
+    "read_array",
+    "read_parts",
+]
 
 PixelType = Literal["8", "16", "half", "float"]
 
 MAX_PIXELS = 2**28
-# what numpy and zipfile raise on bytes that are no array
-_BROKEN: tuple[type[Exception], ...] = (ValueError, OSError, EOFError, KeyError, TypeError, MemoryError, OverflowError)
-_BROKEN += (RuntimeError, SyntaxError, zipfile.BadZipFile, struct.error, zlib.error, tokenize.TokenError)
-_SAMPLES: dict[str, PixelType] = {"uint8": "8", "uint16": "16", "half": "half"}
+MOST_ATTRIBUTES = 4096
+"""Of all parts of an EXR file together; what renderers write is a few hundred."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +49,8 @@ class Part:
         label: Name of the part, often empty.
         names: Names of the channels.
         values: ``[H, W, C]``.
-        samples: What each channel was stored as: "8", "16", "half" or "float".
-        white: The number that stands for 1.0: 255, 65535 or 1.
+        kinds: What each channel was stored as, as OpenImageIO calls it: "uint8", "half", ...
+        is_exr: Whether names may carry a layer before a dot, and whole numbers are no parts of white.
         straight_alpha: Whether colour is not multiplied by alpha yet.
         metadata: Name -> (OpenImageIO type, value).
         window: x, y, full x, full y, full width, full height.
@@ -48,8 +59,8 @@ class Part:
     label: str
     names: tuple[str, ...]
     values: np.ndarray
-    samples: tuple[PixelType, ...]
-    white: float = 1.0
+    kinds: tuple[str, ...]
+    is_exr: bool = False
     straight_alpha: bool = False
     metadata: dict[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None
@@ -80,79 +91,133 @@ def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str)
     return path
 
 
+@contextlib.contextmanager
+def named_in_utf8(path: Path) -> Iterator[str]:
+    """A name by which OpenImageIO opens a file: one that is no UTF-8 by a link to it."""
+    with contextlib.ExitStack() as folders:
+        try:
+            name = os.fsencode(path).decode()
+        except UnicodeDecodeError:
+            link = Path(folders.enter_context(tempfile.TemporaryDirectory()), f"picture{path.suffix}")
+            link.symlink_to(path.absolute())
+            name = str(link)
+        yield name
+
+
 def read_parts(path: Path) -> list[Part]:
     """Reads every part of an image file.
 
     Raises:
         OSError: If the file is damaged, cut short or not an image.
-        ValueError: If it is too large, or holds deep samples.
+        ValueError: If it is too large, holds deep samples, or colours in a way that is not read here.
     """
+    if path.suffix.lower() == ".pfm":
+        return [_read_pfm(path)]
+    check_chunks(path)
+    _check_attributes(path)
     try:
-        return [_read_pfm(path)] if path.suffix.lower() == ".pfm" else _read_every_part(path)
+        with named_in_utf8(path) as name:
+            return list(_parts(path, name))
     except UnicodeDecodeError:
         raise OSError(f"{path}: is damaged (a name in its header is no text)") from None
 
 
-def _read_every_part(path: Path) -> list[Part]:
+def _parts(path: Path, name: str) -> Iterator[Part]:
     """The parts of a file that OpenImageIO reads; other than EXR files have one."""
     import OpenImageIO as oiio
 
-    if path.suffix.lower() == ".png":
-        png.check(path)
-    elif path.suffix.lower() == ".exr":
-        exr.check(path)
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), config)
+    source = oiio.ImageInput.open(name, config)
     if source is None:
         raise OSError(f"{path}: cannot be read ({first_line(oiio.geterror())})")
-    parts: list[Part] = []
-    promised = 0
+    is_exr, number, promised = source.format_name() == "openexr", 0, 0
     try:
-        while source.seek_subimage(len(parts), 0):
+        while source.seek_subimage(number, 0) and (is_exr or not number):
             spec = source.spec()
-            promised += _check_size(
-                path, spec.width, spec.height, spec.pixel_bytes(True) + 4 * spec.nchannels, promised
-            )
+            pixel_bytes = spec.nchannels * (spec.format.size() + 4)
+            promised += _check_size(path, spec.width, spec.height, pixel_bytes, promised)
             if spec.deep:
                 raise ValueError(f"{path}: holds deep samples; flatten it to one sample a pixel first")
+            _check_colours(path, spec)
             values = source.read_image(spec.format)
             problem = source.geterror()
             if values is None or problem:
                 raise OSError(f"{path}: is damaged or cut short ({first_line(problem)})")
             names = tuple(spec.channelnames)
-            is_exr = source.format_name() == "openexr"
             if not is_exr and len(names) <= 4:
                 names = tuple(("Y", "YA", "RGB", "RGBA")[len(names) - 1])
-            integers = np.issubdtype(values.dtype, np.integer)
-            formats = [str(f) for f in spec.channelformats] or [str(spec.format)] * len(names)
-            parts.append(
-                Part(
-                    label=spec.get_string_attribute("name"),
-                    names=names,
-                    values=values.reshape(spec.height, spec.width, len(names)),
-                    samples=tuple(_SAMPLES.get(f, "16" if integers else "float") for f in formats),
-                    white=float(np.iinfo(values.dtype).max) if integers and not is_exr else 1.0,
-                    straight_alpha=bool(spec.get_int_attribute("oiio:UnassociatedAlpha")),
-                    metadata=kept_metadata(spec.extra_attribs),
-                    window=(spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height),
-                )
+            yield Part(
+                label=spec.get_string_attribute("name"),
+                names=names,
+                values=values.reshape(spec.height, spec.width, len(names)),
+                kinds=tuple(map(str, spec.channelformats)) or (str(spec.format),) * len(names),
+                is_exr=is_exr,
+                straight_alpha=bool(spec.get_int_attribute("oiio:UnassociatedAlpha")),
+                metadata=kept_metadata(spec.extra_attribs),
+                window=(spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height),
             )
-            if not is_exr:
-                break
+            number += 1
     finally:
         source.close()
-    return parts
+
+
+def check_chunks(path: Path) -> None:
+    """Refuse a PNG that is cut short or has a wrong checksum: its library would print a line of its own about it.
+
+    Raises:
+        OSError: Naming the part that is damaged.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        place, name = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
+        while name != b"IEND":
+            length, name = struct.unpack(">I4s", content[place : place + 8].ljust(8, b"\0"))
+            end = place + 8 + length
+            if end + 4 > len(content):
+                raise OSError(f"{path}: is damaged or cut short (it ends in its part {name!r})")
+            if zlib.crc32(content[place + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
+                raise OSError(f"{path}: is damaged or cut short (its part {name!r} has another checksum)")
+            place = end + 4
+
+
+def _check_attributes(path: Path) -> None:
+    """Refuse an EXR whose headers hold more attributes than anybody wrote: its library takes minutes for 1e5.
+
+    Reference:
+        OpenEXR File Layout, openexr.com.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        if content[:4] != b"v/1\x01" or len(content) < 9:
+            return
+        several, place = bool(content[5] & 0x10), 8
+        for _ in range(MOST_ATTRIBUTES):
+            if content[place : place + 1] == b"\0":  # the end of a part's header
+                place += 1
+                if not several or content[place : place + 1] == b"\0":
+                    return
+            type_end = content.find(b"\0", content.find(b"\0", place) + 1)
+            place = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
+            if type_end < place - 2**31 or place >= len(content):  # damaged: left to its reader
+                return
+    raise ValueError(f"{path}: its headers hold more than {MOST_ATTRIBUTES} attributes, and no more are read")
+
+
+def _check_colours(path: Path, spec: Any) -> None:
+    """Refuse a TIFF whose numbers OpenImageIO does not give as light or ink: CIELAB, a raw mosaic, negatives."""
+    meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", 2)
+    inks = spec.get_string_attribute("tiff:ColorSpace") == "CMYK"
+    if not (meaning in (1, 2, 3, 6) or (meaning == 0 and str(spec.format) == "uint8") or (meaning == 5 and inks)):
+        raise ValueError(
+            f"{path}: its colours are not stored as RGB or grey (photometric interpretation {meaning}: CIELAB, a raw "
+            "mosaic, a negative or the like); convert it to RGB"
+        )
 
 
 def _read_pfm(path: Path) -> Part:
     """PFM by hand: OpenImageIO multiplies by the header's scale, which ruins disparities (Middlebury's among them)."""
     with path.open("rb") as file:
         words: list[bytes] = []
-        while len(words) < 4:
-            line = file.readline(100)
-            if not line:
-                break
+        while len(words) < 4 and (line := file.readline(100)):
             words += line.split()
         try:
             channels = {b"PF": 3, b"Pf": 1}[words[0]]
@@ -166,8 +231,7 @@ def _read_pfm(path: Path) -> Part:
         raise OSError(f"{path}: is cut short ({len(data)} of {4 * count} bytes of pixels)")
     values = np.frombuffer(data, dtype="<f4" if scale < 0 else ">f4").astype(np.float32)
     values = values.reshape(height, width, channels)[::-1]  # stored from the bottom row up
-    samples: list[PixelType] = ["float"] * channels
-    return Part("", tuple("Y" if channels == 1 else "RGB"), values, tuple(samples))
+    return Part("", tuple("Y" if channels == 1 else "RGB"), values, ("float",) * channels)
 
 
 def read_array(path: Path, key: str | None) -> np.ndarray:
@@ -189,18 +253,17 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
                 if 2 * largest > free_bytes():
                     raise ValueError(f"holds {largest} bytes, more than there is memory for")
             with np.load(path, allow_pickle=False) as arrays:
+                listed = ", ".join(arrays.files)
                 if key is None and len(arrays.files) != 1:
-                    raise ValueError(
-                        f"which of the arrays {', '.join(arrays.files)} is depth? name it (--depth-channel)"
-                    )
+                    raise ValueError(f"which of the arrays {listed} is depth? name it (--depth-channel)")
                 if key is not None and key not in arrays.files:
-                    raise ValueError(f"no array {key!r}; it has {', '.join(arrays.files)}")
+                    raise ValueError(f"no array {key!r}; it has {listed}")
                 array = arrays[key or arrays.files[0]]
         else:
             array = np.load(path, allow_pickle=False, mmap_mode="r")
         if not isinstance(array, np.ndarray):
             raise ValueError("it is no array")
-    except _BROKEN as error:
+    except Exception as error:  # of bytes that are no array, numpy and zipfile raise a dozen kinds
         raise ValueError(f"{path}: cannot be read as an array ({first_line(str(error))})") from None
     shape = array.shape
     while array.ndim > 2 and 1 in (array.shape[0], array.shape[-1]):

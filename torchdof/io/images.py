@@ -6,9 +6,10 @@ sRGB and files of floats (EXR, HDR, PFM, TIFF of floats) as linear light, unless
 OpenImageIO is imported when a file is read or written, so that ``import torchdof`` stays light.
 """
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from ..validation import real_tensor
 from . import foreign
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
-from .decode import PixelType, existing, first_line, read_array, read_parts
+from .decode import Part, PixelType, check_chunks, existing, first_line, named_in_utf8, read_array, read_parts
 from .transfer import Transfer, decode, default_transfer, encode
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
@@ -37,6 +38,8 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hol
     ".pfm": ("float",),
 }
 _OIIO_SAMPLE = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
+_STORED: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.items()} | {"double": "float"}
+_WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
 _HOLDS_ALPHA = (".exr", ".png", ".tif", ".tiff")
 _HOLDS_GREY = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
 _LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
@@ -84,8 +87,9 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         or ``ViewLayer.Depth.Z``). Pixels are as stored: the orientation tag of a camera is kept, not applied.
 
     Raises:
-        OSError: If the file is missing, empty, truncated or not an image.
-        ValueError: If the type is not supported, a channel is missing or colours are not finite.
+        OSError: If the file is missing, empty, truncated, not an image, or memory for it cannot be had.
+        ValueError: If the type, the size or the kind of colours is not supported, a channel is missing, or colours are
+            not finite.
 
     Example:
         >>> import tempfile
@@ -100,30 +104,72 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     path = existing(path, (*_SUFFIXES, *foreign.readable()), "an image")
     if transfer not in (None, "linear", "srgb"):
         raise ValueError(f"transfer must be 'linear' or 'srgb', got {transfer!r}")
-    parts = read_parts(path)
-    try:
-        part, indices, names = colour_channels(
-            [(p.label, p.names) for p in parts], layer, path.suffix.lower() == ".exr"
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    source = parts[part]
-    array = _float32(source.values[..., indices])
-    if not np.isfinite(array).all():
-        bad = int((~np.isfinite(array)).any(axis=-1).sum())
-        raise ValueError(f"{path}: {bad} pixels are not finite (NaN or inf); repair them before blurring spreads them")
-    sample: PixelType = "half" if all(source.samples[k] == "half" for k in indices) else source.samples[indices[0]]
-    transfer = transfer or default_transfer(sample)
-    pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]  # [H, W, C] -> [1, C, H, W]
-    pixels = decode(pixels / source.white, transfer, names[-1] == "A", source.straight_alpha)
-    if not bool(torch.isfinite(pixels).all()):
-        raise ValueError(f"{path}: its light is beyond what float32 holds; scale it down")
-    depth = None
-    same_size = [p for p in parts if p.values.shape[:2] == source.values.shape[:2]]
-    depth_place = depth_channel([(p.label, p.names) for p in same_size])
-    if depth_place is not None:
-        depth = torch.from_numpy(_float32(same_size[depth_place[0]].values[..., depth_place[1]]))[None, None]
+    with _memory_for(path):
+        parts = read_parts(path)
+        try:
+            part, indices, names = colour_channels([(p.label, p.names) for p in parts], layer, parts[0].is_exr)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        source = parts[part]
+        pixels, sample, transfer = _light(path, source, indices, transfer, has_alpha=names[-1] == "A")
+        depth = None
+        same_size = [p for p in parts if p.values.shape[:2] == source.values.shape[:2]]
+        depth_place = depth_channel([(p.label, p.names) for p in same_size])
+        if depth_place is not None:
+            depth = _map(same_size[depth_place[0]].values[..., depth_place[1]])
     return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window)
+
+
+@contextlib.contextmanager
+def _memory_for(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:  # torch's allocator raises the latter
+        raise OSError(f"{path}: memory for it cannot be had ({first_line(str(error))})") from None
+
+
+def _light(
+    path: Path, source: Part, indices: list[int], transfer: Transfer | None, has_alpha: bool
+) -> tuple[Tensor, PixelType, Transfer]:
+    """Stored numbers as light ``[1, C, H, W]``, what they were stored as and how encoded."""
+    kinds = [source.kinds[k] for k in indices]
+    kind = kinds[0] if len(set(kinds)) == 1 else "float"
+    if kind not in _STORED and not source.is_exr:
+        raise ValueError(f"{path}: holds numbers of type {kind}, of which it is not known what is white; store 16 bits")
+    sample = _STORED.get(kind, "float")
+    transfer, white = transfer or default_transfer(sample), _WHITE[sample]
+    curve = None
+    if white > 1 and (source.straight_alpha or not has_alpha):
+        levels = np.arange(white + 1, dtype=np.float32).reshape(1, 1, 1, -1) / np.float32(white)
+        curve = decode(torch.from_numpy(levels), transfer, has_alpha=False, straight=False).flatten().numpy()
+    height, width = source.values.shape[:2]
+    light, unknown = torch.from_numpy(np.empty((1, len(indices), height, width), np.float32)), 0
+    for lines in _strips(height, width * len(indices)):
+        stored = source.values[lines][..., indices]
+        if curve is not None:
+            values = curve[stored]
+            if has_alpha:
+                values[..., -1] = stored[..., -1] / np.float32(white)
+        else:
+            values = _float32(stored)
+            values = values / np.float32(white) if white > 1 else values
+            unknown += int((~np.isfinite(values)).any(axis=-1).sum())
+        pixels = torch.from_numpy(values).permute(2, 0, 1)[None]  # [h, W, C] -> [1, C, h, W]
+        encoded: Transfer = "linear" if curve is not None else transfer
+        light[:, :, lines] = decode(pixels, encoded, has_alpha, source.straight_alpha)
+        if not unknown and not bool(torch.isfinite(light[:, :, lines]).all()):
+            raise ValueError(f"{path}: its light is beyond what float32 holds; scale it down")
+    if unknown:
+        raise ValueError(
+            f"{path}: {unknown} pixels are not finite (NaN or inf); repair them before blurring spreads them"
+        )
+    return light, sample, transfer
+
+
+def _strips(height: int, line: int) -> list[slice]:
+    """Some lines at a time, about a million numbers, so that nothing but a picture itself is as large as a picture."""
+    lines = 1 + 2**20 // line
+    return [slice(top, top + lines) for top in range(0, height, lines)]
 
 
 def write_image(
@@ -169,10 +215,11 @@ def write_image(
     if names[0] == "Y" and suffix not in _HOLDS_GREY:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
-    pixels = encode(pixels, transfer, names[-1] == "A", straight)
-    if sample == "half":
-        pixels = pixels.clamp(-65504.0, 65504.0)
-    array = np.ascontiguousarray(pixels[0].permute(1, 2, 0).numpy())  # [C, H, W] -> [H, W, C]
+    array = np.empty((*pixels.shape[2:], len(names)), np.float32)
+    for lines in _strips(array.shape[0], array.shape[1] * len(names)):
+        encoded = encode(pixels[:, :, lines], transfer, names[-1] == "A", straight)
+        encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
+        array[lines] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
 
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
     spec.channelnames = names
@@ -195,17 +242,19 @@ def write_image(
         spec.attribute("jpeg:subsampling", "4:4:4")
 
     with whole_file(path) as part:
-        if suffix in (".jpg", ".jpeg"):
-            _reserve(part, array.size + 2**20)
-        output = oiio.ImageOutput.create(str(part))
-        if output is None or not output.open(str(part), spec):
-            problem = (oiio if output is None else output).geterror()
-            raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
-        done = output.write_image(array)
-        done = output.close() and done
-        problem = output.geterror()  # a full disk shows only here
-        if not done or problem or not _is_whole(part):
-            raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
+        with part.open("wb") as file:
+            if suffix in (".jpg", ".jpeg") and hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, array.size + 2**20)  # libjpeg ends the process on a full disk
+        with named_in_utf8(part) as name:
+            output = oiio.ImageOutput.create(name)
+            if output is None or not output.open(name, spec):
+                problem = (oiio if output is None else output).geterror()
+                raise OSError(f"{path}: could not be opened for writing ({first_line(problem)})")
+            done = output.write_image(array)
+            done = output.close() and done
+            problem = output.geterror()  # a full disk shows only here
+            if not done or problem or not _is_whole(name):
+                raise OSError(f"{path}: could not be written ({first_line(problem)}); is the disk full?")
 
 
 def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Tensor:
@@ -221,28 +270,32 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         a PFM file is not applied.
 
     Raises:
-        OSError: If the file is missing, empty, truncated or unreadable.
+        OSError: If the file is missing, empty, truncated or unreadable, or memory for it cannot be had.
         ValueError: If the channel is not clear, or the array is not two-dimensional numbers.
     """
     path = existing(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
-    if path.suffix.lower() in (".npy", ".npz"):
-        return torch.from_numpy(_float32(read_array(path, channel)))[None, None]
-    parts = read_parts(path)
-    planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
-    listing = ", ".join(name for _, name, _ in planes)
-    if channel is not None:
-        chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
-        if not chosen:
-            raise ValueError(f"{path}: no channel {channel!r}; it has {listing}")
-        return torch.from_numpy(_float32(chosen[0]))[None, None]
-    depth_place = depth_channel([(p.label, p.names) for p in parts])
-    if depth_place is not None:
-        plane = parts[depth_place[0]].values[..., depth_place[1]]
-    elif all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
-        plane = planes[0][2]
-    else:
-        raise ValueError(f"{path}: which of the channels {listing} is depth? name it (--depth-channel)")
-    return torch.from_numpy(_float32(plane))[None, None]
+    with _memory_for(path):
+        if path.suffix.lower() in (".npy", ".npz"):
+            return _map(read_array(path, channel))
+        parts = read_parts(path)
+        planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
+        listing = ", ".join(name for _, name, _ in planes)
+        if channel is not None:
+            chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
+            if not chosen:
+                raise ValueError(f"{path}: no channel {channel!r}; it has {listing}")
+            return _map(chosen[0])
+        depth_place = depth_channel([(p.label, p.names) for p in parts])
+        if depth_place is not None:
+            return _map(parts[depth_place[0]].values[..., depth_place[1]])
+        if all(np.array_equal(values, planes[0][2]) for _, name, values in planes if name != "A"):
+            return _map(planes[0][2])
+    raise ValueError(f"{path}: which of the channels {listing} is depth? name it (--depth-channel)")
+
+
+def _map(values: np.ndarray) -> Tensor:
+    """Numbers ``[H, W]`` as ``[1, 1, H, W]``."""
+    return torch.from_numpy(_float32(values))[None, None]
 
 
 def _float32(values: np.ndarray) -> np.ndarray:
@@ -251,17 +304,18 @@ def _float32(values: np.ndarray) -> np.ndarray:
         return values.astype(np.float32)
 
 
-def _is_whole(path: Path) -> bool:
-    """Whether a file that was written can be read: what fails in the last flush of its buffer is reported by nobody."""
-    try:
-        read_parts(path)
-    except (OSError, ValueError):
+def _is_whole(name: str) -> bool:
+    """Whether a file's end is there: what fails in the last flush of its buffer is reported by nobody."""
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(name)
+    if source is None:
+        oiio.geterror()
         return False
-    return True
-
-
-def _reserve(path: Path, size: int) -> None:
-    """Reserves the bytes on the disk, because libjpeg ends the process when that is full."""
-    if hasattr(os, "posix_fallocate"):
-        with path.open("wb") as file:
-            os.posix_fallocate(file.fileno(), 0, size)
+    last = source.read_scanline(source.spec().y + source.spec().height - 1, 0, "float")
+    problem = source.geterror()
+    source.close()
+    with contextlib.suppress(OSError):
+        check_chunks(Path(name))  # OpenImageIO does not read the last one
+        return last is not None and not problem
+    return False

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..io.atomic import whole_file
+from ..io.atomic import write_text
 from ..validation import show
 
 __all__ = ["fields_of", "find", "read", "shipped", "stamped", "write"]
@@ -63,9 +63,7 @@ def write(data: Mapping[str, Any], path: str | os.PathLike[str]) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
-    text = json.dumps(data, indent=1) + "\n"
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(path, json.dumps(data, indent=1) + "\n")
 
 
 def stamped(fields: Mapping[str, Any]) -> dict[str, Any]:

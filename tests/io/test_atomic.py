@@ -1,0 +1,181 @@
+"""A file is written whole or not at all: on full disks, by several at once, and whatever ends the process."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from torchdof import BlurTable
+from torchdof.io import atomic
+from torchdof.io.atomic import whole_file, write_text
+from torchdof.io.images import Picture, read_image, write_image
+
+pytestmark = pytest.mark.hard
+
+PICTURE = Picture(torch.linspace(0, 1, 3 * 8 * 9).reshape(1, 3, 8, 9))
+WRITES: dict[str, Callable[[Path], object]] = {
+    "x.json": BlurTable.disc().save,
+    "x.exr": lambda path: write_image(path, PICTURE),
+}
+
+
+@pytest.mark.parametrize("name", WRITES)
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_what_fails_leaves_the_old_file_and_nothing_else(
+    name: str, error: type[BaseException], step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise error
+
+    (tmp_path / name).write_text("old")
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(error):
+        WRITES[name](tmp_path / name)
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [(name, "old")]
+
+
+CUT = """
+import os, resource, signal, sys, torch
+from torchdof.io.images import Picture, read_image, write_image
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+picture = Picture(torch.linspace(0, 1, 3 * 30 * 40).reshape(1, 3, 30, 40))
+for folder in sys.argv[1:]:
+    name, sample = folder.split()
+    os.chdir(folder)
+    write_image("whole" + name, picture, sample=sample)
+    size = len(open("whole" + name, "rb").read())
+    for limit in (size - 1, size - 3, size // 2, 100):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        try:
+            write_image(name, picture, sample=sample)
+            print(folder, "written")
+        except OSError as error:
+            print(folder, "refused:", error)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    os.chdir("..")
+"""
+KINDS = (".png 8", ".png 16", ".exr half", ".exr float", ".tif float", ".hdr float", ".pfm float", ".jpg 8")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files")
+def test_a_disk_that_is_full_from_the_start_or_at_the_last_byte_is_noticed(tmp_path: Path) -> None:
+    folders = [f"x{kind}" for kind in KINDS]
+    for name in folders:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name.split()[0]).write_text("old")
+    call = [sys.executable, "-c", CUT, *folders]
+    run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    for name in folders:
+        said = [line.removeprefix(name) for line in run.stdout.splitlines() if line.startswith(name)]
+        assert len(said) == 4 and all(line.startswith(" refused:") for line in said), run.stdout + run.stderr
+        file = name.split()[0]
+        assert sorted(p.name for p in (tmp_path / name).iterdir()) == [f"whole{file}", file]
+        assert (tmp_path / name / file).read_text() == "old"
+
+
+def test_writers_of_one_name_at_once_leave_one_whole_file(tmp_path: Path) -> None:
+    script = """
+import sys, torch
+from torchdof.io.images import Picture, write_image
+for _ in range(20):
+    write_image("x.exr", Picture(torch.full((1, 3, 50, 60), float(sys.argv[1]))))
+"""
+    runs = [subprocess.Popen([sys.executable, "-c", script, value], cwd=tmp_path) for value in ("1", "2")]
+    assert [run.wait(timeout=120) for run in runs] == [0, 0]
+    assert read_image(tmp_path / "x.exr").pixels.unique().tolist() in ([1.0], [2.0])
+    assert [p.name for p in tmp_path.iterdir()] == ["x.exr"]
+
+
+WRITING = """
+import signal, sys, time
+from torchdof.io.atomic import whole_file
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, and stays so
+with whole_file(sys.argv[1]) as outer, whole_file(sys.argv[1] + ".json") as inner:
+    outer.write_bytes(b"half")
+    inner.write_bytes(b"half")
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def writing(path: Path) -> subprocess.Popen[str]:
+    """A process that is in the middle of two files."""
+    run = subprocess.Popen([sys.executable, "-c", WRITING, str(path)], stdout=subprocess.PIPE, text=True)
+    assert run.stdout is not None and run.stdout.readline() == "writing\n"
+    return run
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_termination_while_files_are_written_leaves_nothing_of_them(tmp_path: Path, number: int) -> None:
+    (tmp_path / "x.exr").write_text("old")
+    with writing(tmp_path / "x.exr") as run:
+        run.send_signal(number)
+        assert run.wait(timeout=30) == 128 + number
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("x.exr", "old")]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_what_a_killed_process_left_is_removed_by_the_first_that_writes_there_a_day_later(tmp_path: Path) -> None:
+    with writing(tmp_path / "x.exr") as run:
+        run.kill()
+    left = {*tmp_path.iterdir()}
+    other = tmp_path / ".y.exr-like.part"
+    other.write_text("of somebody else")
+    for path in (*left, other):
+        os.utime(path, (time.time() - 90_000,) * 2)
+    with writing(tmp_path / "z.exr") as living:
+        begun = {*tmp_path.iterdir()} - {other}
+        assert len(left) == len(begun) == 2 and not begun & left
+        living.kill()
+
+
+def test_a_handler_of_the_caller_is_left_alone(tmp_path: Path) -> None:
+    def handler(*_: Any) -> None: ...
+
+    before = signal.signal(signal.SIGTERM, handler)
+    try:
+        for mine in (handler, signal.SIG_DFL):
+            signal.signal(signal.SIGTERM, mine)
+            BlurTable.disc().save(tmp_path / "x.json")
+            assert signal.getsignal(signal.SIGTERM) == mine
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_folder_is_searched_for_leftovers_once(tmp_path: Path) -> None:
+    for _ in range(2):
+        write_text(tmp_path / "x.txt", "x")
+        (tmp_path / f".{'0' * 32}.part").touch()
+        os.utime(tmp_path / f".{'0' * 32}.part", (0, 0))
+    assert (tmp_path / f".{'0' * 32}.part").exists()
+    atomic._remove_abandoned.cache_clear()
+    write_text(tmp_path / "x.txt", "x")
+    assert [p.name for p in tmp_path.iterdir()] == ["x.txt"]
+
+
+def test_a_link_is_followed_and_kept(tmp_path: Path) -> None:
+    (tmp_path / "real.png").write_text("old")
+    (tmp_path / "link.png").symlink_to(tmp_path / "real.png")
+    with whole_file(tmp_path / "link.png") as part:
+        part.write_text("new")
+    assert (tmp_path / "link.png").is_symlink()
+    assert (tmp_path / "real.png").read_text() == "new"
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission_is_named(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(PermissionError, match="may not write to the folder"):
+            write_image(tmp_path / "x.exr", PICTURE)
+    finally:
+        tmp_path.chmod(0o700)

@@ -1,0 +1,463 @@
+"""Files that lie, are damaged, too large, or of a kind that is not read: refused by name, in one line, without harm."""
+
+import io
+import os
+import re
+import struct
+import subprocess
+import sys
+import time
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from torchdof import BlurTable
+from torchdof.depth.reading import read_depth
+from torchdof.io import foreign
+from torchdof.io.decode import MOST_ATTRIBUTES
+from torchdof.io.images import Picture, read_image, read_values, write_image
+
+pytestmark = pytest.mark.hard
+
+Made = Callable[[Path], object]
+FUZZ = settings(
+    max_examples=max(100, settings().max_examples // 5),
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+KINDS = {".png": "8", ".tif": "float", ".exr": "half", ".jpg": "8", ".hdr": "float", ".pfm": "float"}
+
+
+def tiny(height: int = 8, width: int = 9) -> Picture:
+    return Picture(torch.linspace(0, 1, 3 * height * width).reshape(1, 3, height, width))
+
+
+def with_bytes(content: bytes) -> Made:
+    return lambda path: path.write_bytes(content)
+
+
+def with_values(values: np.ndarray, *names: str, kind: str = "float", tags: dict[int, int] | None = None) -> Made:
+    """A file by OpenImageIO alone, in a TIFF some tags of which are changed afterwards."""
+
+    def make(path: Path) -> None:
+        spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
+        spec.channelnames = names or spec.channelnames
+        output = oiio.ImageOutput.create(str(path))
+        assert output is not None and output.open(str(path), spec)
+        assert output.write_image(values) and output.close()
+        content = bytearray(path.read_bytes())
+        for tag, value in (tags or {}).items():
+            start = struct.unpack_from("<I", content, 4)[0] + 2
+            count = struct.unpack_from("<H", content, start - 2)[0]
+            (at,) = (e for e in range(start, start + 12 * count, 12) if struct.unpack_from("<H", content, e)[0] == tag)
+            struct.pack_into("<H", content, at + 8, value)
+        path.write_bytes(content)
+
+    return make
+
+
+def with_array(array: Any, cut: int | None = None) -> Made:
+    def make(path: Path) -> None:
+        np.save(path, array, allow_pickle=True) if path.suffix == ".npy" else np.savez(path, array)
+        path.write_bytes(path.read_bytes()[:cut])
+
+    return make
+
+
+def with_member(name: str) -> Made:
+    def make(path: Path) -> None:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr(name, "no array")
+
+    return make
+
+
+def loop(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def deep(path: Path) -> None:
+    spec = oiio.ImageSpec(4, 4, 2, "float")
+    spec.channelnames, spec.deep = ("Z", "A"), True
+    samples = oiio.DeepData()
+    samples.init(16, 2, [oiio.FLOAT, oiio.FLOAT], ["Z", "A"])
+    for pixel in range(16):
+        samples.set_samples(pixel, 2)
+    output = oiio.ImageOutput.create(str(path))
+    assert output is not None and output.open(str(path), spec)
+    assert output.write_deep_image(samples) and output.close()
+
+
+def large_map(path: Path) -> None:
+    np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=(2**15, 2**14))
+
+
+class Bomb:
+    """Makes a file when it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (Path("ran"),))
+
+
+def holed() -> np.ndarray:
+    values = np.ones((4, 4, 3), np.float32)
+    values[1, 2, 0], values[3, 3, :] = np.nan, np.inf
+    return values
+
+
+GREY, COLOUR, TEXT = np.ones((2, 3, 1), np.float32), np.ones((2, 3, 3), np.float32), b"hello world, this is no image\n"
+NOT_RGB = r"colours are not stored as RGB or grey \(photometric interpretation"
+
+# name, how it is made, what reading it as an image is refused with, and as a map (None: not tried)
+FILES: list[tuple[str, Made | None, str | None, str | None]] = [
+    ("none.png", None, "there is no such file", "there is no such file"),
+    ("none.npy", None, "is not an image that can be read", "there is no such file"),
+    ("empty.png", with_bytes(b""), "the file is empty", "the file is empty"),
+    ("folder.png", Path.mkdir, "is not a file", "is not a file"),
+    ("text.exr", with_bytes(TEXT), "cannot be read", "cannot be read"),
+    ("text.png", with_bytes(TEXT), "cannot be read", "cannot be read"),
+    ("text.pfm", with_bytes(b"hello\n"), "is not a PFM file", "is not a PFM file"),
+    ("header.pfm", with_bytes(b"PF\n3 2\n"), "is not a PFM file", None),
+    ("short.pfm", with_bytes(b"PF\n3 2\n-1\n12345"), "is cut short", None),
+    ("huge.pfm", with_bytes(b"PF\n999999 999999\n-1\n12345"), "claims 999999 x 999999 pixels", None),
+    ("negative.pfm", with_bytes(b"PF\n-3 2\n-1\n12345"), "claims -3 x 2 pixels", None),
+    ("picture.gif", with_bytes(b"GIF89a"), "is not an image that can be read", "is not a depth map"),
+    ("picture", with_bytes(b"x"), "no suffix is not an image", "no suffix is not a depth map"),
+    *((f"loop{suffix}", loop, None, "is a link that leads back to itself") for suffix in (".png", ".npy", ".npz")),
+    ("deep.exr", deep, "holds deep samples; flatten it", "holds deep samples; flatten it"),
+    ("c.exr", with_values(np.ones((4, 4, 1200), np.float32), *(f"c{i}.R" for i in range(1200))), "1200 channels", None),
+    ("holes.exr", with_values(holed()), "2 pixels are not finite", None),
+    ("bright.tif", with_values(np.full((2, 3, 3), 1e39), kind="double"), "6 pixels are not finite", None),
+    ("z.exr", with_values(GREY, "Z"), "has no colour: expected channels R, G, B or Y, found Z", None),
+    *(
+        (f"no{c}.exr", with_values(np.ones((2, 3, 2), np.float32), *"RGB".replace(c, "")), "expected channels R", None)
+        for c in "RGB"
+    ),
+    ("lab.tif", with_values(COLOUR, kind="uint8", tags={262: 8}), f"{NOT_RGB} 8", f"{NOT_RGB} 8"),
+    ("lab16.tif", with_values(COLOUR, kind="uint16", tags={262: 8}), f"{NOT_RGB} 8", f"{NOT_RGB} 8"),
+    ("inks.tif", with_values(COLOUR, kind="uint8", tags={262: 5}), f"{NOT_RGB} 5", f"{NOT_RGB} 5"),
+    ("mosaic.tif", with_values(GREY, kind="uint16", tags={262: 32803}), f"{NOT_RGB} 32803", f"{NOT_RGB} 32803"),
+    ("negative.tif", with_values(GREY, kind="uint16", tags={262: 0}), f"{NOT_RGB} 0", f"{NOT_RGB} 0"),
+    ("signed.tif", with_values(GREY, kind="int16"), "numbers of type int16, of which it is not known what is wh", None),
+    ("colour.png", with_values(np.eye(3, dtype=np.float32)[None], kind="uint8"), None, "which of the channels R, G, B"),
+    ("object.npy", with_array(np.array([[{"a": 1}]], object)), None, "cannot be read as an array"),
+    ("bomb.npy", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
+    ("bomb.npz", with_array(np.array([[Bomb()]], object)), None, "cannot be read as an array"),
+    ("text.npy", with_array(np.array([["a"]])), None, r"expected an array \[H, W\] of numbers"),
+    ("vector.npy", with_array(np.zeros(5)), None, r"expected an array \[H, W\] of numbers"),
+    ("complex.npy", with_array(np.zeros((2, 2), complex)), None, r"expected an array \[H, W\] of numbers"),
+    ("zero.npy", with_array(np.zeros((0, 4))), None, r"expected an array \[H, W\] of numbers"),
+    ("cut.npy", with_array(np.zeros((50, 50)), cut=500), None, "cannot be read as an array"),
+    ("junk.npy", with_bytes(b"\x93NUMPY junk"), None, "cannot be read as an array"),
+    ("large.npy", large_map, None, "claims 16384 x 32768 pixels"),
+    *((f"{m}.npz", with_member(m), None, "cannot be read as an array") for m in ("depth.txt", "depth", "depth.npy")),
+]
+
+
+@pytest.mark.parametrize(("name", "make", "image", "values"), FILES, ids=[file[0] for file in FILES])
+def test_a_file_that_is_not_what_it_should_be_is_refused_by_name_in_one_line(
+    name: str,
+    make: Made | None,
+    image: str | None,
+    values: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if make is not None:
+        make(tmp_path / name)
+    for read, message in ((read_image, image), (read_values, values)):
+        if message is not None:
+            with pytest.raises((ValueError, OSError), match=message) as caught:
+                read(tmp_path / name)
+            assert name in str(caught.value) and "\n" not in str(caught.value)
+    assert not (tmp_path / "ran").exists()
+
+
+NO_TARGETS: list[tuple[str, Any, str]] = [
+    ("x.hdr", "16", r"a \.hdr file holds samples of float, not 16"),
+    ("x.jpg", "half", r"a \.jpg file holds samples of 8, not half"),
+    ("x.gif", None, "cannot write files of type '.gif'"),
+    ("x", None, "cannot write files of type 'none'"),
+    ("missing/x.png", None, "there is no folder .*missing; make it first"),
+    ("folder.png", None, r"folder\.png: is a folder"),
+    ("loop.exr", None, r"loop\.exr: is a link that leads back to itself"),
+]
+
+
+@pytest.mark.parametrize(("name", "sample", "message"), NO_TARGETS)
+def test_a_target_that_cannot_be_written_is_named(name: str, sample: Any, message: str, tmp_path: Path) -> None:
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "loop.exr").symlink_to("other.exr")
+    (tmp_path / "other.exr").symlink_to("loop.exr")
+    with pytest.raises((ValueError, OSError), match=message):
+        write_image(tmp_path / name, tiny(), sample=sample)
+    assert (tmp_path / "loop.exr").is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [("a.heic", "convert it to JPEG or 16-bit TIFF"), ("a.AVIF", "convert it"), ("a.dng", "develop it to linear")],
+)
+def test_a_type_without_a_reader_is_refused_with_how_to_convert_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, how: str
+) -> None:
+    monkeypatch.setattr(foreign, "readable", lambda: ())
+    with pytest.raises(ValueError, match=rf"{name}: {Path(name).suffix.lower()} is not read here: {how}"):
+        read_image(name)
+    # OpenImageIO goes by what is in a file: a JPEG stands for what its reader of such a type would give
+    write_image(tmp_path / "a.jpg", Picture(torch.full((1, 3, 8, 8), 0.2159)))
+    (tmp_path / "a.jpg").rename(tmp_path / name)
+    monkeypatch.setattr(foreign, "readable", lambda: (Path(name).suffix.lower(),))
+    assert float(read_image(tmp_path / name).pixels.mean()) == pytest.approx(0.2159, abs=0.002)
+
+
+def test_names_that_are_no_utf_8_are_read_and_written(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    folder.mkdir()
+    for suffix, sample in KINDS.items():
+        write_image(folder / f"x{suffix}", tiny(), sample=sample)  # type: ignore[arg-type]
+        named = folder / (os.fsdecode(b"\xe9") + suffix)
+        (folder / f"x{suffix}").rename(named)
+        assert torch.equal(read_image(named).pixels, read_image(shutil_copy(named, tmp_path)).pixels)
+    np.save(folder / os.fsdecode(b"\xe9.npy"), np.ones((2, 3)))
+    assert read_values(folder / os.fsdecode(b"\xe9.npy")).mean() == 1.0
+    BlurTable.disc().save(folder / "x.json")
+    named.write_bytes(TEXT)
+    with pytest.raises(OSError, match="is not a PFM file"):
+        read_image(named)
+
+
+def shutil_copy(path: Path, folder: Path) -> Path:
+    copy = folder / f"copy{path.suffix}"
+    copy.write_bytes(path.read_bytes())
+    return copy
+
+
+# Damage
+
+
+@pytest.mark.parametrize(("suffix", "sample"), KINDS.items())
+@pytest.mark.parametrize("share", [0.1, 0.6, 0.98])
+def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, share: float) -> None:
+    write_image(tmp_path / f"whole{suffix}", Picture(torch.rand(1, 3, 100, 130)), sample=sample)
+    content = (tmp_path / f"whole{suffix}").read_bytes()
+    (tmp_path / f"cut{suffix}").write_bytes(content[: int(len(content) * share)])
+    with pytest.raises(OSError, match=r"cut\.\w+: (is damaged or cut short|is cut short|cannot be read)"):
+        read_image(tmp_path / f"cut{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [*KINDS, ".npy", ".npz"])
+@FUZZ
+@given(st.data())
+def test_a_file_with_bytes_changed_is_read_or_refused_by_name(suffix: str, tmp_path: Path, data: Any) -> None:
+    path = tmp_path / f"x{suffix}"
+    if not path.exists():
+        array = np.linspace(1, 2, 12, dtype=np.float32).reshape(3, 4)
+        stored = io.BytesIO()
+        np.savez_compressed(stored, depth=array) if suffix == ".npz" else np.save(stored, array)
+        (tmp_path / f"whole{suffix}").write_bytes(stored.getvalue())
+        if suffix in KINDS:
+            write_image(tmp_path / f"whole{suffix}", tiny())
+        path.touch()
+    content = bytearray((tmp_path / f"whole{suffix}").read_bytes())
+    # mostly in the header, where sizes and offsets are
+    places = st.integers(0, min(len(content), 400) - 1) | st.integers(0, len(content) - 1)
+    for place, value in data.draw(st.lists(st.tuples(places, st.integers(0, 255)), min_size=1, max_size=6)):
+        content[place] = value
+    path.write_bytes(content[: data.draw(st.integers(1, len(content)) | st.just(len(content)))])
+    for read in (read_image, read_values) if suffix in KINDS else (lambda p: read_depth(p, fill="far"),):
+        try:
+            read(path)
+        except (ValueError, OSError) as error:
+            assert path.name in str(error)
+
+
+SILENT = """
+import os, sys
+from pathlib import Path
+from torchdof.io.images import read_image
+def read(content, suffix):
+    Path("x" + suffix).write_bytes(content)
+    try:
+        read_image("x" + suffix)
+    except (ValueError, OSError):
+        pass
+for suffix in sys.argv[1:]:
+    os.write(2, suffix.encode() + b"\\n")
+    content = Path("whole" + suffix).read_bytes()
+    for end in range(1, len(content), 1 + len(content) // 50):
+        read(content[:end], suffix)
+    for place in range(0, len(content), 1 + len(content) // 100):
+        read(content[:place] + bytes([content[place] ^ 77]) + content[place + 1 :], suffix)
+"""
+
+
+def test_no_library_prints_a_line_of_its_own_about_a_damaged_picture(tmp_path: Path) -> None:
+    for suffix in KINDS:
+        write_image(tmp_path / f"whole{suffix}", tiny())
+    call = [sys.executable, "-c", SILENT, *KINDS]
+    run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert (run.returncode, run.stdout, run.stderr.split()) == (0, "", [*KINDS])
+
+
+def two_parts(path: Path) -> None:
+    specs = [oiio.ImageSpec(16, 16, channels, "float") for channels in (3, 1)]
+    specs[1].channelnames = ("Z",)
+    for spec, name in zip(specs, ("beauty", "z"), strict=True):
+        spec.attribute("name", name)
+    output = oiio.ImageOutput.create(str(path))
+    assert output is not None and output.open(str(path), tuple(specs))
+    assert output.write_image(np.ones((16, 16, 3), np.float32))
+    assert output.open(str(path), specs[1], "AppendSubimage")
+    assert output.write_image(np.ones((16, 16, 1), np.float32)) and output.close()
+
+
+@pytest.mark.parametrize("place", range(4, 120, 5))
+@pytest.mark.parametrize("value", [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f"])
+def test_hostile_sizes_in_headers_of_an_exr_are_refused_by_name(tmp_path: Path, place: int, value: bytes) -> None:
+    path = tmp_path / "x.exr"
+    two_parts(path)
+    content = path.read_bytes()
+    path.write_bytes(content[:place] + value + content[place + 4 :])
+    try:
+        read_image(path)
+    except (ValueError, OSError) as error:
+        assert "x.exr" in str(error)
+
+
+def with_attributes(path: Path, count: int) -> None:
+    """An EXR with so many attributes in its header."""
+    write_image(path, tiny())
+    content, end = path.read_bytes(), 8
+    while content[end]:
+        name_end = content.index(b"\0", end)
+        type_end = content.index(b"\0", name_end + 1)
+        end = type_end + 5 + int.from_bytes(content[type_end + 1 : type_end + 5], "little")
+    more = b"".join(b"a%d\0int\0" % i + struct.pack("<Ii", 4, i) for i in range(count))
+    (pixels_at,) = struct.unpack("<Q", content[end + 1 : end + 9])  # of its only block of lines
+    path.write_bytes(content[:end] + more + b"\0" + struct.pack("<Q", pixels_at + len(more)) + content[end + 9 :])
+
+
+def test_attributes_are_kept_and_endless_ones_refused_at_once(tmp_path: Path) -> None:
+    with_attributes(tmp_path / "some.exr", 500)
+    assert read_image(tmp_path / "some.exr").metadata["a499"][1] == 499
+    for count in (MOST_ATTRIBUTES, 100_000):
+        with_attributes(tmp_path / "x.exr", count)
+        start = time.perf_counter()
+        with pytest.raises(ValueError, match=rf"x\.exr: its headers hold more than {MOST_ATTRIBUTES} attributes"):
+            read_image(tmp_path / "x.exr")
+        assert time.perf_counter() - start < 2.0  # its library takes minutes
+
+
+def test_endless_texts_of_a_png_cost_no_time(tmp_path: Path) -> None:
+    write_image(tmp_path / "x.png", tiny())
+    content = (tmp_path / "x.png").read_bytes()
+    bomb = chunk(b"zTXt", b"k\0\0" + zlib.compress(bytes(2**27), 9))
+    texts = b"".join(chunk(b"tEXt", b"k%d\0v" % i) for i in range(100_000))
+    (tmp_path / "x.png").write_bytes(content[:33] + bomb + texts + content[33:])
+    start = time.process_time()
+    assert read_image(tmp_path / "x.png").pixels.shape == (1, 3, 8, 9)
+    assert time.process_time() - start < 5.0
+
+
+# Sizes
+
+
+def chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def png(side: int, pixels: bytes) -> bytes:
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+def huge_exr(path: Path) -> None:
+    write_image(path, tiny())
+    content = bytearray(path.read_bytes())
+    for name in (b"dataWindow\0box2i\0", b"displayWindow\0box2i\0"):
+        start = content.index(name) + len(name) + 4
+        content[start : start + 16] = struct.pack("<iiii", 0, 0, 1_000_000, 1_000_000)
+    path.write_bytes(content)
+
+
+NPY = "{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000), }".ljust(117).encode() + b"\n"
+HUGE: dict[str, Made] = {
+    "huge.png": with_bytes(png(200_000, zlib.compress(b"0" * 100))),
+    "huge.exr": huge_exr,
+    "huge.hdr": with_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 900000 +X 900000\n" + bytes(100)),
+    "huge.npy": with_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(NPY)) + NPY),
+}
+READ = """
+import resource, sys
+import OpenImageIO
+from torchdof.bench import memory
+from torchdof.io import decode
+from torchdof.io.images import read_image, read_values
+from torchdof.io.memory import free_bytes
+def limit(megabytes):
+    pages = int(open("/proc/self/statm").read().split()[0])
+    space = pages * resource.getpagesize() + (megabytes << 20)
+    resource.setrlimit(resource.RLIMIT_AS, (space, resource.RLIM_INFINITY))
+def read(name):
+    for reader in (read_values, read_image)[: 1 if name[-4:] in (".npy", ".npz") else 2]:
+        try:
+            reader(name)
+            print(name, "read")
+        except (ValueError, OSError) as error:
+            print(name, "refused:", error)
+"""
+
+
+def told(code: str, folder: Path, names: list[str]) -> list[str]:
+    run = subprocess.run(
+        [sys.executable, "-c", READ + code, *names], cwd=folder, capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr[-500:]
+    return run.stdout.splitlines()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
+def test_huge_sizes_in_a_header_are_refused_without_the_memory(tmp_path: Path) -> None:
+    for name, make in HUGE.items():
+        make(tmp_path / name)
+    code = "limit(6000)\nfor name in sys.argv[1:]:\n    read(name)\nprint(memory.peak_mb())"
+    *lines, megabytes = told(code, tmp_path, [*HUGE])
+    assert len(lines) == 7 and all(re.match(r"(huge\.\w+) refused: .*\1", line) for line in lines), lines
+    assert float(megabytes) < 1500
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
+@pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
+def test_a_picture_that_memory_cannot_hold_is_refused(known: bool, tmp_path: Path) -> None:
+    side = 4096
+    zeros = np.zeros((side, side), np.float32)
+    np.save(tmp_path / "x.npy", zeros)
+    np.savez_compressed(tmp_path / "x.npz", depth=zeros)
+    for name in ("x.exr", "x.tif", "x.pfm"):
+        write_image(tmp_path / name, Picture(torch.zeros(1, 1, side, side), channels=("Y",)), sample="float")
+    (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
+    names = sorted(path.name for path in tmp_path.iterdir())
+    code = "decode.free_bytes = lambda: float('inf')\n" * (not known)
+    lines = told(code + "limit(24)\nfor name in sys.argv[1:]:\n    read(name)", tmp_path, names)
+    assert len(lines) == 10
+    why = "GiB of memory are free|more than there is memory for|allocate" + "|cannot be had" * (not known)
+    assert all(re.match(rf"(x\.\w+) refused: \1: .*({why})", line) for line in lines), lines
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="measures memory")
+def test_reading_takes_the_stored_picture_and_its_light_and_no_more(tmp_path: Path) -> None:
+    side = 3000
+    (tmp_path / "x.png").write_bytes(png(side, zlib.compress(bytes(side * (3 * side + 1)))))
+    code = "before = memory.peak_mb()\nread_image('x.png')\nprint(memory.peak_mb() - before)"
+    (megabytes,) = told(code, tmp_path, [])
+    assert float(megabytes) * 1e6 / side**2 < 1.3 * (3 + 3 * 4)
