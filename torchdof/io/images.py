@@ -21,7 +21,7 @@ from . import foreign
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
 from .decode import PixelType, existing, first_line, read_array, read_parts
-from .transfer import Transfer, decode, default_transfer, encode
+from .transfer import Transfer, decode, decode_integers, default_transfer, encode, encode_8_bits
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
@@ -69,6 +69,11 @@ class Picture:
         """Whether the last channel is alpha."""
         return self.channels[-1] == "A"
 
+    @property
+    def light(self) -> Tensor:
+        """The pixels without alpha."""
+        return self.pixels[:, :-1] if self.has_alpha else self.pixels
+
 
 def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, layer: str | None = None) -> Picture:
     """Reads an image into linear light.
@@ -108,21 +113,28 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     source = parts[part]
-    array = _float32(source.values[..., indices])
-    if not np.isfinite(array).all():
-        bad = int((~np.isfinite(array)).any(axis=-1).sum())
-        raise ValueError(f"{path}: {bad} pixels are not finite (NaN or inf); repair them before blurring spreads them")
+    values = source.values if indices == list(range(len(source.names))) else source.values[..., indices]
     sample: PixelType = "half" if all(source.samples[k] == "half" for k in indices) else source.samples[indices[0]]
-    transfer = transfer or default_transfer(sample)
-    pixels = torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))[None]  # [H, W, C] -> [1, C, H, W]
-    pixels = decode(pixels / source.white, transfer, names[-1] == "A", source.straight_alpha)
-    if not bool(torch.isfinite(pixels).all()):
-        raise ValueError(f"{path}: its light is beyond what float32 holds; scale it down")
+    transfer, has_alpha = transfer or default_transfer(sample), names[-1] == "A"
+    if values.dtype in (np.uint8, np.uint16) and source.white > 1 and (source.straight_alpha or not has_alpha):
+        pixels = decode_integers(values, transfer, has_alpha)
+    else:
+        pixels = _float32(values.transpose(2, 0, 1))[None]  # [H, W, C] -> [1, C, H, W]
+        if not _is_finite(pixels):
+            bad = int((~pixels.isfinite()).any(1).sum())
+            raise ValueError(
+                f"{path}: {bad} pixels are not finite (NaN or inf); repair them before blurring spreads them"
+            )
+        pixels = decode(
+            pixels if source.white == 1.0 else pixels / source.white, transfer, has_alpha, source.straight_alpha
+        )
+        if not _is_finite(pixels):
+            raise ValueError(f"{path}: its light is beyond what float32 holds; scale it down")
     depth = None
     same_size = [p for p in parts if p.values.shape[:2] == source.values.shape[:2]]
     depth_place = depth_channel([(p.label, p.names) for p in same_size])
     if depth_place is not None:
-        depth = torch.from_numpy(_float32(same_size[depth_place[0]].values[..., depth_place[1]]))[None, None]
+        depth = _float32(same_size[depth_place[0]].values[..., depth_place[1]])[None, None]
     return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window)
 
 
@@ -169,10 +181,13 @@ def write_image(
     if names[0] == "Y" and suffix not in _HOLDS_GREY:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
-    pixels = encode(pixels, transfer, names[-1] == "A", straight)
-    if sample == "half":
-        pixels = pixels.clamp(-65504.0, 65504.0)
-    array = np.ascontiguousarray(pixels[0].permute(1, 2, 0).numpy())  # [C, H, W] -> [H, W, C]
+    if sample == "8" and (straight or names[-1] != "A"):
+        array = encode_8_bits(pixels, transfer, straight)
+    else:
+        pixels = encode(pixels, transfer, names[-1] == "A", straight)
+        if sample == "half":
+            pixels = pixels.clamp(-65504.0, 65504.0)
+        array = np.ascontiguousarray(pixels[0].permute(1, 2, 0).numpy())  # [C, H, W] -> [H, W, C]
 
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
     spec.channelnames = names
@@ -226,7 +241,7 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
     """
     path = existing(path, (*_SUFFIXES, ".npy", ".npz"), "a depth map")
     if path.suffix.lower() in (".npy", ".npz"):
-        return torch.from_numpy(_float32(read_array(path, channel)))[None, None]
+        return _float32(read_array(path, channel))[None, None]
     parts = read_parts(path)
     planes = [(p.label, name, p.values[..., k]) for p in parts for k, name in enumerate(p.names)]
     listing = ", ".join(name for _, name, _ in planes)
@@ -234,7 +249,7 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         chosen = [plane for label, name, plane in planes if channel in (name, f"{label}.{name}")]
         if not chosen:
             raise ValueError(f"{path}: no channel {channel!r}; it has {listing}")
-        return torch.from_numpy(_float32(chosen[0]))[None, None]
+        return _float32(chosen[0])[None, None]
     depth_place = depth_channel([(p.label, p.names) for p in parts])
     if depth_place is not None:
         plane = parts[depth_place[0]].values[..., depth_place[1]]
@@ -242,13 +257,18 @@ def read_values(path: str | os.PathLike[str], channel: str | None = None) -> Ten
         plane = planes[0][2]
     else:
         raise ValueError(f"{path}: which of the channels {listing} is depth? name it (--depth-channel)")
-    return torch.from_numpy(_float32(plane))[None, None]
+    return _float32(plane)[None, None]
 
 
-def _float32(values: np.ndarray) -> np.ndarray:
+def _float32(values: np.ndarray) -> Tensor:
     """Numbers in single precision; those beyond it become infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return values.astype(np.float32)
+        return torch.from_numpy(np.array(values, dtype=np.float32, order="C"))
+
+
+def _is_finite(pixels: Tensor) -> bool:
+    """Whether all numbers are finite, by their ends, which are NaN if one is."""
+    return bool(torch.stack(torch.aminmax(pixels)).isfinite().all())
 
 
 def _is_whole(path: Path) -> bool:
