@@ -20,9 +20,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 import torchdof
-from torchdof.cli.frame import tint_focus
 from torchdof.depth import inspect_depth, read_depth
-from torchdof.depth.inspect import coc_colours, panels
+from torchdof.depth.inspect import coc_colours, panels, tint_focus
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.io.sheet import write_sheet
 from torchdof.reference.degraded import degrade

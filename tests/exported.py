@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from click.testing import CliRunner
 from filelock import FileLock
 from torch import Tensor
-from typer.testing import CliRunner
 
 import torchdof
 from torchdof.cli.main import app

@@ -9,9 +9,9 @@ from typing import Any
 import onnx
 import pytest
 import torch
+from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 from torchdof import BlurTable, Camera, DepthOfField
 from torchdof.cli.main import app

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import torch
+from click.testing import CliRunner, Result
 from torch import Tensor
-from typer.testing import CliRunner, Result
 
 from torchdof import BlurTable, Camera, DepthOfField
 from torchdof.bench import scaling, speed

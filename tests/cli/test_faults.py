@@ -1,31 +1,31 @@
-"""A sequence that is interrupted, a disk that fills up, names that clash."""
+"""A sequence that is interrupted, a disk that fills up, memory that runs out, and what is seen while it takes long."""
 
+import io
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
-from torchdof.cli.main import app
+from torchdof.cli import frame, printed
 from torchdof.io.images import Picture, read_image, write_image
 
 pytestmark = pytest.mark.hard
 
-
-def tiny() -> torch.Tensor:
-    return torch.linspace(0, 1, 3 * 8 * 9).reshape(1, 3, 8, 9)
+SEQUENCE = "render shot.####.exr depth.npy -o out.####.exr --focus-m 2"
 
 
-def frames(folder: Path, count: int) -> list[str]:
-    for n in range(1, count + 1):
-        write_image(folder / f"shot.{n:04d}.exr", Picture(tiny() * n, sample="float"))
-    np.save(folder / "depth.npy", np.linspace(1, 4, 72).reshape(8, 9))
-    return ["shot.####.exr", "depth.npy", "-o", "out.####.exr", "--focus-m", "2"]
+def copies(folder: Path, count: int) -> None:
+    for n in range(4, count + 1):
+        os.link(folder / "shot.0001.exr", folder / f"shot.{n:04d}.exr")
 
 
 def heed_interrupts() -> None:
@@ -33,41 +33,79 @@ def heed_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def test_an_interrupted_sequence_keeps_what_is_whole_and_resumes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_sequence_keeps_what_is_whole_and_resumes(scene: Path, number: signal.Signals) -> None:
     count = 400
-    arguments = frames(tmp_path, count)
-    command = [sys.executable, "-m", "torchdof", "render", *arguments]
+    copies(scene, count)
+    command = [sys.executable, "-m", "torchdof", *SEQUENCE.split()]
     with subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        preexec_fn=heed_interrupts,
-    ) as run:
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=heed_interrupts
+    ) as process:
         deadline = time.monotonic() + 60
-        while len(list(tmp_path.glob("out.*"))) < 5 and time.monotonic() < deadline and run.poll() is None:
+        while len(list(scene.glob("out.*"))) < 5 and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.002)
-        run.send_signal(signal.SIGINT)
-        _, said = run.communicate(timeout=60)
-    assert run.returncode not in (0, -signal.SIGSEGV), said
-    done = sorted(tmp_path.glob("out.*.exr"))
+        process.send_signal(number)
+        told, said = process.communicate(timeout=60)
+    assert process.returncode == (1 if number == signal.SIGINT else 128 + number), said
+    assert b"Traceback" not in said
+    done = sorted(scene.glob("out.*.exr"))
     assert 5 <= len(done) < count
-    assert not list(tmp_path.glob(".*")), "a part was left behind"
-    for path in done:
-        assert read_image(path).pixels.shape == (1, 3, 8, 9)
+    assert not list(scene.glob(".*")), "a part was left behind"
+    assert [line.split(b":")[0].decode() for line in told.splitlines()] == [path.name for path in done]
+    assert all(read_image(path).pixels.shape == (1, 3, 16, 24) for path in done)
     before = {path: path.stat().st_mtime_ns for path in done}
-    for path in sorted(tmp_path.glob("shot.*"))[len(done) + 3 :]:
+    for path in sorted(scene.glob("shot.*"))[len(done) + 3 :]:
         path.unlink()  # three more are enough to see that it goes on
-    again = subprocess.run([*command, "--resume"], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    again = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=120)
     assert again.returncode == 0, again.stderr
     assert again.stdout.startswith(f"{len(done)} of {len(done) + 3} frames are there already")
-    assert len(list(tmp_path.glob("out.*.exr"))) == len(done) + 3
+    assert len(list(scene.glob("out.*.exr"))) == len(done) + 3
     assert {path: path.stat().st_mtime_ns for path in done} == before
+
+
+@pytest.mark.parametrize("broken", ["shot.0003.exr", "out.0003.exr"])
+def test_a_frame_that_cannot_be_read_or_written_ends_a_sequence_by_its_name(
+    scene: Path, run: Callable[..., str], broken: str
+) -> None:
+    copies(scene, 5)
+    if broken.startswith("shot"):
+        Path(broken).write_bytes(Path(broken).read_bytes()[:200])
+    else:
+        Path(broken).mkdir()
+    message = run(SEQUENCE, code=2)
+    assert message.startswith(f"error: {broken}: ") and message.count("\n") == 1
+    done = sorted(path.name for path in scene.glob("out.*") if path.is_file())
+    assert done[:2] == ["out.0001.exr", "out.0002.exr"] and "out.0005.exr" not in done and not list(scene.glob(".*"))
+
+
+def test_the_next_frame_is_read_and_the_last_written_while_one_is_rendered(
+    scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reading, rendering = ([threading.Event() for _ in range(4)] for _ in range(2))
+    read, render, write = frame.Renderer.read, frame.Renderer.render, frame.Renderer.write
+    number = lambda out: int(out.name.split(".")[1]) - 1  # noqa: E731
+
+    def slow_read(self: Any, image: Path, depth: Path, out: Path) -> Any:
+        reading[number(out)].set()
+        return read(self, image, depth, out)
+
+    def slow_render(self: Any, source: Any, out: Path, *others: Any) -> Any:
+        rendering[number(out)].set()
+        assert out.name == "out.0003.exr" or reading[number(out) + 1].wait(20), "the next is not read"
+        return render(self, source, out, *others)
+
+    def slow_write(self: Any, rendered: Any) -> Any:
+        assert rendered.out.name == "out.0003.exr" or rendering[number(rendered.out) + 1].wait(20), "the next waits"
+        return write(self, rendered)
+
+    for name, slow in (("read", slow_read), ("render", slow_render), ("write", slow_write)):
+        monkeypatch.setattr(frame.Renderer, name, slow)
+    assert [line[:12] for line in run(SEQUENCE).splitlines()] == [f"out.000{n}.exr" for n in (1, 2, 3)]
 
 
 FULL = """
 import resource, signal, sys
-import torchdof.cli.main, torchdof.cli.render, OpenImageIO  # before files may not grow any more
+import torchdof.cli.main, torchdof.cli.frame, OpenImageIO  # before files may not grow any more
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (200, resource.RLIM_INFINITY))
 torchdof.cli.main.app(sys.argv[1:])
@@ -75,112 +113,18 @@ torchdof.cli.main.app(sys.argv[1:])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits the size of files")
-def test_a_disk_that_fills_up_in_a_sequence_ends_it_in_one_sentence(tmp_path: Path) -> None:
-    arguments = frames(tmp_path, 3)
-    run = subprocess.run(
-        [sys.executable, "-c", FULL, "render", *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=120
-    )
-    assert run.returncode == 2 and run.stderr.splitlines()[-1].startswith("error: out.0001.exr: could not be")
-    assert not list(tmp_path.glob("*out.*")) and not list(tmp_path.glob(".*"))
+def test_a_disk_that_fills_up_in_a_sequence_ends_it_in_one_sentence(scene: Path) -> None:
+    told = subprocess.run([sys.executable, "-c", FULL, *SEQUENCE.split()], capture_output=True, text=True, timeout=120)
+    assert told.returncode == 2 and told.stderr.splitlines()[-1].startswith("error: out.0001.exr: could not be")
+    assert not list(scene.glob("*out.*")) and not list(scene.glob(".*"))
 
 
-def test_two_frames_never_share_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    arguments = frames(tmp_path, 2)
-    arguments[3] = "out.exr"
-    result = CliRunner().invoke(app, ["render", *arguments])
-    assert result.exit_code == 2 and "expected one place for the frame number" in result.stderr
-    arguments[3] = "shot.####.exr"
-    result = CliRunner().invoke(app, ["render", *arguments])
-    assert result.exit_code == 2 and "is one of the inputs" in result.stderr
-    arguments[3] = "depth.npy"
-    before = (tmp_path / "depth.npy").read_bytes()
-    result = CliRunner().invoke(app, ["render", *arguments])
-    assert result.exit_code == 2 and (tmp_path / "depth.npy").read_bytes() == before
-
-
-# Names, numbers and memory
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the command runs: an image and its depth."""
-    monkeypatch.chdir(tmp_path)
-    write_image("x.exr", Picture(tiny()))
-    np.save("depth.npy", np.linspace(1, 4, 72).reshape(8, 9))
-    return tmp_path
-
-
-def render(*arguments: str) -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["render", *arguments, "--focus-m", "2"])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, (result.stderr or result.stdout).strip()
-
-
-@pytest.mark.parametrize("name", ["take #1/x.exr", "50%done/x.exr", "IMG #1.exr", "a##b.exr", "%d.exr", "x %03d.exr"])
-def test_a_file_by_that_very_name_is_no_pattern(folder: Path, name: str) -> None:
-    path = folder / name
-    path.parent.mkdir(exist_ok=True)
-    write_image(path, Picture(tiny()))
-    np.save(path.with_suffix(".npy"), np.linspace(1, 4, 72).reshape(8, 9))
-    out = path.with_name(f"out {path.name}")
-    assert render(name, str(path.with_suffix(".npy")), "-o", str(out))[0] == 0
-    assert read_image(out).pixels.shape == (1, 3, 8, 9)
-
-
-def test_a_folder_may_be_called_like_a_pattern_in_a_sequence(folder: Path) -> None:
-    (folder / "take #1").mkdir()
-    for n in (1, 2):
-        write_image(folder / f"take #1/shot.{n:04d}.exr", Picture(tiny()))
-    assert render("take #1/shot.####.exr", "depth.npy", "-o", "take #1/out.%03d.exr")[0] == 0
-    assert sorted(p.name for p in (folder / "take #1").glob("out*")) == ["out.001.exr", "out.002.exr"]
-
-
-def test_a_single_image_is_written_where_it_is_told(folder: Path) -> None:
-    assert render("x.exr", "depth.npy", "-o", "take #2.exr")[0] == 0 and (folder / "take #2.exr").is_file()
-    code, said = render("x.exr", "depth.npy", "-o", "out.####.exr")
-    assert code == 2 and said == "error: x.exr: is a single image; for a sequence write it as shot.####.exr"
-
-
-@pytest.mark.parametrize("frames", ["0-300000000", "1-99999999999999999", "7"])
-def test_a_range_of_frames_is_not_counted_out(folder: Path, frames: str) -> None:
-    write_image("shot.0001.exr", Picture(tiny()))
+@pytest.mark.parametrize("frames", ["0-300000000", "1-99999999999999999", "7", "9" * 5000])
+def test_a_range_of_frames_is_not_counted_out(scene: Path, run: Callable[..., str], frames: str) -> None:
     start = time.monotonic()
-    code, said = render("shot.####.exr", "depth.npy", "-o", "out.####.exr", "--frames", frames)
-    assert code == 2 and "there is no such file" in said and time.monotonic() - start < 5.0
-    code, said = render("shot.####.exr", "depth.npy", "-o", "out.####.exr", "--frames", "9" * 5000)
-    assert code == 2 and said.startswith("error: --frames expects first-last") and len(said) < 200
-    code, said = render("shot.%099999999d.exr", "depth.npy", "-o", "out.####.exr")
-    assert code == 2 and "must have at most 18 digits" in said
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (("--f-number", "0"), "--f-number must be positive"),
-        (("--f-number", "1e-42"), "this lens (--focal-length-mm (not given) 50, --f-number 1e-42, --focus-m 2"),
-        (("--sensor-width-mm", "1e-300"), "--sensor-width-mm 1e-300"),
-        (("--focal-length-mm", "1e6"), "--focus-m must be longer than the focal length (1e+06 mm)"),
-        (("--fov-deg", "40", "--aperture-radius-m", "1e45"), "--fov-deg 40, --aperture-radius-m 1e+45"),
-        (("--fov-deg", "40", "--aperture-radius-m", "-1"), "--aperture-radius-m must be positive"),
-        (("--fov-deg", "40", "--f-number", "1e-42"), "--f-number 1e-42"),
-        (("--fill-depth", "1e-45", "--depth-unknown", "1"), "blurs a depth of 1.4e-45 m"),
-    ],
-)
-def test_an_impossible_lens_is_named_by_its_option(folder: Path, arguments: tuple[str, ...], named: str) -> None:
-    code, said = render("x.exr", "depth.npy", "-o", "out.exr", *arguments)
-    assert code == 2 and named in said
-    assert not any(word in said for word in ("coc_px", "check=False", "f_number", "focus_m", "_mm", "_deg"))
-    assert not (folder / "out.exr").exists()
-
-
-@pytest.mark.parametrize("link", ["x.exr", "depth.npy", "out.exr"])
-def test_a_link_to_itself_is_refused_in_one_sentence(folder: Path, link: str) -> None:
-    (folder / link).unlink(missing_ok=True)
-    (folder / link).symlink_to(link)
-    code, said = render("x.exr", "depth.npy", "-o", "out.exr")
-    assert code == 2 and said.startswith(f"error: {link}: is a link that leads back to itself")
-    assert (folder / link).is_symlink()
+    said = run(f"{SEQUENCE} --frames", frames, code=2)
+    assert "there is no such file" in said or "--frames expects first-last" in said
+    assert time.monotonic() - start < 5.0 and len(said) < 200
 
 
 @pytest.mark.parametrize(
@@ -194,19 +138,20 @@ def test_a_link_to_itself_is_refused_in_one_sentence(folder: Path, link: str) ->
     ],
     ids=str,
 )
-def test_too_little_memory_is_one_sentence(folder: Path, error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_is_one_sentence(
+    scene: Path, run: Callable[..., str], error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr("torchdof.cli.frame.depth_of_field", fail)
-    code, said = render("x.exr", "depth.npy", "-o", "out.exr")
-    assert code == 2 and said.startswith("error: there is too little memory for this image")
-    assert len(said.splitlines()) == 1
+    monkeypatch.setattr(frame, "blur_by_coc", fail)
+    said = run("render image.exr depth.npy -o out.exr --focus-m 2", code=2)
+    assert said.startswith("error: there is too little memory for this image") and said.count("\n") == 1
 
 
 SMALL = """
 import resource, sys
-import torch, torchdof.cli.main, torchdof.cli.render, OpenImageIO
+import torch, torchdof.cli.main, torchdof.cli.frame, OpenImageIO
 torch.set_num_threads(1)
 pages = int(open("/proc/self/statm").read().split()[0])
 limit = pages * resource.getpagesize() + (96 << 20)
@@ -218,13 +163,55 @@ torchdof.cli.main.app(sys.argv[1:])
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory")
 @pytest.mark.parametrize("engine", ["torch", "native"])
 def test_memory_that_runs_out_while_rendering_is_one_sentence(
-    folder: Path, engine: str, monkeypatch: pytest.MonkeyPatch
+    scene: Path, engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", engine)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     write_image("big.exr", Picture(torch.rand(1, 3, 1000, 1500), sample="half"))
     np.save("big.npy", np.linspace(1, 9, 1_500_000, dtype=np.float32).reshape(1000, 1500))
     call = [sys.executable, "-c", SMALL, "render", "big.exr", "big.npy", "-o", "out.exr", "--focus-m", "2"]
-    run = subprocess.run([*call, "--f-number", "1.4"], cwd=folder, capture_output=True, text=True, timeout=120)
-    assert run.returncode == 2 and len(run.stderr.strip().splitlines()) == 1, run.stderr
-    assert "memory" in run.stderr and not (folder / "out.exr").exists()
+    told = subprocess.run([*call, "--f-number", "1.4"], capture_output=True, text=True, timeout=120)
+    assert told.returncode == 2 and len(told.stderr.strip().splitlines()) == 1, told.stderr
+    assert "memory" in told.stderr and not (scene / "out.exr").exists()
+
+
+class Terminal(io.StringIO):
+    """Standard error that somebody looks at."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_bar_shows_frames_and_what_is_left_but_only_of_what_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with printed.Bar("frame 1 of 24", 24):
+        pass
+    assert terminal.getvalue() == ""
+    monkeypatch.setattr(printed, "_PATIENCE_S", 0.0)
+    with printed.Bar("", 4) as bar:
+        bar.step(2, 4, "frame 3 of 4")
+        time.sleep(0.5)
+    assert "frame 3 of 4" in terminal.getvalue() and "about 0 s left" in terminal.getvalue()
+    with printed.Bar("rendering [out].png") as bar:
+        bar.expect(60.0)
+        time.sleep(0.5)
+    assert "rendering [out].png" in terminal.getvalue()
+    left = [
+        int(words.split()[-1]) for words in terminal.getvalue().split(" s left")[:-1] if words.split()[-2] == "about"
+    ]
+    assert 40 <= left[-1] <= 61
+
+
+def test_a_large_image_is_measured_by_a_strip_where_somebody_looks(
+    scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected: list[float] = []
+    monkeypatch.setattr(frame, "_LARGE_PX", 100)
+    monkeypatch.setattr(printed.Bar, "expect", lambda self, seconds: expected.append(seconds))
+    run("render image.exr depth.npy -o out.exr --focus-m 2")
+    assert expected == []
+    monkeypatch.setattr(printed.Bar, "is_seen", property(lambda self: True))
+    run("render image.exr depth.npy -o out.exr --focus-m 2")
+    assert len(expected) == 1 and expected[0] > 0

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from torchdof.cli.main import app
 from torchdof.io.images import Picture, read_image, write_image
@@ -94,20 +94,3 @@ def test_relative_depth_is_inspected_between_its_distances(scene: Path) -> None:
 def test_a_range_in_focus_and_a_tilt_are_told(scene: Path) -> None:
     out, _ = run("photo.png", "depth.npy", "--focus-range", "1.5,2.2", "--tilt", "3")
     assert "focus 1.5 to 2.2 m" in out and "tilt 3 degrees" in out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("none.png", "depth.npy"), "none.png: there is no such file"),
-        (("photo.png",), "photo.png: has no depth channel"),
-        (("photo.png", "depth.npy", "-o", "photo.png"), "photo.png: is one of the inputs"),
-        (("photo.png", "zeros.npy"), "zeros.npy: no pixel has a depth"),
-        (("photo.png", "depth.npy", "--depth-kind", "disparity"), "disparity needs a scale (--depth-scale)"),
-        (("photo.png", "depth.npy", "--depth-kind", "relative"), "--depth-kind relative needs --near-m and --far-m"),
-    ],
-)
-def test_wrong_input_is_one_sentence_and_exit_code_2(scene: Path, arguments: tuple[str, ...], says: str) -> None:
-    np.save("zeros.npy", np.zeros((HEIGHT, WIDTH)))
-    _, err = run(*arguments, code=2)
-    assert err.startswith("error: ") and says in err and err.count("\n") == 1

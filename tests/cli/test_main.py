@@ -1,75 +1,105 @@
-"""Which commands there are, and what is said of one that cannot run."""
+"""Which commands there are, what their options mean, and what is said of one that cannot run."""
 
+import os
+import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import click
 import pytest
-from typer.testing import CliRunner
 
-from torchdof.cli import main
-from torchdof.cli.arguments import DEPTH, LENS
-from torchdof.cli.main import app
+from torchdof.cli.export import Export
+from torchdof.cli.main import COMMANDS, app
 
-
-def other_command(monkeypatch: pytest.MonkeyPatch, folder: Path, text: str) -> None:
-    """Installs a module ``extra_room.command`` that brings the command ``fit``."""
-    package = folder / "extra_room"
-    package.mkdir()
-    (package / "__init__.py").touch()
-    (package / "command.py").write_text(text)
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setattr(main, "_MODULES", {**main._MODULES, "fit": "extra_room.command"})
-    monkeypatch.delitem(sys.modules, "extra_room", raising=False)
-    monkeypatch.delitem(sys.modules, "extra_room.command", raising=False)
+PARSED = {name: command for name in COMMANDS if (command := app.get_command(click.Context(app), name))}
 
 
-def test_commands_of_other_modules_join_by_being_there(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    other_command(
-        monkeypatch, tmp_path, 'def fit(name: str) -> None:\n    "Fits a table."\n    print("fitted", name)\n'
-    )
-    assert "Fits a table." in CliRunner().invoke(app, ["--help"]).output
-    assert CliRunner().invoke(app, ["fit", "lens"]).stdout == "fitted lens\n"
+def test_help_lists_every_command_with_what_it_does(run: Callable[..., str]) -> None:
+    listed = " ".join(run("--help").split())
+    assert list(PARSED) == list(COMMANDS) and len(COMMANDS) == 6
+    assert all(f"{name} {command.short_help}" in listed for name, command in PARSED.items())
 
 
-def test_commands_of_modules_that_are_not_there_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(main, "_MODULES", {**main._MODULES, "fit": "no_room.command", "bench": "torchdof.no_bench"})
-    result = CliRunner().invoke(app, ["--help"])
-    assert "render" in result.output and "bench" not in result.output
-    assert CliRunner().invoke(app, ["fit"]).exit_code == 2
-
-
-def test_command_whose_package_is_missing_says_which_extra_brings_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    other_command(monkeypatch, tmp_path, "import scipy\n\n\ndef fit() -> None:\n    pass\n")
-    monkeypatch.setitem(sys.modules, "scipy", None)
-    result = CliRunner().invoke(app, ["fit"])
-    assert result.exit_code == 2
-    assert "this command needs scipy; install it with: pip install 'torchdof[fit]'" in result.stderr
+def test_help_of_a_command_teaches_by_examples_and_puts_the_basic_options_first(run: Callable[..., str]) -> None:
+    told = " ".join(run("render --help").split())
+    for example in ("torchdof render shot.exr -o out.exr", "--focus-m 1:2,48:5.5", "--depth-kind disparity"):
+        assert example in told
+    basic, groups = told.partition("Options: ")[2].partition("Focus and lens: ")[::2]
+    assert all(f"{option} " in basic for option in ("--out", "--focus-m", "--f-number", "--depth-scale", "--tolerance"))
+    assert groups.index("--tilt ") < groups.index("Depth map: ") < groups.index("--near-m ") < groups.index("Blur: ")
 
 
 def test_an_option_means_the_same_in_all_commands() -> None:
-    commands = {name: main._imported(name) for name in main._MODULES if main._source(name)}
-    meanings: dict[str, dict[str, str]] = {}  # option -> parameter -> a command that has it
-    spellings: dict[str, dict[str, str]] = {}  # parameter -> options -> a command that has it
-    for command, parsed in commands.items():
-        for parameter in parsed.params:
-            if parameter.opts[0].startswith("-"):
-                spellings.setdefault(parameter.name, {})[" ".join(sorted(parameter.opts))] = command
-                for option in parameter.opts:
-                    meanings.setdefault(option, {})[parameter.name] = command
+    meanings: dict[str, dict[str | None, str]] = {}  # option -> parameter -> a command that has it
+    spellings: dict[str | None, dict[str, str]] = {}  # parameter -> options -> a command that has it
+    for name, command in PARSED.items():
+        for parameter in (each for each in command.params if isinstance(each, click.Option)):
+            spellings.setdefault(parameter.name, {})[" ".join(sorted(parameter.opts))] = name
+            for option in parameter.opts:
+                meanings.setdefault(option, {})[parameter.name] = name
     assert {option: means for option, means in meanings.items() if len(means) > 1} == {}
     assert {parameter: options for parameter, options in spellings.items() if len(options) > 1} == {}
-    assert all("--json" in {option for p in parsed.params for option in p.opts} for parsed in commands.values())
+    assert all("--json" in {option for p in command.params for option in p.opts} for command in PARSED.values())
 
 
-def test_what_renders_and_what_measures_take_the_same_lens_depth_and_blur() -> None:
-    commands = {name: main._imported(name) for name in ("render", "inspect", "bench", "export", "tables")}
-    options = {name: {p.name: p.rich_help_panel for p in command.params} for name, command in commands.items()}
-    told = {name for name, panel in options["render"].items() if panel in (LENS, DEPTH)}
-    told -= {"depth_edges", "steady", "strict"}  # what is done with it
-    shape = {"blades", "rotation", "curvature", "squeeze", "aperture"}
-    assert told <= set(options["inspect"]) and told <= set(options["bench"])
-    for name in ("render", "bench", "tables"):
-        assert shape | {"vignetting"} <= set(options[name]), name
-    assert shape | {"table"} <= set(options["export"]) and "table" in options["bench"]
+NAMES = """
+render: image depth out focus_m focus_at focus_range tilt swing f_number focal_length_mm sensor_width_mm fov_deg
+    aperture_radius_m depth_kind depth_scale depth_offset near_m far_m relative_kind value_range strict depth_unknown
+    fill_depth depth_channel depth_edges table blades rotation curvature squeeze aperture vignetting tolerance attention
+    no_occlusion method show_focus device transfer out_transfer bits layer frames steady resume as_json
+inspect: image depth out focus_m focus_at focus_range tilt swing f_number focal_length_mm sensor_width_mm fov_deg
+    aperture_radius_m depth_kind depth_scale depth_offset near_m far_m relative_kind value_range strict depth_unknown
+    fill_depth depth_channel as_json
+tables: names out blades rotation curvature squeeze aperture vignetting as_json
+export: out show focal_length_mm sensor_width_mm fov_deg table blades rotation curvature squeeze aperture max_coc
+    tolerance no_occlusion method depth_edges inputs channels width opset as_json
+fit: captures out family accuracy_db dots colours target paper square_mm root lens f_number focus_m nodes field_deg
+    field wavelengths plots as_json
+"""
+
+
+@pytest.mark.parametrize("line", NAMES.replace("\n    ", " ").strip().splitlines(), ids=lambda line: line.split(":")[0])
+def test_names_that_scripts_use_stay(line: str) -> None:
+    command, _, names = line.partition(": ")
+    assert set(names.split()) <= {parameter.name for parameter in PARSED[command].params}
+
+
+def test_defaults_are_those_of_the_library() -> None:
+    from torchdof.export.conversion import OPSET
+    from torchdof.fit.photo.target import SQUARE_MM
+
+    defaults = {name: {p.name: p.default for p in PARSED[name].params} for name in ("export", "fit")}
+    assert (defaults["export"]["opset"], defaults["fit"]["square_mm"]) == (OPSET, SQUARE_MM)
+
+
+def test_a_package_that_is_missing_is_named_with_the_extra_that_brings_it(
+    monkeypatch: pytest.MonkeyPatch, run: Callable[..., str]
+) -> None:
+    def missing(self: Export) -> None:
+        import scipy  # noqa: F401
+
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    monkeypatch.setattr(Export, "run", missing)
+    assert "this command needs scipy; install it with: pip install 'torchdof[fit]'" in run("export", code=2)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads what GNU's OpenMP says of itself")
+@pytest.mark.parametrize(
+    ("said", "spins"),
+    [({}, "0"), ({"GOMP_SPINCOUNT": "77"}, "77"), ({"OMP_WAIT_POLICY": "active"}, "30000000000")],
+    ids=["nothing", "spins", "policy"],
+)
+def test_threads_that_wait_do_not_spin_unless_the_user_says_so(said: dict[str, str], spins: str) -> None:
+    names = {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"}
+    environment = {name: value for name, value in os.environ.items() if name not in names}
+    environment |= {"OMP_DISPLAY_ENV": "verbose", **said}
+    command = [sys.executable, "-m", "torchdof", "--version"]
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
+    assert f"GOMP_SPINCOUNT = '{spins}'" in told
+
+
+def test_python_dash_m_is_the_command(scene: Path) -> None:
+    command = [sys.executable, "-m", "torchdof", "render", "image.exr", "none.npy", "-o", "out.exr", "--focus-m", "2"]
+    told = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (told.returncode, told.stderr) == (2, "error: none.npy: there is no such file\n")

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from torchdof import BlurTable
 from torchdof.cli.main import app
@@ -60,7 +60,3 @@ def test_json_tells_programs_the_same() -> None:
         "mm",
     )
     assert facts["coc"][0] < 0 < facts["coc"][1] and facts["aperture"] is None
-
-
-def test_a_table_that_is_none_is_refused() -> None:
-    assert "no blur table 'nothing'" in run("nothing", code=2)

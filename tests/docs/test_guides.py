@@ -11,9 +11,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import click
 import pytest
 import torch
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 import torchdof
 from torchdof.cli import main
@@ -152,7 +153,7 @@ def test_the_prescription_that_measuring_shows_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", _names(PAGES))
 def test_commands_that_a_page_mentions_have_the_options_it_gives_them(name: str) -> None:
-    parsed = {command: main._imported(command) for command in main._MODULES}
+    parsed = {command: app.get_command(click.Context(app), command) for command in main.COMMANDS}
     for match in _COMMAND.finditer((ROOT / name).read_text()):
         words = re.sub(r"\\\n", " ", match[1]).removeprefix("python -m ").split()
         options = [re.split(r"[=,.;:)]", word)[0] for word in words[2:] if re.match(r"--?[a-z]", word)]

@@ -9,9 +9,9 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
-import typer
 
-from torchdof.cli.render import render
+from torchdof.cli.command import command_of
+from torchdof.cli.render import Render
 
 FARM = Path(__file__).parents[2] / "examples" / "farm"
 SHOT = ["Image=/s/b.####.exr", "Depth=/s/d.####.exr", "Out=/s/o.####.exr", "Frames=1-48", "ChunkFrames=5"]
@@ -23,9 +23,7 @@ def installed(*names: str) -> pytest.MarkDecorator:
 
 
 def options_of_render() -> set[str]:
-    app = typer.Typer()
-    app.command()(render)
-    return {option for parameter in typer.main.get_command(app).params for option in parameter.opts}
+    return {option for parameter in command_of("render", Render).params for option in parameter.opts}
 
 
 def test_the_openjd_template_calls_options_that_there_are() -> None:

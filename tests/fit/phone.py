@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from torchdof import BlurTable, Camera, blur_by_coc
 from torchdof.cli.main import app

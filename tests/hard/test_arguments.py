@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
-from torchdof.cli.frame import tint_focus
-from torchdof.cli.settings import RenderSettings, load_table, pick_device
+from torchdof.cli.command import numbers, word_or_number
 from torchdof.depth.holes import fill_holes
+from torchdof.depth.inspect import tint_focus
 from torchdof.depth.kinds import depth_from_values
 from torchdof.io.metadata import camera_facts
 from torchdof.io.sequence import FramePattern, focus_at_frame, parse_focus, parse_frames
@@ -88,10 +88,6 @@ def depth_blurred(image: Tensor, **others: Any) -> None:
     rendered(image, render=depth_of_field, **others)
 
 
-def settings_of(**said: Any) -> RenderSettings:
-    return RenderSettings(aperture_radius_m=0.1, **said)
-
-
 OPTIONS: dict[str, Any] = {
     "table": RING, "tolerance": 0.01, "occlusion": True, "normalize": True, "method": "layered",
     "max_coc_px": 8.0, "check": True,
@@ -153,9 +149,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "fill_holes": (fill_holes, {"depth": VALUES, "fill": "far"}),
     "tint_focus": (tint_focus, {"image": IMAGE, "coc_px": COC}),
-    "load_table": (load_table, {"name": "disc"}),
-    "pick_device": (pick_device, {"name": "cpu"}),
-    "RenderSettings": (settings_of, {"fov_x_deg": 40.0}),
     "focus_at_frame": (lambda frame: focus_at_frame([(0, 1.0), (5, 2.0)], frame), {"frame": 3}),
     "camera_facts": (facts, {name: 2.0 for name in TAGS}),
 }  # fmt: skip
@@ -182,11 +175,18 @@ def test_any_argument_gives_a_result_or_a_named_error(name: str, data: st.DataOb
     share = data.draw(st.sampled_from([1, 1, 2, 8]), label="wrong arguments")
     wrong = data.draw(st.lists(st.sampled_from(sorted(good)), max_size=share, unique=True), label="which")
     arguments = {**good, **{k: data.draw(ANYTHING, label=k) for k in wrong}}
-    honest(lambda: function(**arguments), *([FileNotFoundError] if name.endswith(("load", "load_table")) else []))
+    honest(lambda: function(**arguments), *([FileNotFoundError] if name.endswith("load") else []))
 
 
 @FEW
 @given(st.text(max_size=12) | st.from_regex(r"[-0-9:.,einfa ]{0,12}", fullmatch=True))
 def test_any_text_is_read_or_refused_by_name(text: str) -> None:
-    for read in (parse_frames, parse_focus, FramePattern):
+    two = numbers(2, "--range expects two numbers such as 1,2")
+    for read in (
+        parse_frames,
+        parse_focus,
+        FramePattern,
+        two,
+        word_or_number(("far",), "--fill expects far or metres"),
+    ):
         honest(functools.partial(read, text))

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from matplotlib.figure import Figure
-from rich.console import Console
 from torch import Tensor
-from typer.testing import CliRunner
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.cli.fit import _draw_table
+from torchdof.cli.fitted import Shown
 from torchdof.cli.main import app
 from torchdof.depth.edges import repair
 from torchdof.fit.lens.glass import Glass
@@ -212,7 +211,7 @@ def test_a_plot_that_cannot_be_finished_leaves_nothing(tmp_path: Path, monkeypat
 
     monkeypatch.setattr(Figure, "savefig", full_disk)
     with pytest.raises(OSError, match="No space left"):
-        _draw_table(BlurTable.disc(), tmp_path, "disc", Console(quiet=True))
+        Shown(quiet=True).draw(BlurTable.disc(), tmp_path, "disc")
     assert not list(tmp_path.iterdir())
 
 

@@ -5,146 +5,50 @@ import importlib.util
 import os
 import shutil
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING
 
-import typer
-from rich.console import Console
+import click
 
-from ..bench import scaling, speed
-from ..bench.accuracy import compare_with_truth
-from ..bench.degraded import compare_degraded
-from ..bench.inputs import BenchScene, shipped
-from ..bench.report import existing_folder
-from .arguments import (
-    DEPTH,
-    ApertureImage,
-    ApertureRadiusM,
-    AsJson,
-    Blades,
-    Curvature,
-    DepthChannel,
-    DepthOffset,
-    DepthScale,
-    DepthUnknown,
-    FarM,
-    FillDepth,
-    FNumber,
-    FocalLengthMm,
-    FocusAt,
-    FocusMOrMedian,
-    FocusRange,
-    FovDeg,
-    NearM,
-    RelativeKind,
-    Rotation,
-    SensorWidthMm,
-    Squeeze,
-    Swing,
-    TableName,
-    Tilt,
-    ValueRange,
-    Vignetting,
-)
-from .frame import read_frame
-from .from_arguments import settings_of
-from .printed import json_line
-from .settings import RenderSettings
+from .command import argument, option
+from .options import Blur, Scene, json_option
+from .printed import WarnOnce, json_line
 
-__all__ = ["bench", "from_files"]
+if TYPE_CHECKING:
+    from ..bench.inputs import BenchScene
 
-_SPEED, _ACCURACY = "Speed", "Accuracy"
+__all__ = ["Bench"]
 
 
-def bench(
-    image: Annotated[
-        Path | None,
-        typer.Argument(metavar="[IMAGE]", help="Image to measure the speed on; without one, a scene that is built in."),
-    ] = None,
-    depth: Annotated[
-        Path | None, typer.Argument(metavar="[DEPTH]", help="Its depth; not needed if IMAGE has a Z channel.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png."),
-    ] = None,
-    repeat: Annotated[int, typer.Option(help="Timed renderings of each setting.", min=1)] = 5,
-    focus_m: FocusMOrMedian = None,
-    focus_at: FocusAt = None,
-    focus_range: FocusRange = None,
-    tilt: Tilt = 0.0,
-    swing: Swing = 0.0,
-    f_number: FNumber = None,
-    focal_length_mm: FocalLengthMm = None,
-    sensor_width_mm: SensorWidthMm = None,
-    fov_deg: FovDeg = None,
-    aperture_radius_m: ApertureRadiusM = None,
-    depth_kind: Annotated[
-        Literal["z", "distance", "disparity", "inverse", "relative", "coc"],
-        typer.Option(help="What the numbers are, as for torchdof render.", rich_help_panel=DEPTH),
-    ] = "z",
-    depth_scale: DepthScale = None,
-    depth_offset: DepthOffset = 0.0,
-    near_m: NearM = None,
-    far_m: FarM = None,
-    relative_kind: RelativeKind = None,
-    value_range: ValueRange = None,
-    depth_unknown: DepthUnknown = None,
-    fill_depth: FillDepth = None,
-    depth_channel: DepthChannel = None,
-    table: TableName = "disc",
-    blades: Blades = 0,
-    rotation: Rotation = 0.0,
-    curvature: Curvature = 0.0,
-    squeeze: Squeeze = 1.0,
-    aperture: ApertureImage = None,
-    vignetting: Vignetting = 0.0,
-    onnx: Annotated[
-        bool,
-        typer.Option(
-            "--onnx", help="Also export and time the file in onnxruntime; takes minutes.", rich_help_panel=_SPEED
-        ),
-    ] = False,
-    compiled: Annotated[
-        bool,
-        typer.Option("--compile", help="Also time torch.compile; takes minutes.", rich_help_panel=_SPEED),
-    ] = False,
-    scan: Annotated[
-        bool,
-        typer.Option("--scan", help="Also show how cost grows with radius and frame size.", rich_help_panel=_SPEED),
-    ] = False,
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            "--truth",
-            help="Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it.",
-            rich_help_panel=_ACCURACY,
-        ),
-    ] = None,
-    views: Annotated[
-        list[int] | None,
-        typer.Option(
-            help="Points on the lens for the reference renderer; repeat it to see how it converges.",
-            min=1,
-            rich_help_panel=_ACCURACY,
-        ),
-    ] = None,
-    degrade: Annotated[
-        bool,
-        typer.Option(
-            "--degrade",
-            help="Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.",
-            rich_help_panel=_ACCURACY,
-        ),
-    ] = False,
-    peer: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="With --degrade, a Python file with another renderer, blur(image, coc_px); may be repeated.",
-            rich_help_panel=_ACCURACY,
-        ),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Speed:
+    """Speed."""
+
+    repeat: int = option("Timed renderings of each setting.", 5, least=1, basic=True)
+    onnx: bool = option("Also export and time the file in onnxruntime; takes minutes.", False)
+    compiled: bool = option("Also time torch.compile; takes minutes.", False, names=("--compile",))
+    scan: bool = option("Also show how cost grows with radius and frame size.", False)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Accuracy:
+    """Accuracy."""
+
+    truth: Path | None = option(
+        "Folder with scenes: meta.json, sharp.exr, depth.exr and truth_K.exr, at any depth below it."
+    )
+    views: tuple[int, ...] = option(
+        "Points on the lens for the reference renderer; repeat it to see how it converges.", (), least=1
+    )
+    degrade: bool = option(
+        "Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.", False
+    )
+    peer: tuple[Path, ...] = option(
+        "With --degrade, a Python file with another renderer, blur(image, coc_px); may be repeated.", ()
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bench:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
     Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU; with --onnx also an
@@ -152,7 +56,7 @@ def bench(
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
-    Camera, depth and blur are told as to torchdof render.
+    Camera, depth and blur are told as to torchdof render; without a focus it is at the median depth.
 
     torchdof and simpler renderers against scenes whose depth of field is known:
 
@@ -165,89 +69,103 @@ def bench(
     The picture that --truth alone writes shows, for each scene, the place where torchdof is farthest from the truth:
     sharp, truth, each renderer with its error below it, four times enlarged.
     """
-    existing_folder(out)
-    how = settings_of(locals())
-    if truth is not None:
-        if image is not None or onnx or compiled or scan:
+
+    image: Path | None = argument(
+        "Image to measure the speed on; without one, a scene that is built in.", "[IMAGE]", None
+    )
+    depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
+    out: Path | None = option(
+        "Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png.", names=("--out", "-o")
+    )
+    scene: Scene
+    blur: Blur
+    speed: _Speed
+    accuracy: _Accuracy
+    as_json: bool = json_option()
+
+    def run(self) -> None:
+        """Measures, prints and writes."""
+        if self.out is not None and not self.out.is_dir():
+            raise FileNotFoundError(f"{self.out}: there is no such folder; make it first")
+        if self.accuracy.truth is not None:
+            self._compare_with_truth(self.accuracy.truth)
+            return
+        if self.accuracy != _Accuracy():
+            raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
+        if self.image is None and self.scene != Scene():
+            raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
+        self.scene.lens.refuse_keyframes()
+        needed = {"matplotlib": self.out is not None, "onnxruntime": self.speed.onnx}
+        for package, is_needed in needed.items():  # before the time is spent
+            if is_needed and importlib.util.find_spec(package) is None:
+                raise ModuleNotFoundError(f"no {package}", name=package)
+        if self.speed.compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
+            raise FileNotFoundError(
+                "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
+            )
+        self._measure_speed()
+
+    def _compare_with_truth(self, truth: Path) -> None:
+        """Accuracy on the scenes of a folder."""
+        if self.image is not None or self.speed != _Speed(repeat=self.speed.repeat):
             raise ValueError(
                 "--truth measures the scenes of its folder; leave IMAGE and DEPTH out, and --onnx, --compile and --scan"
             )
-        if how != RenderSettings(table=how.table) or how.table.aperture is not None or table != "disc":
+        if self.scene != Scene() or self.blur != Blur():
             raise ValueError(
                 "the scenes of --truth have their own lens and depth; leave options of these and of blur out"
             )
-        if as_json:
+        if self.as_json:
             raise ValueError("--truth writes its numbers as CSV to the folder --out; leave --json out")
-        if out is None:
+        if self.out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
-        if not degrade and peer:
+        if not self.accuracy.degrade and self.accuracy.peer:
             raise ValueError("--peer goes with --degrade")
-        if degrade and views:
+        if self.accuracy.degrade and self.accuracy.views:
             raise ValueError("--degrade compares without the reference; leave --views out")
-        if degrade:
-            compare_degraded(truth, out, peer or [])
+        from ..bench.accuracy import compare_with_truth
+        from ..bench.degraded import compare_degraded
+
+        if self.accuracy.degrade:
+            compare_degraded(truth, self.out, list(self.accuracy.peer))
         else:
-            compare_with_truth(truth, out, views)
-        return
-    if views or degrade or peer:
-        raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
-    if (onnx or compiled) and how.table.depends_on_place:
-        raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
-    if image is None and how != RenderSettings(table=how.table):
-        raise ValueError("the built-in scene has its own camera and depth; name an IMAGE for these options")
-    if out is not None and importlib.util.find_spec("matplotlib") is None:  # before the time is spent
-        raise ModuleNotFoundError("no matplotlib", name="matplotlib")
-    if onnx and importlib.util.find_spec("onnxruntime") is None:
-        raise ModuleNotFoundError("no onnxruntime", name="onnxruntime")
-    if compiled and not any(map(shutil.which, (os.environ.get("CXX", ""), "g++", "clang++", "c++"))):
-        raise FileNotFoundError(
-            "torch.compile needs a C++ compiler, and none was found; install g++ or leave --compile out"
-        )
-    scene = dataclasses.replace(shipped(), table=how.table) if image is None else from_files(image, depth, how)
-    console = Console(stderr=True)
-    runtimes: list[speed.Runtime] = []
-    if onnx:
-        runtimes.append("onnxruntime")
-    if compiled:
-        runtimes.append("compiled")
-    rows, unit = speed.measure_all(scene, repeat, console, runtimes)
-    scan_costs = scaling.measure_scans(scene, repeat, unit, console) if scan else []
-    scans = [scaling.table_of(scan_costs)] if scan_costs else []
-    if as_json:
-        facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table), "unit_s": unit}
-        costs = {"settings": [dataclasses.asdict(row) for row in rows]}
-        typer.echo(json_line({**facts, **costs, "scans": [dataclasses.asdict(cost) for cost in scan_costs]}))
-    else:
-        speed.show(rows, scene, unit)
-        for of_scan in scans:
-            of_scan.show()
-    if out is not None:
-        speed.write(out, rows, scene, unit, repeat, scans)
+            compare_with_truth(truth, self.out, list(self.accuracy.views) or None)
 
+    def _measure_speed(self) -> None:
+        """Speed against error on the user's scene, or the one that is built in."""
+        from rich.console import Console
 
-def from_files(image: Path, depth: Path | None, how: RenderSettings) -> BenchScene:
-    """An image and its depth from files; alpha is left out.
+        from ..bench import scaling, speed
+        from ..bench.inputs import shipped
 
-    Args:
-        image: Image file.
-        depth: Depth file; None takes the depth channel of the image.
-        how: Camera, depth and table as for ``torchdof render``; without a focus it is at the median depth, so that
-            there is blur on both sides.
+        table, console = self.blur.table_of(self.blur.table), Console(stderr=True)
+        if (self.speed.onnx or self.speed.compiled) and table.depends_on_place:
+            raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
+        scene = dataclasses.replace(shipped() if self.image is None else self._read(self.image), table=table)
+        chosen: dict[speed.Runtime, bool] = {"onnxruntime": self.speed.onnx, "compiled": self.speed.compiled}
+        runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
+        rows, unit = speed.measure_all(scene, self.speed.repeat, console, runtimes)
+        scan_costs = scaling.measure_scans(scene, self.speed.repeat, unit, console) if self.speed.scan else []
+        scans = [scaling.table_of(scan_costs)] if scan_costs else []
+        if self.as_json:
+            facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table), "unit_s": unit}
+            costs = {"settings": [dataclasses.asdict(row) for row in rows]}
+            click.echo(json_line({**facts, **costs, "scans": [dataclasses.asdict(cost) for cost in scan_costs]}))
+        else:
+            speed.show(rows, scene, unit)
+            for of_scan in scans:
+                of_scan.show()
+        if self.out is not None:
+            speed.write(self.out, rows, scene, unit, self.speed.repeat, scans)
 
-    Raises:
-        ValueError: If input is wrong or missing.
-        OSError: If a file cannot be read.
-    """
-    frame = read_frame(image, depth, how)
-    picture, values = frame.picture, frame.values
-    light = picture.pixels[:, :-1] if picture.has_alpha else picture.pixels
-    if how.depth_kind == "coc":
-        return BenchScene(image.name, light, values, "blur as given", how.table)
-    focus = "focus as stated"
-    if how.focus is None and how.focus_at is None and how.focus_range is None:
-        focus, how = "focus at the median depth", dataclasses.replace(how, focus=[(0, float(values.median()))])
-    camera, remarks = how.camera(picture.metadata, light.shape[-1], 0)
-    if how.focus_at is not None:
-        camera = camera.focus_at(values, *how.focus_at)
-    words = f"{camera!r}; {', '.join([focus, *remarks])}"
-    return BenchScene(image.name, light, camera.coc_px(values, light.shape[-1]), words, how.table)
+    def _read(self, image: Path) -> "BenchScene":
+        """The user's image and its blur, without alpha."""
+        from ..bench.inputs import BenchScene
+        from .frame import coc_of, read_frame
+
+        frame = read_frame(image, self.depth, self.scene)
+        coc_px, camera, remarks = coc_of(frame, self.scene, WarnOnce(self.scene.depth_map.strict), median=True)
+        if self.scene.lens.has_focus:
+            remarks = ["focus as stated", *remarks]
+        words = "blur as given" if camera is None else f"{camera!r}; {', '.join(remarks)}"
+        return BenchScene(image.name, frame.picture.light, coc_px, words)

@@ -5,9 +5,9 @@ import errno
 import sys
 from collections.abc import Iterator
 
-import typer
+import click
 
-__all__ = ["advice", "told_in_one_sentence"]
+__all__ = ["told_in_one_sentence"]
 
 _EXTRAS = {
     "scipy": "fit",
@@ -25,16 +25,19 @@ _NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size c
 
 @contextlib.contextmanager
 def told_in_one_sentence() -> Iterator[None]:
-    """Turns errors of the input, of files and of memory into their message and exit code 2; others pass.
+    """Turns errors of the input, of files, of memory and of missing packages into their message; others pass.
 
     Raises:
-        typer.Exit: After the message.
+        SystemExit: With code 2, after the message.
     """
     try:
         yield
         return
     except ModuleNotFoundError as error:
-        message = advice(error)
+        package = (error.name or "").partition(".")[0]
+        if package not in _EXTRAS:
+            raise
+        message = f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
     except OSError as error:
         if error.errno == errno.EPIPE:
             raise
@@ -51,17 +54,5 @@ def told_in_one_sentence() -> Iterator[None]:
             message = _TOO_LITTLE
         else:
             raise
-    typer.echo(f"error: {message}", err=True)
-    raise typer.Exit(2)
-
-
-def advice(error: ModuleNotFoundError) -> str:
-    """Which extra brings a package that is missing.
-
-    Raises:
-        ModuleNotFoundError: The same, if none does.
-    """
-    package = (error.name or "").partition(".")[0]
-    if package not in _EXTRAS:
-        raise error
-    return f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
+    click.echo(f"error: {message}", err=True)
+    raise SystemExit(2)

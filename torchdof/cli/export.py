@@ -2,81 +2,37 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import typer
-from rich.console import Console
+import click
 
-from torchdof import Camera, DepthOfField
-from torchdof.cli.arguments import (
-    BLUR,
-    LENS,
-    ApertureImage,
-    AsJson,
-    Blades,
-    Curvature,
-    DepthEdgesName,
-    FovDeg,
-    MethodName,
-    NoOcclusion,
-    Rotation,
-    Squeeze,
-    TableName,
-    ToleranceText,
-)
-from torchdof.cli.printed import json_line
-from torchdof.cli.settings import depth_edges_of, load_aperture, load_table
-from torchdof.export.conversion import OPSET, to_onnx
-from torchdof.export.metadata import describe, shown
-from torchdof.options import tolerance_of_text
+from .command import option
+from .options import Accuracy, Blur, Sensor, edges_option, json_option
+from .printed import Bar, json_line
 
-__all__ = ["export"]
-
-_GRAPH = "Graph"
+__all__ = ["Export"]
 
 
-def export(
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The file to write.")] = None,
-    show: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write nothing; print what this file says about itself.")
-    ] = None,
-    focal_length_mm: Annotated[float, typer.Option(help="Real focal length.", rich_help_panel=LENS)] = 50.0,
-    sensor_width_mm: Annotated[float, typer.Option(help="36 for full frame.", rich_help_panel=LENS)] = 36.0,
-    fov_deg: FovDeg = None,
-    table: TableName = "disc",
-    blades: Blades = 0,
-    rotation: Rotation = 0.0,
-    curvature: Curvature = 0.0,
-    squeeze: Squeeze = 1.0,
-    aperture: ApertureImage = None,
-    max_coc: Annotated[
-        float, typer.Option(help="Largest radius in pixels that the file holds.", rich_help_panel=BLUR)
-    ] = 32.0,
-    tolerance: ToleranceText = "final",
-    no_occlusion: NoOcclusion = False,
-    method: MethodName = "layered",
-    depth_edges: DepthEdgesName = "as-given",
-    inputs: Annotated[
-        Literal["depth", "coc_px"],
-        typer.Option(
-            help="The map the graph takes: depth in metres, with focus and f-number as inputs; or the signed blur "
-            "radius in pixels.",
-            rich_help_panel=_GRAPH,
-        ),
-    ] = "depth",
-    channels: Annotated[int, typer.Option(help="Channels of the image.", rich_help_panel=_GRAPH)] = 3,
-    width: Annotated[
-        int | None,
-        typer.Option(
-            help="Image width whose kernels the file holds, for a table in millimetres or fractions of the width.",
-            rich_help_panel=_GRAPH,
-        ),
-    ] = None,
-    opset: Annotated[int, typer.Option(help="ONNX operator set.", rich_help_panel=_GRAPH)] = OPSET,
-    as_json: AsJson = False,
-) -> None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Graph:
+    """Graph."""
+
+    inputs: Literal["depth", "coc_px"] = option(
+        "The map the graph takes: depth in metres, with focus and f-number as inputs; or the signed blur radius in "
+        "pixels.",
+        "depth",
+    )
+    channels: int = option("Channels of the image.", 3)
+    width: int | None = option(
+        "Image width whose kernels the file holds, for a table in millimetres or fractions of the width."
+    )
+    opset: int = option("ONNX operator set.", 20)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export:
     """Write depth of field as one ONNX file, for pipelines without PyTorch.
 
     The file is compared with the module in onnxruntime before it is written; the comparison is printed.
@@ -91,54 +47,60 @@ def export(
 
         torchdof export --show dof.onnx
     """
-    if (out is None) == (show is None):
-        raise ValueError("give either -o FILE to write or --show FILE to read")
-    if show is not None:
-        facts = describe(show)
-        print(json_line(facts) if as_json else "\n".join(_lines(facts)))
-        return
-    if out is None:
-        return
-    if out.suffix != ".onnx":
-        raise ValueError(f"the file is ONNX: name it {out.with_suffix('.onnx')}")
-    if fov_deg is None:
-        camera = Camera(focal_length_mm=focal_length_mm, sensor_width_mm=sensor_width_mm)
-    else:
-        camera = Camera.from_fov(fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
-    dof = DepthOfField(
-        camera,
-        load_table(table, load_aperture(blades, rotation, curvature, squeeze, aperture)),
-        tolerance=tolerance_of_text(tolerance),
-        occlusion=not no_occlusion,
-        method=method,
-        max_coc_px=max_coc,
-        check=False,
-    )
-    with Console(stderr=True).status("tracing") as status:
-        report = to_onnx(
-            dof,
-            out,
-            inputs=inputs,
-            channels=channels,
-            width=width,
-            depth_edges=depth_edges_of(depth_edges),
-            opset=opset,
-            progress=status.update,
+
+    out: Path | None = option("The file to write.", names=("--out", "-o"))
+    show: Path | None = option("Write nothing; print what this file says about itself.", metavar="FILE")
+    sensor: Sensor
+    blur: Blur
+    max_coc: float = option("Largest radius in pixels that the file holds.", 32.0, basic=True)
+    accuracy: Accuracy
+    depth_edges: Literal["auto", "repair", "as-given"] = edges_option("as-given")
+    graph: _Graph
+    as_json: bool = json_option()
+
+    def run(self) -> None:
+        """Writes a file, or reads one."""
+        if self.show is not None and self.out is None:
+            from torchdof.export.metadata import describe
+
+            facts = describe(self.show)
+            click.echo(json_line(facts) if self.as_json else _lines(facts))
+            return
+        if self.out is None or self.show is not None:
+            raise ValueError("give either -o FILE to write or --show FILE to read")
+        if self.out.suffix != ".onnx":
+            raise ValueError(f"the file is ONNX: name it {self.out.with_suffix('.onnx')}")
+        from torchdof import Camera, DepthOfField
+        from torchdof.export.conversion import to_onnx
+
+        if self.sensor.fov_deg is None:
+            stated = {name: getattr(self.sensor, name) for name in ("focal_length_mm", "sensor_width_mm")}
+            camera = Camera(**{name: value for name, value in stated.items() if value is not None})
+        else:
+            camera = Camera.from_fov(self.sensor.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
+        dof = DepthOfField(
+            camera, self.blur.table_of(self.blur.table), **self.accuracy.options(), max_coc_px=self.max_coc, check=False
         )
-    print(json_line({"out": str(out), **dataclasses.asdict(report)}) if as_json else f"{report}\nwrote {out}")
+        with Bar("tracing") as bar:
+            report = to_onnx(
+                dof,
+                self.out,
+                **dataclasses.asdict(self.graph),
+                depth_edges=self.depth_edges.replace("-", " "),
+                progress=bar.tell,
+            )
+        facts = {"out": str(self.out), **dataclasses.asdict(report)}
+        click.echo(json_line(facts) if self.as_json else f"{report}\nwrote {self.out}")
 
 
-def _lines(facts: Mapping[str, Any]) -> Sequence[str]:
+def _lines(facts: Mapping[str, Any], indent: str = "") -> str:
     """A file's metadata, a line each."""
+    from torchdof.export.metadata import shown
+
     lines = []
     for name, value in facts.items():
-        if isinstance(value, dict):
-            lines.append(f"{shown(name)}:")
-            lines += [f"  {shown(k)}: {_told(v)}" for k, v in value.items()]
+        if isinstance(value, dict) and not indent:
+            lines += [f"{shown(name)}:", _lines(value, "  ")]
         else:
-            lines.append(f"{shown(name)}: {_told(value)}")
-    return lines
-
-
-def _told(value: Any) -> str:
-    return shown(value if isinstance(value, str) else json.dumps(value))
+            lines.append(f"{indent}{shown(name)}: {shown(value if isinstance(value, str) else json.dumps(value))}")
+    return "\n".join(lines)

@@ -1,34 +1,40 @@
-"""One frame from files to a file: what ``torchdof render`` does with each image."""
+"""One frame from files to a file: what ``torchdof render`` does with each image, and what other commands do of it."""
 
 import dataclasses
+import functools
 import math
 import os
 import time
-from typing import Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
 from ..depth.holes import resolve_holes
+from ..depth.inspect import tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import coc_mistakes, depth_mistakes
 from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.metadata import camera_facts
-from ..module import blur_by_coc, depth_of_field
-from ..optics.camera import Camera
+from ..module import blur_by_coc
+from ..optics.blur_table import BlurTable
+from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
-from ..validation import coc_of_lens, image_and_map, same_aspect
-from .settings import RenderSettings
-from .warn_once import WarnOnce
+from ..validation import coc_of_lens, same_aspect
+from .options import Scene, pick_device
+from .printed import Bar, WarnOnce, json_line
 
-__all__ = ["Frame", "Rendered", "read_frame", "read_metres", "render_frame", "tint_focus"]
+if TYPE_CHECKING:
+    from .render import Render
 
-_NEAR, _SHARP, _FAR = (0.90, 0.35, 0.0), (0.0, 0.62, 0.20), (0.0, 0.30, 0.85)
-_FAINT, _CLEAR = 0.2, 0.6  # change of light to the next pixel, of the brighter one: begins to be an outline, and is one
-_DARKEST = 0.05  # of the mean light: what is darker has no outlines of its own
+__all__ = ["Frame", "Rendered", "Renderer", "coc_of", "facts_of_camera", "read_frame"]
+
+_LARGE_PX = 8_000_000  # pixels from which on people ask how long it takes
+_STRIPS = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,281 +42,235 @@ class Frame:
     """An image and its depth, as read.
 
     Args:
+        name: Of the file that the depth is from.
         picture: The image.
-        values: ``[1, 1, H, W]``, depth in metres (signed pixels for coc) without holes.
+        values: ``[1, 1, H, W]``, depth in metres (signed pixels for coc).
         holes: How many holes were filled.
+        seconds: How long reading took.
     """
 
+    name: str
     picture: Picture
     values: Tensor
     holes: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Rendered:
-    """What was done to a frame, with what, and how long it took; ``str`` says it in one line.
-
-    Args:
-        out: The file that was written.
-        settings: What the user said.
-        camera: The camera; None where the depth map was the circle of confusion itself.
-        largest_coc_px: Largest radius of the blur in pixels.
-        size: Width and height in pixels.
-        holes: How many pixels of depth were filled.
-        seconds: From reading to writing.
-        remarks: What was not stated: the focus from the file, the lens from the file or assumed.
-    """
-
-    out: str
-    settings: RenderSettings
-    camera: Camera | None
-    largest_coc_px: float
-    size: tuple[int, int]
-    holes: int
     seconds: float
-    remarks: tuple[str, ...]
-
-    @property
-    def table(self) -> str:
-        """Name of the blur table, or its family where it has none."""
-        return self.settings.table.name or self.settings.table.family
-
-    def __str__(self) -> str:
-        settings, parts = self.settings, []
-        if self.camera is not None:
-            ends = self.camera.focus_range_m or (self.camera.focus_m,)
-            parts.append(
-                f"focus {' to '.join(f'{end:.4g}' for end in ends)} m, f/{self.camera.f_number:.3g}, "
-                f"{self.camera.focal_length_mm:.4g} mm on {self.camera.sensor_width_mm:.4g} mm"
-            )
-            angles = {"tilt": self.camera.tilt_deg, "swing": self.camera.swing_deg}
-            parts += [f"{name} {angle:.4g} degrees" for name, angle in angles.items() if angle != 0.0]
-        parts.append(f"blur radius up to {self.largest_coc_px:.1f} px")
-        if settings.show_focus:
-            parts.append("focus shown: near orange, sharp green, far blue")
-        else:
-            parts.append(f"{self.table}, {settings.method}")
-            if settings.table.aperture is not None:
-                parts.append(repr(settings.table.aperture).removeprefix("Aperture(").removesuffix(")"))
-            parts += [] if settings.occlusion else ["no occlusion"]
-        if self.holes:
-            parts.append(f"{self.holes} px of depth filled ({settings.fill})")
-        parts += [f"{self.size[0]} x {self.size[1]}", f"{self.seconds:.2f} s on {settings.device}"]
-        return f"{self.out}: " + "; ".join(parts) + (f" [{', '.join(self.remarks)}]" if self.remarks else "")
-
-    def facts(self) -> dict[str, Any]:
-        """The same for programs, as JSON-like data."""
-        settings, names = self.settings, ("focus_m", "f_number", "focal_length_mm", "sensor_width_mm")
-        camera: dict[str, Any] | None = None
-        if self.camera is not None:
-            camera = {name: float(getattr(self.camera, name)) for name in names}
-            ends = self.camera.focus_range_m
-            camera |= {"focus_range_m": None if ends is None else [float(end) for end in ends]}
-            camera |= {"tilt_deg": float(self.camera.tilt_deg), "swing_deg": float(self.camera.swing_deg)}
-        facts: dict[str, Any] = {"out": self.out, "camera": camera, "assumed": self.remarks}
-        facts |= {"largest_coc_px": self.largest_coc_px, "width": self.size[0], "height": self.size[1]}
-        facts |= {"filled_px": self.holes, "show_focus": settings.show_focus}
-        if not settings.show_focus:
-            aperture = settings.table.aperture
-            facts |= {"table": self.table, "aperture": None if aperture is None else aperture.to_dict()}
-            facts |= {"method": settings.method, "occlusion": settings.occlusion}
-            facts |= {"tolerance": settings.tolerance, "attention": settings.attention}
-        return facts | {"seconds": self.seconds, "device": str(settings.device)}
 
 
-def read_frame(image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, settings: RenderSettings) -> Frame:
+def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
     """Reads an image and its depth.
 
     Args:
         image: Image file.
         depth: Depth file; None takes the depth channel of the image.
-        settings: What the user said.
+        scene: What the user said of lens and depth.
+        holes: Whether holes that nobody said how to fill stay NaN; otherwise they are an error.
+        **encoding: Of the image, as for :func:`torchdof.io.images.read_image`.
 
     Raises:
         ValueError: If input is wrong or missing.
         OSError: If a file cannot be read.
     """
-    picture = read_image(image, settings.transfer, settings.layer)
-    values = read_metres(image, depth, picture, settings)
-    return Frame(picture, *resolve_holes(values, str(image if depth is None else depth), settings.fill))
+    start, name, fill = time.perf_counter(), str(depth or image), scene.depth_map.fill_depth
+    picture = read_image(image, **encoding)
+    values, filled = _metres(image, depth, picture, scene), 0
+    if fill is not None or not holes:
+        values, filled = resolve_holes(values, name, fill)  # type: ignore[arg-type]
+    return Frame(name, picture, values, filled, time.perf_counter() - start)
 
 
-def render_frame(
-    image: str | os.PathLike[str],
-    depth: str | os.PathLike[str] | None,
-    out: str | os.PathLike[str],
-    settings: RenderSettings,
-    frame: int = 0,
-    warned: WarnOnce | None = None,
-    source: Frame | None = None,
-) -> Rendered:
-    """Reads an image and its depth, blurs, and writes the result whole or not at all.
-
-    Args:
-        image: Image file.
-        depth: Depth file; None takes the depth channel of the image.
-        out: File to write.
-        settings: What the user said.
-        frame: Number of the frame, for focus that moves.
-        warned: What was warned of in frames before; None warns of everything.
-        source: What is in ``image`` and ``depth`` where it was read already.
-
-    Returns:
-        What was done, with what, and how long it took.
-
-    Raises:
-        ValueError: If input is wrong or missing, or looks like a mistake and the settings are strict.
-        OSError: If a file cannot be read or written.
-    """
-    warned = WarnOnce(settings.strict) if warned is None else warned
-    if any(os.path.realpath(source) == os.path.realpath(out) for source in (image, depth) if source is not None):
-        raise ValueError(f"{out}: is one of the inputs; write to another file")
-    start = time.perf_counter()
-    source = read_frame(image, depth, settings) if source is None else source
-    picture, holes = source.picture, source.holes
-    height, width = picture.pixels.shape[-2:]
-    values = source.values.to(settings.device)
-    camera: Camera | None = None
-    remarks: list[str] = []
-    if settings.depth_kind == "coc":
-        coc_px = values
-        warned.warn(depth or image, coc_mistakes(coc_px))
-    else:
-        camera, remarks = settings.camera(picture.metadata, width, frame)
-        if settings.focus_at is not None:
-            camera = camera.focus_at(values, *settings.focus_at)
-        coc_px = camera.coc_px(values, width)
-        coc_of_lens(coc_px, values, settings.stated(camera))
-        warned.warn(depth or image, depth_mistakes(values, camera, settings.depth_kind, settings.depth_scale))
-    pixels = picture.pixels.to(settings.device)
-    if settings.show_focus:
-        pixels = tint_focus(pixels, coc_px, picture.has_alpha)
-        picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
-    else:
-        table = settings.table
-        if picture.has_alpha and table.channels > 1:  # alpha is blurred as green is
-            params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
-            field = table.field
-            if field is not None:
-                field = dataclasses.replace(field, light=torch.cat([field.light, field.light[1:2]]))
-            table = table.replace(params=params, field=field)
-        options = Options(
-            table, settings.tolerance, settings.occlusion, method=settings.method, depth_edges=settings.depth_edges
-        ).arguments()
-        with torch.no_grad():
-            if camera is None:
-                pixels = blur_by_coc(pixels, coc_px, attention=settings.attention, **options)
-            else:
-                pixels = depth_of_field(pixels, values, camera, attention=settings.attention, **options)
-    write_image(out, dataclasses.replace(picture, pixels=pixels), settings.out_transfer, settings.sample)
-    largest, seconds = float(coc_px.abs().max()), time.perf_counter() - start
-    return Rendered(str(out), settings, camera, largest, (width, height), holes, seconds, tuple(remarks))
-
-
-def tint_focus(image: Tensor, coc_px: Tensor, has_alpha: bool = False) -> Tensor:
-    """The image with outlines in colour: green in focus (radius of at most 1 px), orange nearer, blue farther.
-
-    Everything else keeps its colours. Outlines are where the image's light changes by more than a third from pixel to
-    pixel, and where one of the three zones meets another.
-
-    Args:
-        image: ``[B, C, H, W]`` in linear light, C of 1 or 3, one more with alpha (premultiplied).
-        coc_px: ``[B, 1, H, W]``, signed radius in pixels.
-        has_alpha: Whether the last channel is alpha.
-
-    Returns:
-        ``[B, 3, H, W]``, or ``[B, 4, H, W]`` with alpha.
-
-    Raises:
-        ValueError: If shapes or types are not as described.
-
-    Example:
-        >>> coc_px = torch.tensor([-3.0, -3.0, 0.2, 5.0, 5.0])[None, None, None]
-        >>> tinted = tint_focus(torch.ones(1, 3, 1, 5), coc_px)
-        >>> tinted[0, :, 0, 1:4].argmax(dim=0)  # red, green and blue are strongest where zones meet
-        tensor([0, 1, 2])
-        >>> tinted[0, :, 0, 0]
-        tensor([1., 1., 1.])
-    """
-    image_and_map(image, "coc_px", coc_px, "in pixels")
-    if image.shape[1] - has_alpha not in (1, 3):
-        raise ValueError(f"image must have 1 or 3 channels of colour, got {image.shape[1] - has_alpha}")
-    colour, alpha = (image[:, :-1], image[:, -1:]) if has_alpha else (image, image[:, :0])
-    tints = torch.tensor([_NEAR, _SHARP, _FAR], dtype=image.dtype, device=image.device)
-    zone = (coc_px >= -1.0).long() + (coc_px > 1.0).long()
-    tint = tints[zone[:, 0]].permute(0, 3, 1, 2)  # [B, H, W, 3] -> [B, 3, H, W]
-    grey = colour.mean(dim=1, keepdim=True)
-    brightest, darkest = _largest_around(grey), -_largest_around(-grey)
-    zones = zone.to(image.dtype)
-    meets_another = _largest_around(zones) + _largest_around(-zones) > 0
-    contrast = (brightest - darkest) / brightest.clamp(min=_DARKEST * grey.mean().clamp(min=1e-12))
-    outline = torch.where(meets_another, 1.0, ((contrast - _FAINT) / (_CLEAR - _FAINT)).clamp(0.0, 1.0))
-    shown = tint / tint.amax(dim=1, keepdim=True) * brightest.clamp(min=grey.mean())
-    tinted = torch.lerp(colour.expand_as(shown), shown, outline.expand_as(shown))
-    return torch.cat([tinted, alpha], dim=1)
-
-
-def _largest_around(values: Tensor) -> Tensor:
-    """Largest of a pixel and its eight neighbours, ``[B, 1, H, W]``."""
-    return functional.max_pool2d(values, 3, stride=1, padding=1)
-
-
-def read_metres(
-    image: str | os.PathLike[str], depth: str | os.PathLike[str] | None, picture: Picture, settings: RenderSettings
-) -> Tensor:
-    """Depth in metres (signed pixels for coc) as the file has it, ``[1, 1, H, W]``, NaN in holes.
-
-    Args:
-        image: Image file.
-        depth: Depth file; None takes the depth channel of the image.
-        picture: What is in the image file.
-        settings: What the user said.
-
-    Raises:
-        ValueError: If input is wrong or missing.
-        OSError: If a file cannot be read.
-    """
-    if depth is not None:
-        values = read_values(depth, settings.depth_channel)
-    elif settings.depth_channel is not None:
-        values = read_values(image, settings.depth_channel)
+def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> Tensor:
+    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes."""
+    said, lens, name = scene.depth_map, scene.lens, str(depth or image)
+    if depth is not None or said.depth_channel is not None:
+        values = read_values(depth or image, said.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
-    name = str(depth if depth is not None else image)
-    kind = settings.depth_kind
     (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
-    if kind == "coc" and (h, w) != (ih, iw):
+    if said.depth_kind == "coc" and (h, w) != (ih, iw):
         raise ValueError(f"{name}: coc is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
     try:
         same_aspect(picture.pixels, values)
-        if kind == "relative":
-            metres = from_relative(
-                values,
-                settings.near_m or 0.0,  # the settings refuse to be without
-                settings.far_m or 0.0,
-                settings.relative_kind or "disparity",
-                value_range=settings.value_range,
-                unknown=settings.depth_unknown,
-            )
+        if said.depth_kind == "relative":
+            ends, kind = (said.near_m or 0.0, said.far_m or 0.0), said.relative_kind or "disparity"
+            metres = from_relative(values, *ends, kind, value_range=said.value_range, unknown=said.depth_unknown)
             return at_size_of(picture.pixels, metres)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-    fov_x_deg = settings.fov_x_deg
-    if kind == "distance" and fov_x_deg is None:
+    fov_x_deg = lens.fov_deg
+    if said.depth_kind == "distance" and fov_x_deg is None:
         facts = camera_facts(picture.metadata, iw)
-        focal_mm = settings.focal_length_mm or facts.get("focal_length_mm")
-        sensor_mm = settings.sensor_width_mm or facts.get("sensor_width_mm")
+        focal_mm = lens.focal_length_mm or facts.get("focal_length_mm")
+        sensor_mm = lens.sensor_width_mm or facts.get("sensor_width_mm")
         if focal_mm is None or sensor_mm is None:
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
         fov_x_deg = 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
-    metres = depth_from_values(
-        values,
-        kind,
-        scale=settings.depth_scale,
-        offset=settings.depth_offset,
-        unknown=settings.depth_unknown,
-        fov_x_deg=fov_x_deg,
-    )
-    return metres if kind == "coc" else at_size_of(picture.pixels, metres)
+    numbers = {"scale": said.depth_scale, "offset": said.depth_offset, "unknown": said.depth_unknown}
+    metres = depth_from_values(values, said.depth_kind, **numbers, fov_x_deg=fov_x_deg)  # type: ignore[arg-type]
+    return metres if said.depth_kind == "coc" else at_size_of(picture.pixels, metres)
+
+
+def coc_of(
+    frame: Frame, scene: Scene, warned: WarnOnce, number: int = 0, median: bool = False
+) -> tuple[Tensor, Camera | None, list[str]]:
+    """The circle of confusion of a frame, its camera and remarks on what was not stated.
+
+    Args:
+        frame: What was read.
+        scene: What the user said of lens and depth.
+        warned: What was warned of before.
+        number: Of the frame, for focus that moves.
+        median: Whether the focus is at the median depth where the user said nothing.
+
+    Returns:
+        Signed radius ``[1, 1, H, W]`` in pixels; the camera, None where the map held the radius itself; the remarks.
+
+    Raises:
+        ValueError: If the lens makes no sense, or something looks like a mistake and ``warned`` is strict.
+    """
+    said, values = scene.depth_map, frame.values
+    if said.depth_kind == "coc":
+        warned.warn(frame.name, coc_mistakes(values))
+        return values, None, []
+    camera, remarks = scene.lens.camera(frame.picture.metadata, values, number, median)
+    coc_px = camera.coc_px(values, values.shape[-1])
+    coc_of_lens(coc_px, values, scene.lens.stated(camera))
+    warned.warn(frame.name, depth_mistakes(values, camera, said.depth_kind, said.depth_scale))
+    return coc_px, camera, remarks
+
+
+def facts_of_camera(camera: Camera) -> dict[str, float]:
+    """Its numbers, for programs."""
+    return {name: float(getattr(camera, name)) for name in CAMERA_NUMBERS}
+
+
+@dataclasses.dataclass(frozen=True)
+class Rendered:
+    """A picture to write, and what to tell of it.
+
+    Args:
+        out: The file to write.
+        picture: What to write.
+        words: For people.
+        facts: For programs.
+        seconds: Reading, rendering and writing together.
+    """
+
+    out: Path
+    picture: Picture
+    words: list[str]
+    facts: dict[str, Any]
+    seconds: float
+
+    def told(self, as_json: bool) -> str:
+        """One line."""
+        if as_json:
+            return json_line({"out": str(self.out), **self.facts, "seconds": self.seconds})
+        remarks = ", ".join(self.facts["assumed"])
+        words = [*self.words, "{width} x {height}".format_map(self.facts)]
+        line = f"{self.out}: {'; '.join(words)}; {self.seconds:.2f} s on {self.facts['device']}"
+        return f"{line} [{remarks}]" if remarks else line
+
+
+class Renderer:
+    """What ``torchdof render`` does with each frame: reads, renders and writes it.
+
+    Args:
+        command: What the user said.
+
+    Raises:
+        ValueError: If the table, the opening or the device makes no sense.
+        OSError: If a file of theirs cannot be read.
+    """
+
+    def __init__(self, command: "Render") -> None:
+        self.command, self.table = command, command.blur.table_of(command.blur.table)
+        self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
+
+    def read(self, image: Path, depth: Path | None, out: Path) -> Frame:
+        """As :func:`read_frame`, unless the result would take the place of what is read."""
+        if any(os.path.realpath(source) == os.path.realpath(out) for source in (image, depth) if source is not None):
+            raise ValueError(f"{out}: is one of the inputs; write to another file")
+        files = self.command.files
+        return read_frame(image, depth, self.command.scene, transfer=files.transfer, layer=files.layer)
+
+    def render(self, frame: Frame, out: Path, number: int = 0, bar: Bar | None = None) -> Rendered:
+        """The picture of a frame; the bar is told how long a large one takes. Raises as :func:`coc_of`."""
+        start, picture, command = time.perf_counter(), frame.picture, self.command
+        frame = dataclasses.replace(frame, values=frame.values.to(self.device))
+        coc_px, camera, remarks = coc_of(frame, command.scene, self.warned, number)
+        pixels = picture.pixels.to(self.device)
+        if command.show_focus:
+            pixels = tint_focus(pixels, coc_px, picture.has_alpha)
+            picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
+        else:
+            table = _with_alpha(self.table) if picture.has_alpha else self.table
+            edges: Any = command.depth_edges.replace("-", " ")
+            blur = functools.partial(blur_by_coc, table=table, depth_edges=edges, **command.accuracy.options())
+            with torch.no_grad():
+                if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
+                    bar.expect(_seconds(blur, pixels, coc_px))
+                pixels = blur(pixels, coc_px, attention=command.attention)
+        words, facts = self._told(camera, float(coc_px.abs().max()), frame.holes)
+        facts |= {"assumed": remarks, "width": pixels.shape[-1], "height": pixels.shape[-2]}
+        seconds = frame.seconds + time.perf_counter() - start
+        return Rendered(out, dataclasses.replace(picture, pixels=pixels), words, facts, seconds)
+
+    def write(self, rendered: Rendered) -> Rendered:
+        """Writes what was rendered, whole or not at all; its time is then that of writing, too.
+
+        Raises:
+            ValueError: If the type of file cannot hold the picture.
+            OSError: If the file cannot be written.
+        """
+        start = time.perf_counter()
+        write_image(rendered.out, rendered.picture, self.command.files.out_transfer, self.command.files.bits)
+        return dataclasses.replace(rendered, seconds=rendered.seconds + time.perf_counter() - start)
+
+    def _told(self, camera: Camera | None, largest_px: float, holes: int) -> tuple[list[str], dict[str, Any]]:
+        """What was done to a frame, for people and for programs."""
+        command, accuracy, table, words = self.command, self.command.accuracy, self.table, list[str]()
+        facts: dict[str, Any] = {"camera": None, "largest_coc_px": largest_px, "filled_px": holes}
+        facts |= {"show_focus": command.show_focus, "device": str(self.device)}
+        if camera is not None:
+            ends, angles = camera.focus_range_m, {"tilt": camera.tilt_deg, "swing": camera.swing_deg}
+            facts["camera"] = facts_of_camera(camera) | {f"{name}_deg": float(a) for name, a in angles.items()}
+            facts["camera"]["focus_range_m"] = None if ends is None else [float(end) for end in ends]
+            focus = " to ".join(f"{end:.4g}" for end in ends or (camera.focus_m,))
+            lens = f"{camera.focal_length_mm:.4g} mm on {camera.sensor_width_mm:.4g} mm"
+            words.append(f"focus {focus} m, f/{camera.f_number:.3g}, {lens}")
+            words += [f"{name} {angle:.4g} degrees" for name, angle in angles.items() if angle != 0.0]
+        words.append(f"blur radius up to {largest_px:.1f} px")
+        if command.show_focus:
+            words.append("focus shown: near orange, sharp green, far blue")
+        else:
+            name, aperture = table.name or table.family, table.aperture
+            words.append(f"{name}, {accuracy.method}")
+            words += [] if aperture is None else [repr(aperture).removeprefix("Aperture(").removesuffix(")")]
+            words += ["no occlusion"] if accuracy.no_occlusion else []
+            options = Options.of(**accuracy.options())
+            facts |= {"table": name, "aperture": None if aperture is None else aperture.to_dict()}
+            facts |= {"method": options.method, "occlusion": options.occlusion, "tolerance": options.tolerance}
+            facts |= {"attention": command.attention}
+        words += [f"{holes} px of depth filled ({command.scene.depth_map.fill_depth})"] if holes else []
+        return words, facts
+
+
+def _seconds(blur: Callable[[Tensor, Tensor], Tensor], pixels: Tensor, coc_px: Tensor) -> float:
+    """How long an image is expected to take, by a strip across its middle."""
+    start, height = time.perf_counter(), pixels.shape[-2]
+    strip = (..., slice(height // 2, height // 2 + math.ceil(height / _STRIPS)), slice(None))
+    blur(pixels[strip], coc_px[strip])
+    return _STRIPS * (time.perf_counter() - start)
+
+
+def _with_alpha(table: BlurTable) -> BlurTable:
+    """A table for light with alpha, which is blurred as green is."""
+    if table.channels == 1:
+        return table
+    params = {name: torch.cat([v, v[1:2]]) for name, v in table.node_params.items()}
+    field = table.field
+    if field is not None:
+        field = dataclasses.replace(field, light=torch.cat([field.light, field.light[1:2]]))
+    return table.replace(params=params, field=field)

@@ -1,100 +1,72 @@
-"""The command line. Each command lives in a module of its own, which is imported when the command runs."""
+"""The command line. Each command lives in a module of its own, which is imported when it is asked for."""
 
-import ast
 import importlib
 import importlib.metadata
-import importlib.util
-from pathlib import Path
-from typing import Annotated, Any
+import os
+import signal
+from types import FrameType
 
-import typer
-from typer.core import TyperCommand, TyperGroup
+import click
 
-from .errors import advice, told_in_one_sentence
+from .command import command_of
+from .errors import told_in_one_sentence
 
 __all__ = ["app", "main"]
 
-# Each module defines a function of the command's name, with the options as Typer reads them off its signature.
-_MODULES = {
-    "render": "torchdof.cli.render",
-    "fit": "torchdof.cli.fit",
-    "export": "torchdof.cli.export",
-    "bench": "torchdof.cli.bench",
-    "inspect": "torchdof.cli.inspect",
-    "tables": "torchdof.cli.tables",
-}
+COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
+"""Each is a class in the module of its name."""
 
 
-class _Commands(TyperGroup):
-    """The commands that are installed. The list of them is read, not imported: it is there at once."""
+class _Commands(click.Group):
+    """The commands."""
 
-    def list_commands(self, ctx: Any) -> list[str]:
-        return [name for name in _MODULES if _source(name) is not None]
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """What the list shows of a command: its name and the first paragraph of its help."""
-        source = _source(cmd_name)
-        return None if source is None else TyperCommand(cmd_name, help=_summary(source, cmd_name))
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f".{cmd_name}", __package__)
+        return command_of(cmd_name, getattr(module, cmd_name.capitalize()))
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command itself, for which its module is imported."""
-        name, _, remaining = super().resolve_command(ctx, args)
-        return name, _imported(str(name)), remaining
-
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: click.Context) -> object:
         with told_in_one_sentence():
             return super().invoke(ctx)
 
 
-app = typer.Typer(cls=_Commands, no_args_is_help=True, pretty_exceptions_enable=False)
-
-
-@app.callback(invoke_without_command=True)
-def _torchdof(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and the engine in use.")] = False,
-) -> None:
-    """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
-    if version:
+def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted:
         from .. import native  # takes PyTorch
 
-        print(f"torchdof {importlib.metadata.version('torchdof')}, engine {native.describe()}")
-        raise typer.Exit()
+        click.echo(f"torchdof {importlib.metadata.version('torchdof')}, engine {native.describe()}")
+        ctx.exit()
 
 
-def _source(name: str) -> Path | None:
-    """The file of a command's module; None where there is no such command, or it is not installed."""
-    package, _, module = _MODULES.get(name, "").rpartition(".")
-    spec = importlib.util.find_spec(package) if package else None
-    folders = spec.submodule_search_locations if spec is not None else None
-    files = [Path(folder) / f"{module}.py" for folder in folders or []]
-    return next((file for file in files if file.is_file()), None)
+@click.group(cls=_Commands, context_settings={"max_content_width": 120})
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Print the version and the engine in use.",
+)
+def app() -> None:
+    """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
 
 
-def _summary(source: Path, name: str) -> str:
-    """First paragraph of the docstring of a function, from its source."""
-    for node in ast.parse(source.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.FunctionDef) and node.name == name:
-            return (ast.get_docstring(node) or "").partition("\n\n")[0]
-    return ""
-
-
-def _imported(name: str) -> Any:
-    """The command of a name, imported; where a package is missing, one that says what to install."""
-    single = typer.Typer(add_completion=False, rich_markup_mode="markdown")
-    try:
-        function = getattr(importlib.import_module(_MODULES[name]), name)
-    except ModuleNotFoundError as error:
-        message = advice(error)
-
-        def function() -> None:
-            raise ValueError(message)
-
-        single.command(name, help=message)(function)
-    else:
-        single.command(name, no_args_is_help=name in ("render", "inspect"))(function)
-    return typer.main.get_command(single)
+def _end(number: int, _: FrameType | None) -> None:
+    """Ends the process as Ctrl-C does: what is being written is completed, or vanishes."""
+    raise SystemExit(128 + number)
 
 
 def main() -> None:
     """Entry point of ``torchdof`` and of ``python -m torchdof``."""
+    # PyTorch's threads (OpenMP's) wait for their next work without a rest, which takes the processor from whoever has
+    # some. GNU's library and LLVM's read these when PyTorch is loaded; what the user set is left as it is.
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"} & set(os.environ):
+        os.environ |= {"OMP_WAIT_POLICY": "passive", "KMP_BLOCKTIME": "0"}
+    for name in ("SIGTERM", "SIGHUP"):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
+            signal.signal(getattr(signal, name), _end)
     app(prog_name="torchdof")

@@ -1,196 +1,60 @@
 """``torchdof render``: its options, and the frames it goes through."""
 
-import contextlib
 import dataclasses
-import sys
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from torch import Tensor
+import click
 
-from ..depth.sanity import Mistake
-from ..depth.steady import SteadyFrames
 from ..io.sequence import FramePattern, parse_frames
-from .arguments import (
-    BLUR,
-    DEPTH,
-    LENS,
-    ApertureImage,
-    ApertureRadiusM,
-    AsJson,
-    Blades,
-    Curvature,
-    DepthChannel,
-    DepthEdgesName,
-    DepthOffset,
-    DepthScale,
-    DepthUnknown,
-    FarM,
-    FillDepth,
-    FNumber,
-    FocalLengthMm,
-    FocusAt,
-    FocusRange,
-    FovDeg,
-    MethodName,
-    NearM,
-    NoOcclusion,
-    RelativeKind,
-    Rotation,
-    SensorWidthMm,
-    Squeeze,
-    Swing,
-    TableName,
-    Tilt,
-    ToleranceText,
-    ValueRange,
-    Vignetting,
-)
-from .frame import Frame, read_frame, render_frame
-from .from_arguments import settings_of
-from .printed import json_line
-from .settings import RenderSettings
-from .warn_once import WarnOnce
+from .command import argument, numbers, option
+from .options import Accuracy, Blur, Scene, edges_option, json_option
+from .printed import Bar, json_line
 
-__all__ = ["render"]
+if TYPE_CHECKING:
+    from torch import Tensor
 
-_EACH_ITS_OWN = Mistake(
-    "range",
+    from .frame import Frame, Rendered, Renderer
+
+__all__ = ["Render"]
+
+_EACH_ITS_OWN = (
     "each frame's relative depth is scaled by its own extremes, so that distances pulse; give the values that near and "
-    "far have in all frames: --value-range LOW,HIGH",
+    "far have in all frames: --value-range LOW,HIGH"
 )
-_FILES = "Files and frames"
+Encoding = Literal["linear", "srgb"]
 
 
-def render(
-    image: Annotated[
-        Path,
-        typer.Argument(metavar="IMAGE", help="All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr."),
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="File to write, or out.####.exr.")],
-    depth: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[DEPTH]", help="Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel."
-        ),
-    ] = None,
-    focus_m: Annotated[
-        str | None,
-        typer.Option(
-            help="Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between "
-            "them 1/distance is linear, so that the blur changes evenly.",
-            rich_help_panel=LENS,
-        ),
-    ] = None,
-    focus_at: FocusAt = None,
-    focus_range: FocusRange = None,
-    tilt: Tilt = 0.0,
-    swing: Swing = 0.0,
-    f_number: FNumber = None,
-    focal_length_mm: FocalLengthMm = None,
-    sensor_width_mm: SensorWidthMm = None,
-    fov_deg: FovDeg = None,
-    aperture_radius_m: ApertureRadiusM = None,
-    depth_kind: Annotated[
-        Literal["z", "distance", "disparity", "inverse", "relative", "coc"],
-        typer.Option(
-            help="What the numbers are: z along the optical axis or distance along the ray, in metres after scale * "
-            "(value + offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as "
-            "estimators give it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is "
-            "near).",
-            rich_help_panel=DEPTH,
-        ),
-    ] = "z",
-    depth_scale: DepthScale = None,
-    depth_offset: DepthOffset = 0.0,
-    near_m: NearM = None,
-    far_m: FarM = None,
-    relative_kind: RelativeKind = None,
-    value_range: ValueRange = None,
-    strict: Annotated[
-        bool,
-        typer.Option(
-            "--strict", help="Refuse what looks like a wrong unit or scale, instead of warning.", rich_help_panel=DEPTH
-        ),
-    ] = False,
-    depth_unknown: DepthUnknown = None,
-    fill_depth: FillDepth = None,
-    depth_channel: DepthChannel = None,
-    depth_edges: DepthEdgesName = "auto",
-    table: TableName = "disc",
-    blades: Blades = 0,
-    rotation: Rotation = 0.0,
-    curvature: Curvature = 0.0,
-    squeeze: Squeeze = 1.0,
-    aperture: ApertureImage = None,
-    vignetting: Vignetting = 0.0,
-    tolerance: ToleranceText = "final",
-    attention: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,RADIUS",
-            help="Where the viewer looks, in pixels from the top left: the tolerance is kept there, and elsewhere a "
-            "draft's is enough.",
-            rich_help_panel=BLUR,
-        ),
-    ] = None,
-    no_occlusion: NoOcclusion = False,
-    method: MethodName = "layered",
-    show_focus: Annotated[
-        bool,
-        typer.Option(
-            "--show-focus",
-            help="Don't blur: draw the outlines of what is near orange, in focus green, far blue.",
-            rich_help_panel=BLUR,
-        ),
-    ] = False,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda, cuda:1, ...", rich_help_panel=BLUR)] = "auto",
-    transfer: Annotated[
-        Literal["linear", "srgb"] | None,
-        typer.Option(help="How IMAGE is encoded. Default: integers srgb, floats linear.", rich_help_panel=_FILES),
-    ] = None,
-    out_transfer: Annotated[
-        Literal["linear", "srgb"] | None,
-        typer.Option(
-            help="How OUT is encoded. Default: as IMAGE, or by type if one is integers and the other floats.",
-            rich_help_panel=_FILES,
-        ),
-    ] = None,
-    bits: Annotated[
-        Literal["8", "16", "half", "float"] | None,
-        typer.Option(help="What OUT stores. Default: as IMAGE, where the type can.", rich_help_panel=_FILES),
-    ] = None,
-    layer: Annotated[
-        str | None, typer.Option(help="Layer or part of an EXR that is the image.", rich_help_panel=_FILES)
-    ] = None,
-    frames: Annotated[
-        str | None, typer.Option(metavar="FIRST-LAST", help="Part of a sequence.", rich_help_panel=_FILES)
-    ] = None,
-    steady: Annotated[
-        bool,
-        typer.Option(
-            "--steady",
-            help="Filter the depth of a sequence along time, where neither image nor depth moved.",
-            rich_help_panel=DEPTH,
-        ),
-    ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Render only the frames that OUT lacks.", rich_help_panel=_FILES)
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
+class _Job(NamedTuple):
+    """One frame's number and files."""
+
+    number: int
+    image: Path
+    depth: Path | None
+    out: Path
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Files:
+    """Files and frames."""
+
+    transfer: Encoding | None = option("How IMAGE is encoded. Default: integers srgb, floats linear.")
+    out_transfer: Encoding | None = option(
+        "How OUT is encoded. Default: as IMAGE, or by type if one is integers and the other floats."
+    )
+    bits: Literal["8", "16", "half", "float"] | None = option("What OUT stores. Default: as IMAGE, where the type can.")
+    layer: str | None = option("Layer or part of an EXR that is the image.")
+    frames: tuple[int, int] | None = option("Part of a sequence.", metavar="FIRST-LAST", read=parse_frames)
+    steady: bool = option("Filter depth of a sequence along time, where neither image nor depth moved.", False)
+    resume: bool = option("Render only the frames that OUT lacks.", False)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render:
     """Blur IMAGE by its DEPTH as a lens would.
 
     A photograph and its depth in millimetres, focused on what is seen at column 320, row 200:
@@ -224,106 +88,145 @@ def render(
     that is printed says which. Alpha and metadata are kept. A file is written whole or not at all. What looks
     like a wrong unit is said on standard error; with --strict it is refused. --json prints one JSON object a frame.
     """
-    settings = settings_of(locals())
-    if FramePattern.matches(image):
-        _render_sequence(image, depth, out, settings, frames, resume, steady, as_json)
-        return
-    sequences = FramePattern.is_padded(out) and not FramePattern.is_padded(image) and FramePattern.matches(out)
-    if sequences or (depth is not None and FramePattern.matches(depth)) or frames is not None or steady:
-        raise ValueError(f"{image}: is a single image; for a sequence write it as shot.####.exr")
-    if len(settings.focus or []) > 1:
-        raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
-    if resume and out.exists():
-        typer.echo(_there([out]) if as_json else f"{out}: is there already")
-        return
-    with _progress() as progress:
-        progress.add_task(f"rendering {out.name}", total=None)
-        rendered = render_frame(image, depth, out, settings)
-    typer.echo(json_line(rendered.facts()) if as_json else str(rendered))
 
+    image: Path = argument("All-in-focus image (EXR, PNG, TIFF, JPEG, HDR, PFM) or shot.####.exr.", "IMAGE")
+    depth: Path | None = argument(
+        "Its depth (the same types, .npy, .npz); not needed if IMAGE has a Z channel.", "[DEPTH]", None
+    )
+    out: Path = option("File to write, or out.####.exr.", ..., names=("--out", "-o"), metavar="OUT")
+    scene: Scene
+    blur: Blur
+    accuracy: Accuracy
+    attention: tuple[float, float, float] | None = option(
+        "Where the viewer looks, in pixels from the top left: the tolerance is kept there, and elsewhere a draft's is "
+        "enough.",
+        metavar="X,Y,RADIUS",
+        read=numbers(3, "--attention expects X,Y,RADIUS in pixels such as 320,200,80"),
+        group="Blur",
+    )
+    show_focus: bool = option(
+        "Don't blur: draw the outlines of what is near orange, in focus green, far blue.", False, group="Blur"
+    )
+    device: str = option("auto, cpu, cuda, cuda:1, ...", "auto", group="Blur")
+    depth_edges: Literal["auto", "repair", "as-given"] = edges_option("auto")
+    files: _Files
+    as_json: bool = json_option()
 
-def _render_sequence(
-    image: Path,
-    depth: Path | None,
-    out: Path,
-    settings: RenderSettings,
-    frames: str | None,
-    resume: bool,
-    steady: bool,
-    as_json: bool,
-) -> None:
-    """Renders the frames of a numbered sequence, in order; with ``resume`` only those that are missing."""
-    source, target = FramePattern(image), FramePattern(out)
-    depths = FramePattern(depth) if depth is not None and FramePattern.matches(depth) else None
-    numbers: Sequence[int] = source.frames()
-    if frames is not None:
-        first, last = parse_frames(frames)
-        wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
-        if len(existing) < len(wanted):
-            missing = source.name(next(n for n in wanted if n not in existing))
-            raise FileNotFoundError(
-                f"{missing}: there is no such file ({len(wanted) - len(existing)} of {len(wanted)} frames missing)"
-            )
-        numbers = wanted
-    if not numbers:
-        raise FileNotFoundError(f"{image}: there are no such files")
-    if depths is not None:
-        absent = [path for n in numbers if not (path := depths.name(n)).is_file()]
+    def run(self) -> None:
+        """Renders one image, or the frames of a sequence."""
+        if FramePattern.matches(self.image):
+            self._render_sequence()
+            return
+        sequences = FramePattern.is_padded(self.out) and not FramePattern.is_padded(self.image)
+        sequences = (sequences and FramePattern.matches(self.out)) or self.files.frames is not None or self.files.steady
+        if sequences or (self.depth is not None and FramePattern.matches(self.depth)):
+            raise ValueError(f"{self.image}: is a single image; for a sequence write it as shot.####.exr")
+        self.scene.lens.refuse_keyframes()
+        if self.files.resume and self.out.exists():
+            self._tell_of_those_there([self.out], f"{self.out}: is there already")
+            return
+        from .frame import Renderer
+
+        renderer = Renderer(self)
+        with Bar(f"rendering {self.out.name}") as bar:
+            frame = renderer.read(self.image, self.depth, self.out)
+            rendered = renderer.write(renderer.render(frame, self.out, bar=bar))
+        self._tell(rendered)
+
+    def _render_sequence(self) -> None:
+        """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
+        source, target = FramePattern(self.image), FramePattern(self.out)
+        depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
+        numbers = self._numbers(source, depths)
+        todo = [n for n in numbers if not (self.files.resume and target.name(n).is_file())]
+        if len(todo) < len(numbers):
+            there = [target.name(n) for n in numbers if n not in set(todo)]
+            self._tell_of_those_there(there, f"{len(there)} of {len(numbers)} frames are there already")
+        said = self.scene.depth_map
+        if self.files.steady and said.depth_kind == "coc":
+            raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
+        from ..depth.sanity import Mistake
+        from .frame import Renderer
+
+        def job(n: int) -> _Job:
+            return _Job(n, source.name(n), depths.name(n) if depths else self.depth, target.name(n))
+
+        renderer = Renderer(self)
+        if said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
+            renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
+        read: Callable[[_Job], Frame] = lambda job: renderer.read(job.image, job.depth, job.out)  # noqa: E731
+        if self.files.steady:
+            read = _steadied(read, [job(n) for n in source.frames() if depths is None or depths.name(n).is_file()])
+        self._render_each(renderer, [job(n) for n in todo], read)
+
+    def _numbers(self, source: FramePattern, depths: FramePattern | None) -> Sequence[int]:
+        """The numbers of the frames that are asked for, all of which are there."""
+        numbers: Sequence[int] = source.frames()
+        if self.files.frames is not None:
+            first, last = self.files.frames
+            wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
+            if len(existing) < len(wanted):
+                missing = source.name(next(n for n in wanted if n not in existing))
+                raise FileNotFoundError(
+                    f"{missing}: there is no such file ({len(wanted) - len(existing)} of {len(wanted)} frames missing)"
+                )
+            numbers = wanted
+        if not numbers:
+            raise FileNotFoundError(f"{self.image}: there are no such files")
+        absent = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
         if absent:
             raise FileNotFoundError(
                 f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} depths missing)"
             )
-    todo = [n for n in numbers if not (resume and target.name(n).is_file())]
-    if len(todo) < len(numbers):
-        there = [target.name(n) for n in numbers if n not in set(todo)]
-        typer.echo(_there(there) if as_json else f"{len(there)} of {len(numbers)} frames are there already")
-    warned = WarnOnce(settings.strict)
-    if settings.depth_kind == "relative" and settings.value_range is None and len(numbers) > 1:
-        warned.warn(depth or image, [_EACH_ITS_OWN])
-    steadied = _steadied(source, depths, depth, settings) if steady else None
-    with _progress() as progress:
-        task = progress.add_task("rendering", total=len(todo))
-        for n in todo:
-            depth_n = depths.name(n) if depths else depth
-            read = steadied(n) if steadied else None
-            rendered = render_frame(source.name(n), depth_n, target.name(n), settings, n, warned, read)
-            typer.echo(json_line(rendered.facts()) if as_json else str(rendered))
-            progress.advance(task)
+        return numbers
+
+    def _render_each(self, renderer: "Renderer", jobs: Sequence[_Job], read: "Callable[[_Job], Frame]") -> None:
+        """Renders frames in order; while one is rendered, the next is read and the one before is written."""
+        read_ahead: deque[Future[Frame]] = deque()
+        written: Future[Rendered] | None = None
+
+        def finish() -> None:
+            nonlocal written
+            last, written = written, None
+            if last is not None:
+                self._tell(last.result())
+                bar.done += 1
+
+        with Bar("", len(jobs)) as bar, ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
+            coming = iter(jobs)
+            try:
+                for k, job in enumerate(jobs):
+                    bar.what = f"frame {k + 1} of {len(jobs)}"
+                    read_ahead += [reader.submit(read, one) for one in itertools.islice(coming, 2 - len(read_ahead))]
+                    rendered = renderer.render(read_ahead.popleft().result(), job.out, job.number)
+                    finish()
+                    written = writer.submit(renderer.write, rendered)
+            finally:  # what was rendered is written, whatever happens to the next
+                finish()
+
+    def _tell(self, rendered: "Rendered") -> None:
+        click.echo(rendered.told(self.as_json))
+
+    def _tell_of_those_there(self, files: Sequence[Path], line: str) -> None:
+        lines = [json_line({"out": str(file), "is_there_already": True}) for file in files]
+        click.echo("\n".join(lines) if self.as_json else line)
 
 
-def _steadied(
-    source: FramePattern, depths: FramePattern | None, depth: Path | None, settings: RenderSettings
-) -> Callable[[int], Frame]:
-    """Reads frames by their number, with the depth that frames before them steadied, whichever are asked for."""
-    if settings.depth_kind == "coc":
-        raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
-    numbers = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
+def _steadied(read: "Callable[[_Job], Frame]", jobs: Sequence[_Job]) -> "Callable[[_Job], Frame]":
+    """Reads frames with the depth that frames before them steadied, whichever of a sequence are asked for."""
+    from ..depth.steady import SteadyFrames
+
+    places = {job.number: place for place, job in enumerate(jobs)}
     latest: list[Frame] = []
 
-    def read(place: int) -> tuple[Tensor, Tensor]:
-        n = numbers[place]
-        latest[:] = [read_frame(source.name(n), depths.name(n) if depths else depth, settings)]
+    def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
+        latest[:] = [read(jobs[place])]
         return latest[0].picture.pixels, latest[0].values
 
-    frames = SteadyFrames(read)
+    frames = SteadyFrames(pixels_and_depth)
 
-    def steadied(number: int) -> Frame:
-        values = frames.depth(numbers.index(number))
+    def steadied(job: _Job) -> "Frame":
+        values = frames.depth(places[job.number])
         return dataclasses.replace(latest[0], values=values)
 
     return steadied
-
-
-def _there(files: Sequence[Path]) -> str:
-    """What ``--json`` prints of files that ``--resume`` leaves as they are, a line each."""
-    return "\n".join(json_line({"out": str(file), "is_there_already": True}) for file in files)
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Progress]:
-    """A bar on standard error, where that is a terminal."""
-    columns = [SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()]
-    columns += [TimeElapsedColumn(), TimeRemainingColumn()]
-    progress = Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty(), transient=True)
-    with contextlib.nullcontext() if progress.disable else progress:
-        yield progress

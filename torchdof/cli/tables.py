@@ -1,24 +1,22 @@
 """``torchdof tables``: which blur tables there are, and pictures of their kernels."""
 
+import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-import torch.nn.functional as functional
-import typer
-from torch import Tensor
+import click
 
-from ..io.sheet import write_sheet
-from ..optics import table_file
-from ..optics.blur_table import BlurTable
-from ..optics.kernel_bank import bank_of
-from ..optics.placed_kernels import layer_shares, placed
-from .arguments import ApertureImage, AsJson, Blades, Curvature, Rotation, Squeeze, Vignetting
+from .command import argument, option
+from .options import Opening, json_option
 from .printed import json_line
-from .settings import load_aperture, load_table
 
-__all__ = ["tables"]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..optics.blur_table import BlurTable
+
+__all__ = ["Tables"]
 
 _WIDTH = 1920  # px of the image that kernels are shown for
 _COC_PX = (-24.0, -12.0, -6.0, 6.0, 12.0, 24.0)
@@ -27,23 +25,8 @@ _ZOOM = 2  # picture's pixels a pixel
 _PLACES = (0.0, 0.4, 0.7, 0.95)  # of the way from the middle of the frame to its corner
 
 
-def tables(
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[TABLE]...", help="Names or JSON files; default: all that ship."),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Picture to write: a column of kernels a table, over the blur radius."),
-    ] = None,
-    blades: Blades = 0,
-    rotation: Rotation = 0.0,
-    curvature: Curvature = 0.0,
-    squeeze: Squeeze = 1.0,
-    aperture: ApertureImage = None,
-    vignetting: Vignetting = 0.0,
-    as_json: AsJson = False,
-) -> None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tables:
     """List blur tables, and draw their kernels.
 
     The picture has a column for each table and a row for each signed blur radius, from 24 pixels in front of the focus
@@ -55,25 +38,39 @@ def tables(
 
         torchdof tables disc my_lens.json --blades 7 --rotation 15 -o seven_blades.png
     """
-    opening = load_aperture(blades, rotation, curvature, squeeze, aperture, vignetting)
-    panels = {}
-    for name in names or ["disc", "gaussian", *table_file.shipped()]:
-        table = load_table(name, opening)
-        facts = _facts(name, table)
-        typer.echo(json_line(facts) if as_json else _line(facts))
-        if out is not None:
-            panels[Path(name).stem] = _column(table)
-    if out is None:
-        return
-    widest = max(panel.shape[-1] for panel in panels.values())
-    panels = {name: functional.pad(panel, (0, widest - panel.shape[-1])) for name, panel in panels.items()}
-    write_sheet(out, panels, caption=34)
-    if not as_json:
-        radii = ", ".join(f"{coc:g}" for coc in _COC_PX)
-        typer.echo(f"{out}: blur radii from top to bottom {radii} px in an image of {_WIDTH} px")
+
+    names: tuple[str, ...] = argument("Names or JSON files; default: all that ship.", "[TABLE]...", ())
+    out: Path | None = option(
+        "Picture to write: a column of kernels a table, over the blur radius.", names=("--out", "-o")
+    )
+    opening: Opening
+    as_json: bool = json_option()
+
+    def run(self) -> None:
+        """Lists tables, and draws them if a picture is asked for."""
+        import torch.nn.functional as functional
+
+        from ..io.sheet import write_sheet
+        from ..optics.table_file import shipped
+
+        panels = {}
+        for name in self.names or ["disc", "gaussian", *shipped()]:
+            table = self.opening.table_of(name)
+            facts = _facts(name, table)
+            click.echo(json_line(facts) if self.as_json else _line(facts))
+            if self.out is not None:
+                panels[Path(name).stem] = _column(table)
+        if self.out is None:
+            return
+        widest = max(panel.shape[-1] for panel in panels.values())
+        panels = {name: functional.pad(panel, (0, widest - panel.shape[-1])) for name, panel in panels.items()}
+        write_sheet(self.out, panels, caption=34)
+        if not self.as_json:
+            radii = ", ".join(f"{coc:g}" for coc in _COC_PX)
+            click.echo(f"{self.out}: blur radii from top to bottom {radii} px in an image of {_WIDTH} px")
 
 
-def _facts(name: str, table: BlurTable) -> dict[str, Any]:
+def _facts(name: str, table: "BlurTable") -> dict[str, Any]:
     """What there is to say of a table."""
     return {
         "table": name,
@@ -103,8 +100,11 @@ def _line(facts: dict[str, Any]) -> str:
     return f"{facts['table']:24s} {'; '.join(parts)}" + (f" ({facts['source']})" if facts["source"] else "")
 
 
-def _column(table: BlurTable) -> Tensor:
+def _column(table: "BlurTable") -> "Tensor":
     """Kernels of a table below each other, ``[1, 3, rows, columns]`` in linear light; beside each other over places."""
+    import torch
+    import torch.nn.functional as functional
+
     size = _CELL[0] // _ZOOM // 2 * 2 - 1
     places = _PLACES if table.depends_on_place else (0.0,)
     columns = [_kernels(table, place, size) for place in places]  # [n, 1 or C, size, size]
@@ -115,8 +115,14 @@ def _column(table: BlurTable) -> Tensor:
     return functional.pad(shown, (beside // 2, beside - beside // 2, below, 0)).transpose(0, 1).flatten(1, 2)[None]
 
 
-def _kernels(table: BlurTable, place: float, size: int) -> Tensor:
+def _kernels(table: "BlurTable", place: float, size: int) -> "Tensor":
     """Kernels ``[n, 1 or C, size, size]`` at a part of the way from the middle of the frame to its corner."""
+    import torch
+    import torch.nn.functional as functional
+
+    from ..optics.kernel_bank import bank_of
+    from ..optics.placed_kernels import layer_shares, placed
+
     if not table.depends_on_place:
         return table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()
     frame = (round(_WIDTH / 1.5), _WIDTH)

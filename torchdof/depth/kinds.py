@@ -72,15 +72,22 @@ def depth_from_values(
             raise ValueError(f"scale (--depth-scale) must be finite and not 0, offset (--depth-offset) finite, {got}")
     if unknown is not None and not math.isnan(unknown if isinstance(unknown, float) else 0.0):
         unknown = number("unknown", unknown, infinite=True)
-    value = values.double()
-    missing = value.isnan() if unknown is None else value.isnan() | (value == unknown)
-    depth = scale / (value + offset) if kind in ("disparity", "inverse") else scale * (value + offset)
+    # in double precision, in place: maps have millions of pixels, and NaN stays NaN
+    depth = values.to(torch.float64, copy=True)
+    if unknown is not None:
+        depth.masked_fill_(depth == unknown, math.nan)
+    if offset:
+        depth += offset
+    if kind in ("disparity", "inverse"):
+        depth = scale / depth
+    elif scale != 1.0:
+        depth *= scale
     if kind == "distance":
         if fov_x_deg is None:
             raise ValueError("distance along the ray needs the horizontal field of view (--fov-deg) to become depth")
-        depth = depth / _ray_length(depth, fov_x_deg)
-    missing = missing | (~depth.isfinite() if kind == "coc" else ~(depth > 0))
-    return torch.where(missing, torch.nan, depth).float()
+        depth /= _ray_length(depth, fov_x_deg)
+    metres = depth.float()
+    return torch.where(metres.isfinite() if kind == "coc" else metres > 0, metres, torch.nan)
 
 
 def _ray_length(like: Tensor, fov_x_deg: float) -> Tensor:

@@ -124,10 +124,10 @@ def coc_mistakes(coc_px: Tensor) -> list[Mistake]:
         ['blur']
     """
     real_tensor("coc_px", coc_px, "[B, 1, H, W] in pixels")
-    size = coc_px[coc_px.isfinite()].abs()
-    width = coc_px.shape[-1]
-    if not size.numel() or _share_at(size, 0.99) <= _LARGEST_WIDTHS * width:
+    size, width = _sample(coc_px.abs()), coc_px.shape[-1]
+    if not bool(size.isfinite().any()) or _share_at(size[size.isfinite()], 0.99) <= _LARGEST_WIDTHS * width:
         return []
+    size = coc_px[coc_px.isfinite()].abs()
     message = (
         f"a blur radius of {_pixels(float(size.max()))} px on an image of {width} px is more than a lens makes; are "
         "these depths and no circles of confusion? (--depth-kind)"
@@ -139,21 +139,27 @@ def _mistakes(
     depth: Tensor, camera: Camera, kind: DepthKind | Literal["relative"], scale: float | None
 ) -> list[Mistake]:
     """Likely mistakes of one map ``[1, H, W]`` and a camera of plain numbers."""
-    width, focus_m = depth.shape[-1], float(camera.focus_m)
-    known = depth[depth > 0].detach()
-    if not known.numel():
-        return []
-    coc_px = camera.coc_px(known.reshape(1, 1, 1, -1), width).abs().flatten()
-    finite = known[known.isfinite()]
-    if not finite.numel():
-        finite = known
-    near, far = float(finite.min()), float(finite.max())
+    width, focus_m, known = depth.shape[-1], float(camera.focus_m), depth.detach().flatten()
+    if not float(known.min()) > 0:
+        known = known[known > 0]
+        if not known.numel():
+            return []
+    nearest, farthest = (float(end) for end in known.aminmax())
+    finite = known if farthest < math.inf or nearest == math.inf else known[known < math.inf]
+    near, far = nearest, float(finite.max())
+    # blur grows from the focus to both sides: it is largest at the ends, least where depth is next to the focus
+    ends = camera.focus_range_m or (camera.focus_m, camera.focus_m)
+    before = torch.where(known <= float(ends[1]), known, nearest).max()
+    behind = torch.where(known >= float(ends[0]), known, farthest).min()
+    told = torch.stack([before, behind, known.new_tensor(nearest), known.new_tensor(farthest)])
+    blur = camera.coc_px(torch.cat([told, _sample(known)]).reshape(1, 1, 1, -1), width).abs().flatten()
+    least, largest, blur = float(blur[:2].min()), float(blur[2:4].max()), blur[4:]
     extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
     of_bits = far <= 65535 and _whole_numbers(finite)
-    sharp_px, largest = max(_SHARP_PX, _SHARP_WIDTHS * width), float(coc_px.max())
+    sharp_px = max(_SHARP_PX, _SHARP_WIDTHS * width)
     is_wide_open = float(camera.f_number) < _WIDEST_F_NUMBER and largest > _LARGE_WIDTHS * width
-    is_too_blurred = is_wide_open or _share_at(coc_px, 0.99) > _LARGEST_WIDTHS * width
-    is_sharp = float(coc_px.min()) <= sharp_px
+    is_too_blurred = is_wide_open or _share_at(blur, 0.99) > _LARGEST_WIDTHS * width
+    is_sharp = least <= sharp_px
     factor = next((factor for factor in _FACTORS if near * factor <= focus_m <= far * factor), None)
     is_far_off = factor is not None and not near / _FAR_OFF <= focus_m <= far * _FAR_OFF
     if (not is_sharp and not (is_too_blurred and near <= focus_m <= far)) or is_far_off:
@@ -241,13 +247,18 @@ def _advice(factor: float, scale: float | None) -> str:
     return f"{_UNITS[factor]} ({option})"
 
 
+def _sample(values: Tensor) -> Tensor:
+    """Some 65,536 of the values, or all of fewer."""
+    return values.flatten()[:: max(1, values.numel() // 65536)]
+
+
 def _whole_numbers(values: Tensor) -> bool:
     """Whether many different values all are whole numbers."""
-    sample = values[:: max(1, values.numel() // 65536)]
+    sample = _sample(values)
     return bool((sample == sample.round()).all()) and sample.unique().numel() >= 16
 
 
 def _share_at(values: Tensor, share: float) -> float:
     """The value that this share of the values does not exceed; of many values a sample."""
-    sample = values[:: max(1, values.numel() // 65536)].float()
+    sample = _sample(values).float()
     return float(sample.sort().values[min(sample.numel() - 1, int(share * sample.numel()))])

@@ -22,7 +22,7 @@ from . import foreign
 from .atomic import whole_file
 from .channels import colour_channels, depth_channel
 from .decode import Part, PixelType, check_chunks, existing, first_line, named_in_utf8, read_array, read_parts
-from .transfer import Transfer, decode, default_transfer, encode
+from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
@@ -215,11 +215,14 @@ def write_image(
     if names[0] == "Y" and suffix not in _HOLDS_GREY:
         pixels, names = pixels.expand(-1, 3, -1, -1), ("R", "G", "B")
     straight = names[-1] == "A" and suffix != ".exr"
-    array = np.empty((*pixels.shape[2:], len(names)), np.float32)
-    for lines in _strips(array.shape[0], array.shape[1] * len(names)):
-        encoded = encode(pixels[:, :, lines], transfer, names[-1] == "A", straight)
-        encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
-        array[lines] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
+    if sample == "8" and (straight or names[-1] != "A"):
+        array = encode_8_bits(pixels, transfer, straight)
+    else:
+        array = np.empty((*pixels.shape[2:], len(names)), np.float32)
+        for lines in _strips(array.shape[0], array.shape[1] * len(names)):
+            encoded = encode(pixels[:, :, lines], transfer, names[-1] == "A", straight)
+            encoded = encoded.clamp(-65504.0, 65504.0) if sample == "half" else encoded
+            array[lines] = encoded[0].permute(1, 2, 0).numpy()  # [C, h, W] -> [h, W, C]
 
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], _OIIO_SAMPLE[sample])
     spec.channelnames = names

@@ -2,9 +2,8 @@
 
 import math
 import re
+import reprlib
 from pathlib import Path
-
-from ..validation import number, show
 
 __all__ = ["FramePattern", "focus_at_frame", "parse_focus", "parse_frames"]
 
@@ -75,7 +74,7 @@ def parse_frames(text: str) -> tuple[int, int]:
     """
     match = re.fullmatch(r"\s*(\d{1,18})(?:\s*-\s*(\d{1,18}))?\s*", text)
     if match is None:
-        raise ValueError(f"--frames expects first-last, such as 1-48, got {show(text)}")
+        raise ValueError(f"--frames expects first-last, such as 1-48, got {reprlib.repr(text)}")
     first, last = int(match.group(1)), int(match.group(2) or match.group(1))
     if last < first:
         raise ValueError(f"--frames must not end before it starts, got {text!r}")
@@ -132,6 +131,8 @@ def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
     """
     if not keys:
         raise ValueError("focus needs at least one keyframe (frame, metres), got none")
+    from ..validation import number  # takes PyTorch, without which arguments are read
+
     number("frame", frame)
     if frame <= keys[0][0]:
         return keys[0][1]

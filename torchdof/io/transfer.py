@@ -6,10 +6,11 @@ nothing but three channels, do not mirror negative light, and take a second to i
 
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["Transfer", "decode", "default_transfer", "encode"]
+__all__ = ["Transfer", "decode", "default_transfer", "encode", "encode_8_bits"]
 
 Transfer = Literal["linear", "srgb"]
 
@@ -40,6 +41,42 @@ def encode(pixels: Tensor, transfer: Transfer, has_alpha: bool, straight: bool) 
         colour = _linear_to_srgb(colour) if transfer == "srgb" else colour
         colour = colour if straight else colour * alpha
     return torch.cat([colour, alpha], dim=1)
+
+
+def encode_8_bits(pixels: Tensor, transfer: Transfer, has_alpha: bool) -> np.ndarray:
+    """What :func:`encode` makes of pixels, rounded to 8 bits, by a table over all numbers of half precision.
+
+    Half precision moves a number by a fortieth of a step of the 8 bits at most, so that what was read from 8 bits
+    comes back as it was. Alpha becomes straight.
+
+    Args:
+        pixels: ``[1, C, H, W]``, linear light, premultiplied.
+        transfer: How colour is encoded.
+        has_alpha: Whether the last channel is alpha.
+
+    Returns:
+        ``[H, W, C]``, uint8.
+
+    Example:
+        >>> encode_8_bits(torch.tensor([0.0, 0.2159, 2.0]).reshape(1, 3, 1, 1), "srgb", has_alpha=False).tolist()
+        [[[0, 128, 255]]]
+    """
+    height, width = pixels.shape[-2:]
+    if has_alpha:
+        pixels = torch.cat([_divide(pixels[:, :-1], pixels[:, -1:]), pixels[:, -1:]], 1)
+    numbers = np.arange(65536, dtype=np.uint16).view(np.float16)
+    shares = torch.from_numpy(numbers.astype(np.float32)).nan_to_num(0.0)
+    colour, alpha = (
+        (encode(shares, curve, False, False).clamp(0.0, 1.0) * 255.0).round().byte().numpy()
+        for curve in (transfer, "linear")
+    )
+    planes = pixels[0].half().numpy().view(np.uint16)
+    codes = np.empty((height, width, len(planes)), np.uint8)
+    for k, plane in enumerate(planes):
+        for top in range(0, height, 64):
+            table = alpha if has_alpha and k == len(planes) - 1 else colour
+            codes[top : top + 64, :, k] = np.take(table, plane[top : top + 64], mode="clip")
+    return codes
 
 
 def _divide(colour: Tensor, alpha: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from typer.testing import CliRunner
+from click.testing import CliRunner
 
 from torchdof import BlurTable
 from torchdof.cli.main import app

@@ -1,0 +1,180 @@
+"""Whatever is wrong with the input is one sentence on standard error and exit code 2, and nothing is written."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchdof.io.images import Picture, write_image
+
+_RENDER = """
+none.exr depth.npy --focus-m 2                        | none.exr: there is no such file
+image.exr none.npy --focus-m 2                        | none.npy: there is no such file
+image.exr --focus-m 2                                 | image.exr: has no depth channel; name a depth file
+image.exr small.npy --focus-m 2                       | small.npy: depth is 3 x 4 pixels and the image 24 x 16
+image.exr small.npy --depth-kind coc                  | small.npy: coc is 3 x 4 pixels but the image is 24 x 16
+image.exr holed.npy --focus-m 2                       | holed.npy: 2 pixels (0.5 %) have no depth
+image.exr depth.npy --focus-m 2 --layer b             | image.exr: has no layer 'b'
+image.exr depth.####.npy --focus-m 2                  | image.exr: is a single image
+image.exr depth.npy --focus-m 2 --frames 1-2          | image.exr: is a single image
+image.exr depth.npy --focus-m 2 --steady              | image.exr: is a single image
+shot.####.exr depth.npy --focus-m 2                   | out.exr: expected one place for the frame number
+shot.####.exr none.####.npy --focus-m 2 -o o.#.exr    | none.0001.npy: there is no such file (3 of 3 depths missing)
+shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 2-5 | shot.0004.exr: there is no such file (2 of 4 frames
+none.####.exr depth.npy --focus-m 2 -o o.#.exr        | none.####.exr: there are no such files
+shot.####.exr depth.npy --focus-m 2 -o shot.####.exr  | shot.0001.exr: is one of the inputs
+shot.####.exr depth.####.npy -o o.#.exr --depth-kind coc --steady | --steady filters depth in metres
+shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 5-2   | --frames must not end before it starts
+shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 digits
+image.exr depth.npy --focus-m 2 -o ./image.exr        | is one of the inputs
+image.exr depth.npy --focus-m 2 -o depth.npy          | depth.npy: is one of the inputs
+image.exr depth.npy --focus-m 2 -o nowhere/out.exr    | there is no folder
+image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
+image.exr depth.npy                                   | where is the focus? give --focus-m METRES or --focus-at X,Y
+image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes
+image.exr depth.npy --focus-m 1:2,5:3                 | --focus-m has keyframes but IMAGE is a single image
+image.exr depth.npy --focus-m 0.01                    | --focus-m must be longer than the focal length
+image.exr depth.npy --focus-at 3                      | --focus-at expects a pixel X,Y such as 320,200, got '3'
+image.exr depth.npy --focus-at 99,5                   | focus point (99.0, 5.0) must lie in the frame of 24 x 16
+image.exr depth.npy --focus-m 2 --focus-at 3,3        | --focus-m and --focus-at both say where to focus
+image.exr depth.npy --focus-m 2 --focus-range 1,2     | --focus-m and --focus-range both say where to focus
+image.exr depth.npy --focus-range 2,1                 | --focus-range must go from near to far
+image.exr depth.npy --focus-range 2                   | --focus-range expects two numbers such as 1.5,2.2
+image.exr depth.npy --focus-m 2 --tilt 95             | --tilt must be in (-90, 90) degrees
+image.exr depth.npy --focus-m 2 --f-number -1         | --f-number must be positive
+image.exr depth.npy --focus-m 2 --f-number 0          | --f-number must be positive
+image.exr depth.npy --focus-m 2 --f-number 1e-42      | this lens (--focal-length-mm (not given) 50, --f-number 1e-42,
+image.exr depth.npy --focus-m 2 --sensor-width-mm 1e-300 | --sensor-width-mm 1e-300
+image.exr depth.npy --focus-m 2 --focal-length-mm 1e6 | --focus-m must be longer than the focal length (1e+06 mm)
+image.exr depth.npy --focus-m 2 --fov-deg 200 --f-number 2 | --fov-deg must be a number of degrees > 0 and < 180
+image.exr depth.npy --focus-m 2 --fov-deg 40          | --fov-deg needs the opening of the lens
+image.exr depth.npy --focus-m 2 --fov-deg 40 --focal-length-mm 50 | say the same; give one of them
+image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 2 --aperture-radius-m 1 | both say how wide the lens opens
+image.exr depth.npy --focus-m 2 --fov-deg 40 --f-number 1e-42 | --f-number 1e-42
+image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m 1e45 | --fov-deg 40, --aperture-radius-m 1e+45
+image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m -1 | --aperture-radius-m must be positive
+image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
+image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nearest, far or metres, got 'x'
+image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | blurs a depth of 1.4e-45 m
+image.exr depth.npy --focus-m 2 --depth-kind disparity | disparity needs a scale (--depth-scale)
+image.exr depth.npy --focus-m 2 --depth-kind distance | --depth-kind distance needs --fov-deg
+image.exr depth.npy --focus-m 2 --depth-kind coc      | --depth-kind coc is the blur itself and takes no camera
+image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 | --depth-kind relative needs --near-m and --far-m
+image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 1 --far-m 2 --depth-scale 3 | near and far say it
+image.exr depth.npy --focus-m 2 --depth-kind relative --near-m 5 --far-m 1 | depth.npy: near_m must be nearer than
+image.exr depth.npy --focus-m 2 --near-m 1            | add --depth-kind relative
+image.exr depth.npy --focus-m 2 --value-range 3       | --value-range expects two numbers such as 0,255
+image.exr millimetres.npy --focus-m 3 --f-number 1.4 --strict | millimetres.npy: the focus at 3 m is nearer than all
+image.exr depth.npy --focus-m 2 --table nowhere       | no blur table 'nowhere': neither a file nor one of disc, gauss
+image.exr depth.npy --focus-m 2 --attention 3,4       | --attention expects X,Y,RADIUS
+image.exr depth.npy --focus-m 2 --attention 3,4,0     | (x, y, radius) in pixels, radius > 0
+image.exr depth.npy --focus-m 2 --tolerance -1        | tolerance must be
+image.exr depth.npy --focus-m 2 --tolerance best      | --tolerance expects draft, preview, final or a number
+image.exr depth.npy --focus-m 2 --device warp         | --device warp: there is no such device
+image.exr depth.npy --focus-m 2 --blades 2            | --blades must be a whole number from 3 to 64
+image.exr depth.npy --focus-m 2 --rotation 5          | --rotation turns blades or an image
+image.exr depth.npy --focus-m 2 --curvature 0.5       | --curvature is that of blades
+image.exr depth.npy --focus-m 2 --squeeze 0           | --squeeze must be a number from 0.1 to 10
+image.exr depth.npy --focus-m 2 --blades 5 --aperture a.png | --aperture is the whole opening
+"""
+
+_OTHERS = """
+inspect none.png depth.npy                       | none.png: there is no such file
+inspect image.exr                                | image.exr: has no depth channel
+inspect image.exr depth.npy -o image.exr         | image.exr: is one of the inputs
+inspect image.exr zeros.npy                      | zeros.npy: no pixel has a depth
+inspect image.exr depth.npy --depth-kind disparity | disparity needs a scale (--depth-scale)
+inspect image.exr depth.npy --depth-kind relative | --depth-kind relative needs --near-m and --far-m
+inspect image.exr depth.npy --depth-kind coc     | there is no depth to inspect
+inspect image.exr depth.npy --focus-m 1:2,3:4    | --focus-m has keyframes but IMAGE is a single image
+tables nothing                                   | no blur table 'nothing'
+tables --rotation 5                              | --rotation turns blades or an image
+bench --focus-m 2                                | the built-in scene has its own camera and depth
+bench --views 3                                  | name its folder with --truth
+bench image.exr depth.npy -o nowhere             | nowhere: there is no such folder
+export                                           | give either -o FILE to write or --show FILE to read
+export -o dof.onnx --show dof.onnx               | give either -o FILE
+export -o dof.bin                                | name it dof.onnx
+export -o dof.onnx --table nowhere               | no blur table 'nowhere'
+export -o dof.onnx --table double_gauss_50mm_f2  | state it as width=1920
+export -o dof.onnx --max-coc 0.2                 | max_coc_px must be
+export -o dof.onnx --tolerance 2                 | tolerance must be
+export -o dof.onnx --channels 0                  | channels must be
+export -o dof.onnx --opset 11                    | opset must be
+export -o nowhere/dof.onnx                       | there is no folder
+export --show none.onnx                          | there is no file none.onnx
+fit                                              | either a folder of captures or --lens
+fit nowhere                                      | capture.toml
+fit nowhere --lens double_gauss_50mm             | either a folder of captures or --lens
+fit --lens nowhere                               | nowhere
+fit nowhere -o table.txt                         | name it table.json
+fit nowhere --target other.pdf                   | --target writes the page to print
+fit --lens double_gauss_50mm --root .            | --root is the folder of photographs
+fit --lens double_gauss_50mm --wavelengths red   | --wavelengths takes rgb, or micrometres
+fit --lens double_gauss_50mm --field-deg 95      | --field-deg must be 0 to 90
+fit --lens double_gauss_50mm --field 0,6 --field-deg 5 | give one of them
+fit --lens double_gauss_50mm --field 6,12        | --field takes distances in mm
+fit --lens double_gauss_50mm --field 0           | --field takes distances in mm
+fit --lens double_gauss_50mm --field 0,12,6      | --field takes distances in mm
+fit --lens double_gauss_50mm --field 0,x         | --field takes distances in mm
+fit --lens double_gauss_50mm --field 0,nan       | --field takes distances in mm
+fit --lens double_gauss_50mm --focus-m 0.01      | --focus-m must be
+"""
+
+
+def rows(table: str) -> list[tuple[str, str]]:
+    return [(line.partition("|")[0].strip(), line.partition("|")[2].strip()) for line in table.strip().splitlines()]
+
+
+@pytest.fixture
+def files(scene: Path) -> Path:
+    depth = np.load("depth.npy")
+    np.save("small.npy", np.ones((4, 3)))
+    np.save("zeros.npy", 0 * depth)
+    np.save("millimetres.npy", 1000 * depth)
+    depth[0, 0, 3, 4:6] = 0
+    np.save("holed.npy", depth)
+    write_image("a.png", Picture(torch.ones(1, 3, 4, 4)))
+    return scene
+
+
+def refused(run: Callable[..., str], line: str, says: str, folder: Path) -> None:
+    before = {path: path.read_bytes() for path in folder.rglob("*")}
+    message = run(line, code=2)
+    assert message.startswith("error: ") and says in message and message.count("\n") == 1, message
+    assert {path: path.read_bytes() for path in folder.rglob("*")} == before
+
+
+@pytest.mark.parametrize(("line", "says"), rows(_RENDER))
+def test_what_render_refuses(files: Path, run: Callable[..., str], line: str, says: str) -> None:
+    refused(run, f"render -o out.exr {line}", says, files)
+
+
+@pytest.mark.parametrize(("line", "says"), rows(_OTHERS))
+def test_what_the_other_commands_refuse(files: Path, run: Callable[..., str], line: str, says: str) -> None:
+    refused(run, line, says, files)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("render image.exr", "Missing option '--out' / '-o'"),
+        ("render image.exr depth.npy -o out.exr --f-number wide", "'wide' is not a valid float"),
+        ("render image.exr depth.npy -o out.exr --depth-kind odd", "'odd' is not one of 'z', 'distance'"),
+        ("render image.exr depth.npy -o out.exr --f-number", "Option '--f-number' requires an argument"),
+        ("render --nonsense", "No such option '--nonsense'"),
+        ("bench --repeat 0", "0 is not in the range x>=1"),
+        ("nonsense", "No such command 'nonsense'"),
+    ],
+)
+def test_wrong_usage_names_what_is_wrong(run: Callable[..., str], line: str, says: str) -> None:
+    message = run(line, code=2)
+    assert says in message and "Traceback" not in message
+
+
+def test_library_names_are_told_as_options(files: Path, run: Callable[..., str]) -> None:
+    for lens in ("--f-number 1e-42", "--fov-deg 40 --aperture-radius-m 1e45", "--sensor-width-mm 1e-300"):
+        message = run(f"render image.exr depth.npy -o out.exr --focus-m 2 {lens}", code=2)
+        assert not any(word in message for word in ("coc_px", "check=False", "f_number", "focus_m", "_mm", "_deg"))

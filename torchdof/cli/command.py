@@ -1,0 +1,180 @@
+"""A command is a dataclass: its fields are its arguments and options, stated once, and Click reads them.
+
+Fields that are dataclasses themselves are groups of options that several commands share; their docstring
+heads them in ``--help``. Nothing here imports PyTorch, so that help and wrong arguments are answered at once.
+"""
+
+import dataclasses
+import inspect
+import types
+import typing
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+__all__ = ["argument", "command_of", "numbers", "option", "word_or_number"]
+
+_TYPES: dict[Any, click.ParamType] = {
+    **{str: click.STRING, int: click.INT, float: click.FLOAT, bool: click.BOOL},
+    Path: click.Path(path_type=Path),
+}
+
+
+def option(
+    help: str,
+    default: Any = None,
+    *,
+    names: tuple[str, ...] = (),
+    metavar: str | None = None,
+    read: Callable[[str], Any] | None = None,
+    group: str = "",
+    least: int | None = None,
+    basic: bool = False,
+) -> Any:
+    """A field that is an option of a command.
+
+    Args:
+        help: What it means.
+        default: What it is where it isn't given; ``...`` asks for it.
+        names: What it is called; the field's name with dashes if nothing is said.
+        metavar: What stands for its value in the help.
+        read: Makes the value of its text; a ``ValueError`` says what was expected.
+        group: The heading in the help that it stands under, if not its class's.
+        least: The smallest whole number.
+        basic: Whether it stands first in the help, before the groups.
+    """
+    facts = {"help": help, "names": names, "metavar": metavar, "read": read, "least": least}
+    facts["group"] = "Options" if basic else group
+    return dataclasses.field(**({} if default is ... else {"default": default}), metadata=facts)
+
+
+def argument(help: str, metavar: str, default: Any = ...) -> Any:
+    """A field that is an argument of a command, at its place; with a default it may be left out."""
+    return option(help, default, metavar=metavar, names=("argument",))
+
+
+def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
+    """Reads so many numbers with commas between them; what was expected is the message where there are others."""
+
+    def read(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(map(float, text.split(",")))
+        except ValueError:
+            values = ()
+        if len(values) != count:
+            raise ValueError(f"{expected}, got {text!r}")
+        return values
+
+    return read
+
+
+def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], float | str]:
+    """Reads one of some words, or a number; what was expected is the message where it is neither."""
+
+    def read(text: str) -> float | str:
+        try:
+            return text if text in words else float(text)
+        except ValueError:
+            raise ValueError(f"{expected}, got {text!r}") from None
+
+    return read
+
+
+def command_of(name: str, kind: type[Any]) -> click.Command:
+    """The command whose arguments are the fields of a class, whose docstring says what it does, and ``run`` does it."""
+    parameters, told = list(_parameters(kind, "Options")), inspect.getdoc(kind)
+    return _Command(
+        name,
+        params=parameters,
+        help=told,
+        short_help=" ".join((told or "").partition("\n\n")[0].split()),
+        no_args_is_help=any(parameter.required for parameter in parameters),
+        callback=lambda **values: _made(kind, values).run(),
+        context_settings={"max_content_width": 120},
+    )
+
+
+class _Command(click.Command):
+    """A command whose help lists options by their groups."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        groups: dict[str, list[tuple[str, str]]] = {"Options": []}
+        for parameter in self.get_params(ctx):
+            row = parameter.get_help_record(ctx)
+            if row is not None and not isinstance(parameter, click.Argument):
+                groups.setdefault(getattr(parameter, "group", "Options"), []).append(row)
+        for group, rows in groups.items():
+            with formatter.section(group):
+                formatter.write_dl(rows, col_max=28)
+
+
+class _Option(click.Option):
+    """An option in a group."""
+
+    def __init__(self, *arguments: Any, group: str, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.group = group
+
+
+class _Read(click.ParamType):
+    """The type of a value that a function makes of its text."""
+
+    name = "text"
+
+    def __init__(self, read: Callable[[str], Any]) -> None:
+        self._read = read
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return self._read(value) if isinstance(value, str) else value
+
+
+def _fields(kind: type[Any]) -> list[tuple[Any, Any]]:
+    """The fields of a class and their types."""
+    hints = typing.get_type_hints(kind)
+    return [(field, hints[field.name]) for field in dataclasses.fields(kind)]
+
+
+def _parameters(kind: type[Any], group: str) -> Iterator[click.Parameter]:
+    """The arguments and options that the fields of a class are, and those of the classes in it."""
+    for field, hint in _fields(kind):
+        if dataclasses.is_dataclass(hint):
+            yield from _parameters(hint, (hint.__doc__ or "").rstrip("."))  # type: ignore[arg-type]
+        else:
+            yield _parameter(field, hint, field.metadata["group"] or group)
+
+
+def _parameter(field: Any, hint: Any, group: str) -> click.Parameter:
+    """The argument or option that a field is."""
+    facts, required = field.metadata, field.default is dataclasses.MISSING
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        hint = typing.get_args(hint)[0]
+    several = typing.get_origin(hint) is tuple and facts["read"] is None
+    hint = typing.get_args(hint)[0] if several else hint
+    if facts["read"] is not None:
+        kind: click.ParamType = _Read(facts["read"])
+    elif typing.get_origin(hint) is Literal:
+        kind = click.Choice(typing.get_args(hint))
+    else:
+        kind = _TYPES[hint] if facts["least"] is None else click.IntRange(min=facts["least"])
+    given: dict[str, Any] = {"type": kind, "help": facts["help"], "metavar": facts["metavar"], "required": required}
+    if not required and field.default not in (None, ()):
+        given["default"] = field.default
+    names = facts["names"] or (f"--{field.name.replace('_', '-')}",)
+    if names == ("argument",):
+        return click.Argument([field.name], nargs=-1 if several else 1, **given)
+    if hint is bool:
+        given["is_flag"] = True
+    else:
+        given |= {"multiple": several, "show_default": bool(field.default) and not required}
+    return _Option([field.name, *names], group=group, **given)
+
+
+def _made(kind: type[Any], values: dict[str, Any]) -> Any:
+    """An object of a class, and of the classes in it, from the values of all their fields."""
+    made = {
+        field.name: _made(hint, values) if dataclasses.is_dataclass(hint) else values[field.name]  # type: ignore[arg-type]
+        for field, hint in _fields(kind)
+    }
+    return kind(**made)

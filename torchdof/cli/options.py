@@ -1,0 +1,369 @@
+"""The options that several commands share: focus and lens, depth map, blur; what they mean, and what contradicts.
+
+PyTorch is imported when the first of them is put to use, so that help and contradictions are answered at once.
+"""
+
+import contextlib
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ..io.metadata import camera_facts
+from ..io.sequence import focus_at_frame, parse_focus
+from .command import numbers, option, word_or_number
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from ..optics.aperture import Aperture
+    from ..optics.blur_table import BlurTable
+    from ..optics.camera import Camera
+
+__all__ = [
+    "Accuracy",
+    "Blur",
+    "DepthMap",
+    "Lens",
+    "Opening",
+    "Scene",
+    "Sensor",
+    "edges_option",
+    "json_option",
+    "pick_device",
+]
+
+_ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
+_FIXED_NAMES = {
+    "focus_range_m": "--focus-range",
+    "tilt_deg": "--tilt",
+    "swing_deg": "--swing",
+    "fov_x_deg": "--fov-deg",
+}
+_IDEAL = ("disc", "gaussian")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """Focus and lens."""
+
+    focal_length_mm: float | None = option("Real focal length, not the 35 mm equivalent.")
+    sensor_width_mm: float | None = option("36 for full frame.")
+    fov_deg: float | None = option("Horizontal field of view of a rendered image, instead of a lens.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens(Sensor):
+    """Focus and lens."""
+
+    focus_m: list[tuple[int, float]] | None = option(
+        "Distance in focus in metres (inf allowed), or keyframes frame:metres such as 1:2.0,48:5.5; between them "
+        "1/distance is linear, so that the blur changes evenly.",
+        metavar="METRES",
+        read=parse_focus,
+        basic=True,
+    )
+    focus_at: tuple[float, float] | None = option(
+        "Focus on what is seen at this pixel, counted from the top left; in a sequence, anew in each frame.",
+        metavar="X,Y",
+        read=numbers(2, "--focus-at expects a pixel X,Y such as 320,200"),
+        basic=True,
+    )
+    focus_range: tuple[float, float] | None = option(
+        "In focus from NEAR to FAR metres, blurred beyond; instead of --focus-m.",
+        metavar="NEAR,FAR",
+        read=numbers(2, "--focus-range expects two numbers such as 1.5,2.2"),
+    )
+    tilt: float = option("Degrees by which the lens is tilted down: focus comes nearer towards the bottom.", 0.0)
+    swing: float = option("Degrees to the right: focus comes nearer towards the right.", 0.0)
+    f_number: float | None = option("Smaller is blurrier.", basic=True)
+    aperture_radius_m: float | None = option("Radius of the opening, with --fov-deg.")
+
+    def __post_init__(self) -> None:
+        places = {"--focus-m": self.focus_m, "--focus-at": self.focus_at, "--focus-range": self.focus_range}
+        given = [name for name, place in places.items() if place is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} both say where to focus; give one of them")
+        if self.fov_deg is None:
+            if self.aperture_radius_m is not None:
+                raise ValueError("--aperture-radius-m goes with --fov-deg; a real lens has --f-number instead")
+            return
+        if self.focal_length_mm is not None or self.sensor_width_mm is not None:
+            raise ValueError("--fov-deg and --focal-length-mm with --sensor-width-mm say the same; give one of them")
+        if not 0 < self.fov_deg < 180:
+            raise ValueError(f"--fov-deg must be a number of degrees > 0 and < 180, got {self.fov_deg:g}")
+        if self.f_number is not None and self.aperture_radius_m is not None:
+            raise ValueError("--f-number and --aperture-radius-m both say how wide the lens opens; give one of them")
+
+    @property
+    def has_focus(self) -> bool:
+        """Whether the user said where to focus."""
+        return (self.focus_m, self.focus_at, self.focus_range) != (None, None, None)
+
+    def refuse_keyframes(self) -> None:
+        """Refuse focus that moves, for a single image."""
+        if len(self.focus_m or []) > 1:
+            raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
+
+    def camera(
+        self, metadata: Mapping[str, Any], depth: "Tensor", frame: int = 0, median: bool = False
+    ) -> "tuple[Camera, list[str]]":
+        """The camera of one frame: what the user said, else the file's metadata, else 50 mm, f/2.8 and 36 mm.
+
+        Args:
+            metadata: As in ``Picture.metadata``.
+            depth: ``[1, 1, H, W]``, metres.
+            frame: Its number, for focus that moves.
+            median: Whether the focus is at the median depth where the user said nothing, whatever the file says.
+
+        Returns:
+            The camera and remarks on what was not stated.
+
+        Raises:
+            ValueError: If the focus is stated nowhere, or a number makes no lens; options are named.
+        """
+        from ..optics.camera import Camera
+
+        facts, remarks, focus_m = camera_facts(metadata, depth.shape[-1]), list[str](), math.inf
+        if self.focus_m is not None:
+            focus_m = focus_at_frame(self.focus_m, frame)
+        elif not self.has_focus and median:
+            focus_m = float(depth[depth > 0].median())
+            remarks.append("focus at the median depth")
+        elif not self.has_focus:
+            if "focus_m" not in facts:
+                raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
+            focus_m = facts["focus_m"]
+            remarks.append("focus from the file")
+        moved: dict[str, Any] = {"focus_range_m": self.focus_range, "tilt_deg": self.tilt, "swing_deg": self.swing}
+        if self.fov_deg is not None:
+            radius_m = self.aperture_radius_m
+            if radius_m is None and self.f_number is not None:  # on the equivalent sensor, 36 mm wide
+                radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * self.f_number)
+            if radius_m is None:
+                raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
+            with _by_option(self._names()):
+                camera = Camera.from_fov(self.fov_deg, radius_m, focus_m).replace(**moved)
+        else:
+            lens: dict[str, float] = {}
+            for name, assumed in _ASSUMED.items():
+                stated = getattr(self, name)
+                lens[name] = facts.get(name, assumed) if stated is None else stated
+                if stated is None:
+                    words = name.rsplit("_", 1)[0].replace("_", " ") if name != "f_number" else "f-number"
+                    remarks.append(f"{words} {'from the file' if name in facts else 'assumed'}")
+            with _by_option(self._names()):
+                camera = Camera(**lens, focus_m=focus_m).replace(**moved)
+        return camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at), remarks
+
+    def stated(self, camera: "Camera") -> dict[str, Any]:
+        """The numbers of a camera by the options, or the file, that they are from."""
+        from ..optics.camera import CAMERA_NUMBERS
+
+        names = self._names()
+        if self.fov_deg is None:
+            return {names[name]: getattr(camera, name) for name in CAMERA_NUMBERS}
+        opening = "aperture_radius_m" if self.f_number is None else "f_number"
+        return {"--fov-deg": self.fov_deg, names[opening]: getattr(self, opening), names["focus_m"]: camera.focus_m}
+
+    def _names(self) -> dict[str, str]:
+        """What the user knows a number of the camera as: the option that states it, or the file's own."""
+        focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
+        names = {"focus_m": focus if self.has_focus else f"{focus} (not given)", **_FIXED_NAMES}
+        for name in (*_ASSUMED, "aperture_radius_m"):
+            given = getattr(self, name) is not None
+            names[name] = f"--{name.replace('_', '-')}" + ("" if given else " (not given)")
+        return names
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthMap:
+    """Depth map."""
+
+    depth_kind: Literal["z", "distance", "disparity", "inverse", "relative", "coc"] = option(
+        "What the numbers are: z along the optical axis or distance along the ray, in metres after scale * (value + "
+        "offset); disparity or inverse depth, in metres after scale / (value + offset); relative, as estimators give "
+        "it, between --near-m and --far-m; or coc, the signed blur radius in pixels (negative is near).",
+        "z",
+        basic=True,
+    )
+    depth_scale: float | None = option("0.001 for maps in millimetres.", basic=True)
+    depth_offset: float = option("Added to each value first.", 0.0)
+    near_m: float | None = option("Distance of the nearest value of relative depth.")
+    far_m: float | None = option("Distance of its farthest value (inf allowed).")
+    relative_kind: Literal["disparity", "inverse", "depth"] | None = option(
+        "What relative depth is: disparity or inverse depth, larger is nearer (MiDaS, Depth Anything; the default), or "
+        "depth, larger is farther (Marigold)."
+    )
+    value_range: tuple[float, float] | None = option(
+        "Smallest and largest value of relative depth; default: those of each frame.",
+        metavar="LOW,HIGH",
+        read=numbers(2, "--value-range expects two numbers such as 0,255"),
+    )
+    depth_unknown: float | None = option("A value that means 'not measured', such as 0, -1 or inf.")
+    fill_depth: float | str | None = option(
+        "Fill pixels without depth: from the nearest one, from the farthest around (what stereo cannot see lies "
+        "behind), or with a distance (inf for a sky).",
+        metavar="nearest|far|METRES",
+        read=word_or_number(("nearest", "far"), "--fill-depth expects nearest, far or metres"),
+    )
+    depth_channel: str | None = option("Channel (or array of an .npz) that is depth.")
+    strict: bool = option("Refuse what looks like a wrong unit or scale, instead of warning.", False)
+
+    def __post_init__(self) -> None:
+        if self.depth_kind == "relative":
+            if self.near_m is None or self.far_m is None:
+                raise ValueError(
+                    "--depth-kind relative needs --near-m and --far-m, the distances of the nearest and the farthest "
+                    "value in metres (--far-m inf for a sky)"
+                )
+            if self.depth_scale is not None or self.depth_offset != 0.0:
+                raise ValueError("--depth-kind relative has no --depth-scale and --depth-offset: near and far say it")
+        elif any(value is not None for value in (self.near_m, self.far_m, self.relative_kind, self.value_range)):
+            raise ValueError(
+                "--near-m, --far-m, --relative-kind and --value-range are for relative depth: add --depth-kind relative"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """What is seen, and through what; commands that take an image and its depth are made of it."""
+
+    lens: Lens = Lens()
+    depth_map: DepthMap = DepthMap()
+
+    def __post_init__(self) -> None:
+        lens = self.lens
+        if self.depth_map.depth_kind == "coc" and lens != Lens(fov_deg=lens.fov_deg):
+            raise ValueError(
+                "--depth-kind coc is the blur itself and takes no camera; leave focus and lens options out"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Opening:
+    """Blur."""
+
+    blades: int = option("Aperture blades, from 3; 0 is a round lens.", 0)
+    rotation: float = option("Degrees by which blades or image are turned, counter-clockwise.", 0.0)
+    curvature: float = option("Of the blades: 0 straight, 1 a circle.", 0.0)
+    squeeze: float = option("Height of the blur over its width; 2 for an anamorphic lens.", 1.0)
+    aperture: Path | None = option("Picture of the opening, bright where light passes.", metavar="IMAGE")
+    vignetting: float = option("Cat's eyes towards the corners: 0 none, 1 closed; not in exported files.", 0.0)
+
+    def __post_init__(self) -> None:
+        if self.aperture is not None and (self.blades or self.curvature):
+            raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
+        if self.blades == 0 and self.aperture is None and self.curvature:
+            raise ValueError("--curvature is that of blades; give --blades too")
+        if self.blades == 0 and self.aperture is None and self.rotation:
+            raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
+
+    def opening(self) -> "Aperture | None":
+        """The opening that these options mean; None if they mean a round one.
+
+        Raises:
+            ValueError: If one is out of its range.
+            OSError: If the image cannot be read.
+        """
+        from ..io.images import read_image
+        from ..optics.aperture import Aperture
+
+        mask = None
+        if self.aperture is not None:
+            mask = read_image(self.aperture).light[0].mean(0)
+        names = {name: f"--{name.removesuffix('_deg')}" for name in ("blades", "rotation_deg", "curvature", "squeeze")}
+        with _by_option(names | {"vignetting": "--vignetting"}):
+            aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
+        return None if aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place else aperture
+
+    def table_of(self, name: str) -> "BlurTable":
+        """A table by its name, or by the path of its JSON file, with this opening in place of its own.
+
+        Raises:
+            ValueError: If it is not valid.
+            FileNotFoundError: If there is no such table; the message lists those there are.
+            OSError: If a file cannot be read.
+        """
+        from ..optics.blur_table import BlurTable
+        from ..optics.table_file import shipped
+
+        opening = self.opening()
+        try:
+            table = getattr(BlurTable, name)() if name in _IDEAL else BlurTable.load(name)
+        except FileNotFoundError:
+            names = ", ".join([*_IDEAL, *shipped()])
+            raise FileNotFoundError(f"no blur table {name!r}: neither a file nor one of {names}") from None
+        return table if opening is None else table.with_aperture(opening)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blur(Opening):
+    """Blur."""
+
+    table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Accuracy:
+    """Blur."""
+
+    tolerance: Any = option(
+        "Accepted RMS error on display, of 1: draft (8/255), preview (4/255), final (1/255) or a number; 0 is exact.",
+        "final",
+        metavar="NAME|NUMBER",
+        read=word_or_number(("draft", "preview", "final"), "--tolerance expects draft, preview, final or a number"),
+        basic=True,
+    )
+    no_occlusion: bool = option("One pass that ignores what hides what.", False)
+    method: Literal["layered", "fold"] = option("fold is the literal scatter: exact, slow, for small radii.", "layered")
+
+    def options(self) -> dict[str, Any]:
+        """The same as arguments of :class:`torchdof.DepthOfField`."""
+        return {"tolerance": self.tolerance, "occlusion": not self.no_occlusion, "method": self.method}
+
+
+def edges_option(default: str) -> Any:
+    """The option of what is done to depth edges; commands differ in what they do unless told."""
+    return option(
+        "Move and sharpen the edges of the depth to where the image has them: unless they prove exact, each one, or "
+        "not at all.",
+        default,
+        group="Depth map",
+    )
+
+
+def json_option() -> Any:
+    """The option of all commands for programs."""
+    return option("Print what is printed as JSON, for programs: one object a line.", False, names=("--json",))
+
+
+@contextlib.contextmanager
+def _by_option(names: Mapping[str, str]) -> Iterator[None]:
+    """Has a refusal say the option's name where it says its own."""
+    try:
+        yield
+    except ValueError as error:
+        pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
+        raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
+
+
+def pick_device(name: str) -> "torch.device":
+    """A device by name; "auto" is CUDA where there is one, else the CPU.
+
+    Raises:
+        ValueError: If there is no such device.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device).sum().item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise ValueError(f"--device {name}: there is no such device here; use cpu") from None
+    return device
