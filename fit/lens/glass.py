@@ -1,9 +1,11 @@
-"""Glasses: refractive index at any wavelength, by Sellmeier's formula with a catalogue's coefficients.
+"""Glasses: refractive index in air at any wavelength.
+
+A catalogue's glass has the coefficients of Sellmeier's formula, with the wavelength l in micrometres:
 
     ``n^2 - 1 = B1 l^2 / (l^2 - C1) + B2 l^2 / (l^2 - C2) + B3 l^2 / (l^2 - C3)``
 
-with the wavelength ``l`` in micrometres. It holds a catalogue's indices to their last digit, the secondary spectrum
-included, which an Abbe number leaves out. What ships is ``glasses/schott.txt``; its source is said there.
+It holds the catalogue's indices to their last digit. A glass of which only numbers are known has Cauchy's three terms,
+``n = a + b / l^2 + c / l^4``. What ships is ``glasses/schott.txt``; its source is stated there.
 """
 
 from __future__ import annotations
@@ -13,9 +15,11 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from torchdof.validation import number, show
 
-__all__ = ["C_UM", "D_UM", "F_UM", "G_UM", "Glass"]
+__all__ = ["AIR", "C_UM", "D_UM", "F_UM", "G_UM", "Glass", "catalogue"]
 
 D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
 _LARGEST = 1e100  # coefficient, whose products are numbers too
@@ -24,29 +28,29 @@ _CATALOGUE = Path(__file__).parent / "glasses" / "schott.txt"
 
 @dataclass(frozen=True)
 class Glass:
-    """A glass.
+    """A glass, or another medium.
 
     Args:
-        name: As its maker calls it.
-        sellmeier: ``B1, B2, B3, C1, C2, C3``; the C in square micrometres.
+        name: As a prescription has it.
+        coefficients: ``B1, B2, B3, C1, C2, C3`` of Sellmeier's formula, the C in square micrometres; or ``a, b, c`` of
+            Cauchy's.
 
     Raises:
-        ValueError: If these are not six finite numbers that make an index from 1 to 5 between 0.4 and 0.7 um.
+        ValueError: If these are not so many finite numbers that make an index from 1 to 5 between 0.4 and 0.7 um.
 
     Example:
-        >>> glass = Glass.named("N-BK7")
-        >>> round(glass.index(0.58756), 5), round(glass.abbe, 2)
-        (1.5168, 64.17)
+        >>> round(Glass.named("N-BK7").index(0.58756), 5)
+        1.5168
     """
 
     name: str
-    sellmeier: tuple[float, float, float, float, float, float]
+    coefficients: tuple[float, ...]
 
     def __post_init__(self) -> None:
         """Check that it is a glass."""
-        given = self.sellmeier
+        given = self.coefficients
         plain = isinstance(given, tuple) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
-        if not plain or len(given) != 6 or not all(abs(value) <= _LARGEST for value in given):
+        if not plain or len(given) not in (3, 6) or not all(abs(value) <= _LARGEST for value in given):
             raise ValueError(
                 f"glass {self.name} must have six finite coefficients B1 B2 B3 C1 C2 C3, got {show(given)}"
             )
@@ -58,47 +62,59 @@ class Glass:
         """A glass of the catalogue.
 
         Raises:
-            ValueError: If there is none of that name; the message says how to state it.
+            ValueError: If there is none of that name; the message tells how to state it.
         """
-        if not isinstance(name, str) or name.upper() not in _catalogue():
+        if not isinstance(name, str) or name.upper() not in catalogue():
             raise ValueError(
                 f"no glass {show(name)} in the catalogue of SCHOTT; define it by a line "
                 f"`glass {name} B1 B2 B3 C1 C2 C3` (Sellmeier, micrometres), or write index/V or index/V/P_gF instead"
             )
-        return _catalogue()[name.upper()]
+        return catalogue()[name.upper()]
 
-    def index(self, wavelength_um: float) -> float:
-        """Refractive index in air.
+    @classmethod
+    def of_numbers(cls, index: float, *dispersion: float) -> Glass:
+        """A glass by its index n_d at the d line, Abbe number and partial dispersion, as catalogues list them.
+
+        The Abbe number is ``V = (n_d - 1) / (n_F - n_C)``; without it the index is the same at any wavelength. The
+        partial dispersion is ``P_gF = (n_g - n_F) / (n_F - n_C)``; without it that of a normal glass is taken.
+
+        Reference:
+            SCHOTT, "TIE-29: Refractive index and dispersion", 2016 (the line of normal glasses).
+        """
+        name = "/".join(f"{value:.9g}" for value in (index, *dispersion))
+        abbe, partial = (
+            (*dispersion, max(0.3, 0.6438 - 0.001682 * dispersion[0]))[:2] if dispersion else (math.inf, 0.5)
+        )
+        if not (abbe >= 1 and 0 < partial < 1):
+            raise ValueError(f"the Abbe number must be at least 1 and P_gF between 0 and 1, got {name}")
+        d, f, c, g = (np.array([1.0, line**-2, line**-4]) for line in (D_UM, F_UM, C_UM, G_UM))
+        across = (index - 1.0) / abbe
+        terms = np.linalg.solve(np.stack([d, f - c, g - f]), [index, across, partial * across])
+        return cls(name, tuple(terms.tolist()))
+
+    def index(self, wavelength_um: float = D_UM) -> float:
+        """Refractive index in air, from 0.3 to 1.2 micrometres.
 
         Raises:
             ValueError: If the formula gives none from 1 to 5 there: the wavelength is beyond what the glass lets pass.
         """
-        square = number("wavelength_um", wavelength_um, low=0.0, high=1e3, unit="micrometres") ** 2
-        poles, b = self.sellmeier[3:], self.sellmeier[:3]
-        terms = [b_i * square / (square - c_i) for b_i, c_i in zip(b, poles, strict=True) if square != c_i]
-        if len(terms) < 3 or not 1.0 <= 1.0 + sum(terms) < 25.0:
+        square = number("wavelength_um", wavelength_um, low=0.299, high=1.201, unit="micrometres") ** 2
+        given = self.coefficients
+        if len(given) == 3:
+            index = given[0] + given[1] / square + given[2] / square**2
+        else:
+            terms = (b * square / ((square - c) or 1e-300) for b, c in zip(given[:3], given[3:], strict=True))
+            index = max(1.0 + sum(terms), 0.0) ** 0.5
+        if not 1.0 <= index < 5.0:
             raise ValueError(f"glass {self.name} has no refractive index from 1 to 5 at {wavelength_um:g} um")
-        return math.sqrt(1.0 + sum(terms))
-
-    @property
-    def abbe(self) -> float:
-        """Abbe number V, ``(n_d - 1) / (n_F - n_C)``; ``inf`` without dispersion."""
-        across = self.index(F_UM) - self.index(C_UM)
-        return (self.index(D_UM) - 1.0) / across if across else math.inf
-
-    @property
-    def partial(self) -> float:
-        """Partial dispersion P_gF, ``(n_g - n_F) / (n_F - n_C)``; NaN without dispersion."""
-        across = self.index(F_UM) - self.index(C_UM)
-        return (self.index(G_UM) - self.index(F_UM)) / across if across else math.nan
+        return index
 
 
 @functools.cache
-def _catalogue() -> dict[str, Glass]:
-    glasses = {}
-    for line in _CATALOGUE.read_text(encoding="utf-8").splitlines():
-        name, *numbers = line.partition("#")[0].split() or [""]
-        if name:
-            b1, b2, b3, c1, c2, c3 = map(float, numbers)
-            glasses[name] = Glass(name, (b1, b2, b3, c1, c2, c3))
-    return glasses
+def catalogue() -> dict[str, Glass]:
+    """The glasses that ship, by name in capitals."""
+    lines = (line.partition("#")[0].split() for line in _CATALOGUE.read_text(encoding="utf-8").splitlines())
+    return {name: Glass(name, tuple(map(float, given))) for name, *given in filter(None, lines)}
+
+
+AIR = Glass("1", (1.0, 0.0, 0.0))

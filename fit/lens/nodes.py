@@ -11,19 +11,21 @@ against spots at the nodes *and between them*, where the table will interpolate.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+import torch
 from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import nnls
-from scipy.special import j0
+from scipy.optimize import least_squares, nnls
+from scipy.special import j0, j1
 
-from torchdof.optics.psf import FAMILIES, LENGTHS
+from torchdof.optics.psf import FAMILIES, LENGTHS, profile
 
 from ..result import Array
-from .shape import fit_shape
 from .spot import Spot
 
 __all__ = ["NodeEquations", "Tracer", "fit_radial", "fit_shapes", "place_nodes"]
@@ -31,10 +33,14 @@ __all__ = ["NodeEquations", "Tracer", "fit_radial", "fit_shapes", "place_nodes"]
 _FINEST = 3.0  # cycles a pixel; kernels are sampled on the pixel grid, so frequencies beyond it fold back
 _BETWEEN = (0.25, 0.5, 0.75)  # where between two nodes spots are traced for the joint fit
 _SWEEPS = 6
-_PULL = 1e-4  # weight of a ray histogram where spots say nothing (details far below a pixel)
+_PULL = 1e-4  # weight of a ray histogram where spots tell nothing (details far below a pixel)
 _NARROW = 0.01  # pixels of coc; an interval that narrow is not divided
 _WANTED_DB = 62.0  # PSNR of a natural image in the middle of an interval; beside it it may be some dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
+# of named shapes: where parameters may lie, lengths relative to the outermost ray; the profile's samples, up to so many
+# times that ray; the weight of staying like the neighbour, so that parameters that hardly matter do not jump
+_RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
+_STEPS, _REACH, _KEEP, _TRIES = 400, 2.0, 1e-3, 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +52,6 @@ class NodeEquations:
     pull: Array
     constant: float
     histogram: Array
-    area: Array
 
     def error(self, values: Array) -> float:
         """Weighted squared error of profile values."""
@@ -54,7 +59,7 @@ class NodeEquations:
 
 
 class Tracer:
-    """Traces spots by coc and keeps their equations; between nodes these are for the radius interpolated there."""
+    """Traces spots by coc and keeps them; their equations are for profiles piecewise linear at ``points`` radii."""
 
     def __init__(self, spot: Callable[[float], Spot], points: int, pixel: float) -> None:
         self.spot, self.points, self.pixel = spot, points, pixel
@@ -62,65 +67,49 @@ class Tracer:
         # amplitude of natural images times the area of a ring of frequencies; flat beyond Nyquist, where it folds back
         spectrum = np.minimum(self.frequency, 0.5) ** -0.5
         self.weight = spectrum / np.sqrt(1.0 + (np.pi * self.frequency) ** 2)
-        self._nodes: dict[float, NodeEquations] = {}
-        self._spots: dict[float, tuple[Array, Array, Array]] = {}
+        fine = 12 * (points - 1)
+        self._r = (np.arange(fine) + 0.5) / fine  # within a profile, relative to its radius
+        self._light = _hats(self._r, points) * (2.0 * np.pi * self._r / fine)[:, None]
+        self.area = self._light.sum(0)  # of each hat, which is the light in it
+        self.traced, self.alone = functools.cache(self._traced), functools.cache(self._alone)
 
-    def traced(self, coc: float) -> tuple[Array, Array, Array]:
-        """Radii in pixels, weights and transfer function of the spot."""
-        if coc not in self._spots:
-            spot = self.spot(coc)
-            r = np.maximum(spot.r / self.pixel, 1e-9)
-            self._spots[coc] = r, spot.weight, transfer(self.frequency, r, spot.weight)
-        return self._spots[coc]
+    def _traced(self, coc: float) -> tuple[Array, Array, Array]:
+        """Radii in pixels, weights and transfer function (a Hankel transform) of the spot."""
+        spot = self.spot(coc)
+        r, light = np.maximum(spot.r / self.pixel, 1e-9), spot.weight
+        pieces = (slice(i, i + 4096) for i in range(0, len(r), 4096))
+        return r, light, np.sum([j0(2.0 * np.pi * np.outer(self.frequency, r[i])) @ light[i] for i in pieces], axis=0)
 
-    def node(self, coc: float) -> NodeEquations:
-        """The equations of the spot at a node, whose radius is that of the outermost ray."""
-        if coc not in self._nodes:
-            self._nodes[coc] = self.equations(coc, float(self.traced(coc)[0].max()))
-        return self._nodes[coc]
+    def _alone(self, coc: float) -> tuple[NodeEquations, Array]:
+        """The equations of the spot at a node, whose radius is that of the outermost ray, and values that fit it."""
+        node = self.equations(coc, float(self.traced(coc)[0].max()))
+        return node, self.fitted(node.gram, node.pull, node.histogram)
 
     def equations(self, coc: float, radius: float) -> NodeEquations:
         """The equations of the spot at a coc, for profiles that end at ``radius`` pixels."""
-        r, light, spot_transfer = self.traced(coc)
-        basis, area = _hats(self.frequency, radius, self.points)
-        basis = basis * self.weight[:, None]
-        # all light, whatever the frequencies say
-        heavy = 1e4 * self.weight.max() ** 2
-        gram = basis.T @ basis + heavy * np.outer(area, area)
-        pull = basis.T @ (spot_transfer * self.weight) + heavy * area
-        place = np.minimum(r / radius, 1.0) * (self.points - 1)
-        low = np.minimum(place.astype(int), self.points - 2)
-        upper = place - low
-        ring = np.bincount(low, light * (1 - upper), self.points) + np.bincount(low + 1, light * upper, self.points)
-        constant = float(((spot_transfer * self.weight) ** 2).sum() + heavy)
-        return NodeEquations(radius, gram, pull, constant, ring / area, area)
+        r, light, transfer = self.traced(coc)
+        basis = j0(2.0 * np.pi * np.outer(self.frequency, self._r * radius)) @ self._light * self.weight[:, None]
+        heavy = 1e4 * self.weight.max() ** 2  # all light, whatever the frequencies tell
+        gram = basis.T @ basis + heavy * np.outer(self.area, self.area)
+        pull = basis.T @ (transfer * self.weight) + heavy * self.area
+        histogram = light @ _hats(np.minimum(r / radius, 1.0), self.points) / self.area
+        return NodeEquations(radius, gram, pull, float(((transfer * self.weight) ** 2).sum() + heavy), histogram)
+
+    def fitted(self, gram: Array, pull: Array, prior: Array) -> Array:
+        """Non-negative least squares of a quadratic form, towards a prior where it is flat; light sums to 1."""
+        scale = _PULL**2 * np.trace(gram) / np.sum(self.area) * self.area
+        factor = cholesky(gram + np.diag(scale), lower=True)
+        values, _ = nnls(factor.T, solve_triangular(factor, pull + scale * prior, lower=True), maxiter=50 * len(pull))
+        return values / (self.area @ values)
 
     def relative(self, error: float) -> float:
         """Root of a squared error over that of a kernel that passes no light."""
         return math.sqrt(error / float((self.weight**2).sum()))
 
 
-def transfer(frequency: Array, r: Array, light: Array) -> Array:
-    """Hankel transform of light at distances r from the centre: the spot's transfer function."""
-    parts = [
-        j0(2.0 * np.pi * np.outer(frequency, r[i : i + 4096])) @ light[i : i + 4096] for i in range(0, len(r), 4096)
-    ]
-    return np.sum(parts, axis=0)
-
-
-def _hats(frequency: Array, radius: float, points: int) -> tuple[Array, Array]:
-    """Transfer functions ``[F, P]`` of the piecewise linear profile's basis, and the light in each basis function.
-
-    Lengths within the profile are relative to its radius, so that values mean the same at every radius.
-    """
-    fine = 12 * (points - 1)
-    r = (np.arange(fine) + 0.5) / fine
-    place = r * (points - 1)
-    low = place.astype(int)
-    hats = np.zeros((fine, points))
-    hats[np.arange(fine), low], hats[np.arange(fine), low + 1] = 1.0 - (place - low), place - low
-    light = hats * (2.0 * np.pi * r / fine)[:, None]
-    return j0(2.0 * np.pi * np.outer(frequency, r * radius)) @ light, light.sum(0)
+def _hats(r: Array, points: int) -> Array:
+    """Values at radii ``[R]`` from 0 to 1 of the piecewise linear profile's basis ``[R, P]``."""
+    return np.maximum(1.0 - np.abs(r[:, None] * (points - 1) - np.arange(points)), 0.0)
 
 
 def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> list[float]:
@@ -131,23 +120,16 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
     Raises:
         ValueError: If there are no more intervals to halve.
     """
-    places = [near, near / 2, 0.0, far / 2, far] if far > 0 else [near, near / 2, 0.0]
-    alone: dict[float, Array] = {}
-
-    def values(coc: float) -> Array:
-        if coc not in alone:
-            node = tracer.node(coc)
-            alone[coc] = _non_negative(node, node.gram, node.pull, node.histogram)
-        return alone[coc]
 
     def gap(left: float, right: float) -> float:
-        radii = tracer.node(left).radius, tracer.node(right).radius
-        if max(radii) <= 0.5 or right - left < _NARROW * tracer.pixel:
+        (node, values), (after, next_values) = tracer.alone(left), tracer.alone(right)
+        if max(node.radius, after.radius) <= 0.5 or right - left < _NARROW * tracer.pixel:
             return 0.0
-        between = tracer.equations((left + right) / 2, sum(radii) / 2)
-        return between.error((values(left) + values(right)) / 2)
+        between = tracer.equations((left + right) / 2, (node.radius + after.radius) / 2)
+        return between.error((values + next_values) / 2)
 
-    gaps = [gap(*pair) for pair in zip(places, places[1:], strict=False)]
+    places = [near, near / 2, 0.0, far / 2, far] if far > 0 else [near, near / 2, 0.0]
+    gaps = [gap(*pair) for pair in pairwise(places)]
     enough = 10.0 ** (-_WANTED_DB / 20.0) / _CONTRAST
     while len(places) < nodes if nodes is not None else tracer.relative(max(gaps)) > enough:
         worst = int(np.argmax(gaps))
@@ -156,7 +138,7 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
                 f"nodes must be at most {len(places)} for this lens and width_px, got {nodes}: between those the spots "
                 "stay within one pixel, or hardly differ; take fewer nodes or a larger width_px"
             )
-        left, right = places[worst], places[worst + 1]
+        left, right = places[worst : worst + 2]
         middle = (left + right) / 2
         places.insert(worst + 1, middle)
         gaps[worst : worst + 1] = [gap(left, middle), gap(middle, right)]
@@ -165,55 +147,87 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
 
 def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array], Array]:
     """Values of all nodes at once, by sweeps from both ends to the focus and back."""
-    nodes = [tracer.node(coc) for coc in places]
-    values = [_non_negative(node, node.gram, node.pull, node.histogram) for node in nodes]
-    # every spot: the node to its left, its share of the way to the next one, its equations
-    spots = [(i, 0.0, node) for i, node in enumerate(nodes)]
-    for i in range(len(places) - 1):
-        for fraction in _BETWEEN:
-            radius = (1 - fraction) * nodes[i].radius + fraction * nodes[i + 1].radius
-            spots.append((i, fraction, tracer.equations((1 - fraction) * places[i] + fraction * places[i + 1], radius)))
-    focus = int(np.argmin(np.abs(places)))
-    order = [*range(focus), *range(len(places) - 1, focus - 1, -1)]
-    for sweep in range(_SWEEPS):
-        for i in order if sweep % 2 == 0 else order[::-1]:
-            gram, pull = np.zeros_like(nodes[i].gram), np.zeros_like(nodes[i].pull)
-            for left, fraction, spot in spots:
-                weight = 1 - fraction if left == i else fraction if left + 1 == i else 0.0
-                if weight > 0.0:
-                    gram += weight * weight * spot.gram
-                    pull += weight * spot.pull
-                    if weight < 1.0:
-                        neighbour = values[left + 1 if left == i else left]
-                        pull -= weight * (1 - weight) * (spot.gram @ neighbour)
-            values[i] = _non_negative(nodes[i], gram, pull, nodes[i].histogram)
-    radii = np.array([node.radius for node in nodes]) * tracer.pixel
-    residual = np.array([tracer.relative(n.error(v)) for n, v in zip(nodes, values, strict=True)])
-    return {"values": np.stack(values), "radius": radii}, residual
+    nodes, values = map(list, zip(*(tracer.alone(coc) for coc in places), strict=True))
+    # of each node: equations that its values enter, with what weight, and the node that has the rest of it
+    spots: list[list[tuple[NodeEquations, float, int]]] = [[(node, 1.0, i)] for i, node in enumerate(nodes)]
+    for i, (left, right) in enumerate(pairwise(zip(places, nodes, strict=True))):
+        for share in _BETWEEN:
+            coc, radius = (
+                (1 - share) * left[0] + share * right[0],
+                (1 - share) * left[1].radius + share * right[1].radius,
+            )
+            equations = tracer.equations(coc, radius)
+            spots[i].append((equations, 1 - share, i + 1))
+            spots[i + 1].append((equations, share, i))
+    for order in (_to_focus(places), _to_focus(places)[::-1]) * (_SWEEPS // 2):
+        for i in order:
+            gram = sum(share**2 * spot.gram for spot, share, _ in spots[i])
+            pull = sum(share * (spot.pull - (1 - share) * spot.gram @ values[other]) for spot, share, other in spots[i])
+            values[i] = tracer.fitted(gram, pull, nodes[i].histogram)
+    residual = np.array([tracer.relative(node.error(v)) for node, v in zip(nodes, values, strict=True)])
+    return {"values": np.stack(values), "radius": np.array([node.radius for node in nodes]) * tracer.pixel}, residual
 
 
 def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
     """A named shape at each node, each started from its neighbour, from both ends to the focus."""
+    names = FAMILIES[family]
+    params, residual = np.zeros((len(names), len(places))), np.zeros(len(places))
+    before = None
+    for i in _to_focus(places):
+        r, light, transfer = tracer.traced(places[i])
+        outermost, rms = float(r.max()), math.sqrt(float(light @ (r * r)))
+        if i == len(places) - 1:  # the other side begins
+            before = None
+        frequency = tracer.frequency * outermost
+        before, error = _fit_shape(family, frequency, tracer.weight, transfer, rms / outermost, before)
+        params[:, i] = before * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
+        residual[i] = tracer.relative(error)
+    return dict(zip(names, params, strict=True)), residual
+
+
+def _to_focus(places: Sequence[float]) -> list[int]:
+    """Numbers of the nodes from both ends to the focus."""
     focus = int(np.argmin(np.abs(places)))
-    fitted: dict[int, tuple[dict[str, float], float]] = {}
-    for side in (range(focus), range(len(places) - 1, focus - 1, -1)):
-        before: tuple[dict[str, float], float] | None = None
-        for i in side:
-            r, light, spot_transfer = tracer.traced(places[i])
-            params, error = fit_shape(family, tracer.frequency, tracer.weight, spot_transfer, r, light, before)
-            before, fitted[i] = (params, float(r.max())), (params, tracer.relative(error))
-    columns = {
-        key: np.array([fitted[i][0][key] for i in range(len(places))]) * (tracer.pixel if key in LENGTHS else 1.0)
-        for key in FAMILIES[family]
-    }
-    return columns, np.array([fitted[i][1] for i in range(len(places))])
+    return [*range(focus), *range(len(places) - 1, focus - 1, -1)]
 
 
-def _non_negative(node: NodeEquations, gram: Array, pull: Array, prior: Array) -> Array:
-    """Non-negative least squares of a quadratic form, towards the histogram where it is flat; light sums to 1."""
-    scale = _PULL**2 * np.trace(gram) / np.sum(node.area)
-    factor = cholesky(gram + np.diag(scale * node.area), lower=True)
-    values, _ = nnls(
-        factor.T, solve_triangular(factor, pull + scale * node.area * prior, lower=True), maxiter=50 * len(pull)
-    )
-    return values / (node.area @ values)
+def _fit_shape(
+    family: str, frequency: Array, weight: Array, spot_transfer: Array, rms: float, before: Array | None
+) -> tuple[Array, float]:
+    """Parameters of a shape whose transfer function is nearest to a spot's, and the weighted squared error.
+
+    Lengths, and 1 / frequency, are relative to the spot's outermost ray. A neighbour's parameters are a start and a
+    weak pull.
+    """
+    names = FAMILIES[family]
+    low, high = np.array([_RANGES[name] for name in names]).T
+    if family == "softm":  # a small radius with a wide edge and a large tilt would be a second branch
+        low[0] = 0.5
+    sigma = {"gaussian": 0.5**0.5, "ring": 0.5}.get(family, 0.05) * rms
+    geometry = {"radius": 2.0**0.5 * rms, "sigma": sigma, "r_c": 0.7 * rms, "b": 0.0, "m": 2.0}
+    starts = [np.array([geometry[name] for name in names])]
+    if before is not None:
+        starts.insert(0, before)
+    r = (np.arange(_STEPS) + 0.5) * (_REACH / _STEPS)
+    waves = j0(2.0 * np.pi * np.outer(frequency, r))
+
+    def misfit(values: Array) -> Array:
+        params = dict(zip(names, values, strict=True))
+        if family == "gaussian":
+            transfer = np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2)
+        elif family == "disc":
+            phase = 2.0 * np.pi * params["radius"] * frequency
+            transfer = 2.0 * j1(phase) / phase
+        else:
+            light = profile(family, torch.from_numpy(r), params).numpy() * r
+            transfer = waves @ (light / light.sum())
+        return np.asarray(weight * (transfer - spot_transfer))
+
+    def pulled(values: Array) -> Array:
+        return misfit(values) if before is None else np.concatenate([misfit(values), _KEEP * (values - before)])
+
+    margin = 1e-6 * (high - low)
+    inside = [np.clip(start, low + margin, high - margin) for start in starts]
+    fits = [least_squares(pulled, start, bounds=(low, high), max_nfev=_TRIES) for start in inside]
+    best = min(fits, key=lambda fit: fit.cost).x
+    return best, float((misfit(best) ** 2).sum())

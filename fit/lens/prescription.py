@@ -20,206 +20,109 @@ coefficients of Sellmeier's formula, ``glass NAME B1 B2 B3 C1 C2 C3``. ``#`` sta
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
-import numpy as np
+from .glass import AIR, Glass, catalogue
+from .surface import Surface
 
-from ..result import Array
-from .glass import D_UM, Glass
+__all__ = ["parse", "lines"]
 
-__all__ = ["COLUMNS", "fault", "lines", "parse"]
-
-COLUMNS = ("radius", "thickness", "index", "diameter")
-"""The columns of a line."""
-
-_SMALLEST_MM, _LARGEST_MM = 1e-3, 1e7
+_COLUMNS = "radius thickness index diameter"
 _MOST_SURFACES = 1000
-_POWERS = tuple(range(2, 18, 2))  # of a polynomial
+_SHAPE = ("k", *(f"A{power}" for power in range(2, 18, 2)))
 
 
-def parse(text: str) -> tuple[dict[str, Any], int, str]:
-    r"""Read the text of a prescription.
-
-    Returns:
-        The columns by name (``radius``, ``thickness``, ``index``, ``abbe``, ``partial``, ``diameter``, ``conic``,
-        ``polynomial``, ``glass``), the number of the stop's surface, and the source.
+def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
+    r"""Read the text of a prescription: the surfaces, the number of the stop, and the source.
 
     Raises:
         ValueError: If it is not a prescription; the message names line and column.
 
     Example:
-        >>> columns, stop, _ = parse("50 5 1.5/64 20 \n 0 1 0 18 \n -50 0 1 20")
-        >>> columns["abbe"].tolist(), stop
-        ([64.0, 64.0, inf], 1)
+        >>> surfaces, stop, _ = parse(b"50 5 1.5/64 20 \n 0 1 0 18 \n -50 0 1 20")
+        >>> [surface.glass.name for surface in surfaces], stop
+        (['1.5/64', '1.5/64', '1'], 1)
     """
-    rows: list[list[float]] = []
-    shapes: list[list[float]] = []
-    glasses: list[Glass | None] = []
+    surfaces: list[Surface] = []
     defined: dict[str, Glass] = {}
     stop, source = None, ""
-    for number, line in enumerate(text.splitlines(), start=1):
-        content, _, comment = line.partition("#")
+    for at, line in enumerate(content.decode("utf-8").splitlines(), start=1):
+        text, _, comment = line.partition("#")
         if comment.strip().startswith("source:"):
             source = comment.split(":", 1)[1].strip()
-        fields = content.split()
-        if not fields:
-            continue
-        if fields[0] == "glass":
-            glass = _defined(fields[1:], number)
-            defined[glass.name] = glass
-            continue
-        if len(fields) < len(COLUMNS):
-            raise ValueError(f"line {number}: expected the columns {' '.join(COLUMNS)}, got {len(fields)}: {line!r}")
-        medium = _glass(fields[2], defined, number)
-        if medium is not None:
-            fields[2] = f"{medium.index(D_UM)!r}/{medium.abbe!r}/{medium.partial!r}"
-        row = [_number(text, column, number) for text, column in zip(fields, COLUMNS, strict=False)]
-        words = fields[len(COLUMNS) :]
-        is_stop = "stop" in words
-        shapes.append(_shape([word for word in words if word != "stop"], number))
-        radius, thickness, (index, abbe, partial), diameter = row[0][0], row[1][0], row[2], row[3][0]
-        before = rows[-1][2:5] if rows else [1.0, math.inf, math.nan]
-        if (is_stop or radius == 0.0) and stop is not None:
-            raise ValueError(f"line {number}, column radius: a second stop (radius 0, or stop); write inf for flat")
-        if radius == 0.0:
-            if index not in (0.0, before[0]):
-                raise ValueError(f"line {number}, column index: the stop does not change the index, write 0")
-            is_stop, radius, (index, abbe, partial) = True, math.inf, before
-            medium = glasses[-1] if glasses else None
-        stop = len(rows) if is_stop else stop
-        for column, value in zip(COLUMNS, (radius, thickness, index, diameter), strict=True):
-            if problem := fault(column, value):
-                raise ValueError(f"line {number}, column {column}: {problem}")
-        if len(rows) == _MOST_SURFACES:
-            raise ValueError(f"line {number}: a lens has at most {_MOST_SURFACES} surfaces")
-        rows.append([radius, thickness, index, abbe, partial, diameter])
-        glasses.append(medium)
+        words = text.split()
+        try:
+            if words[:1] == ["glass"]:
+                name, *numbers = words[1:] or [""]
+                if len(numbers) != 6 or not name[0].isalpha():
+                    raise ValueError(f"expected glass NAME B1 B2 B3 C1 C2 C3, got {' '.join(words[1:])!r}")
+                defined[name] = Glass(name, tuple(_number(f"glass {name}", text) for text in numbers))
+            elif words:
+                surface, is_stop = _surface(words, surfaces[-1].glass if surfaces else AIR, defined)
+                if is_stop and stop is not None:
+                    raise ValueError("radius: a second stop (radius 0, or stop); write inf for flat")
+                if len(surfaces) == _MOST_SURFACES:
+                    raise ValueError(f"a lens has at most {_MOST_SURFACES} surfaces")
+                stop = len(surfaces) if is_stop else stop
+                surfaces.append(surface)
+        except ValueError as error:
+            raise ValueError(f"line {at}: {error}") from None
     if stop is None:
-        raise ValueError(f"no aperture stop among {len(rows)} surfaces; one line must have radius 0, or end in stop")
-    names = ("radius", "thickness", "index", "abbe", "partial", "diameter")
-    columns: dict[str, Any] = {
-        name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)
-    }
-    columns["conic"], polynomial = np.array(shapes)[:, 0], np.array(shapes)[:, 1:]
-    used = np.flatnonzero(polynomial.any(0))
-    columns["polynomial"] = polynomial[:, : used[-1] + 1 if len(used) else 0]
-    columns["glass"] = tuple(glasses)
-    return columns, stop, source
+        raise ValueError(
+            f"no aperture stop among {len(surfaces)} surfaces; one line must have radius 0, or end in stop"
+        )
+    return tuple(surfaces), stop, source
 
 
-def lines(
-    radius: Array,
-    thickness: Array,
-    index: Array,
-    abbe: Array,
-    partial: Array,
-    diameter: Array,
-    conic: Array,
-    polynomial: Array,
-    glasses: tuple[Glass | None, ...],
-    stop: int,
-) -> list[str]:
-    """Surfaces as lines of a prescription, the inverse of :func:`parse`."""
-    own = {glass.name: glass for glass in glasses if glass is not None and not _is_in_catalogue(glass)}
-    written = [" ".join(["glass", name, *(f"{b!r}" for b in glass.sellmeier)]) for name, glass in own.items()]
-    for i, row in enumerate(zip(radius, thickness, index, abbe, partial, diameter, strict=True)):
-        medium = glasses[i]
-        glass = f"{row[2]:.9g}/{row[3]:.9g}" if math.isfinite(row[3]) else f"{row[2]:.9g}"
-        glass += f"/{row[4]:.9g}" if math.isfinite(row[3]) and math.isfinite(row[4]) else ""
-        glass = glass if medium is None else medium.name
-        curve, words = f"{row[0]:.9g}", [f"k={conic[i]:.9g}"] if conic[i] else []
-        words += [f"A{power}={a:.9g}" for power, a in zip(_POWERS, polynomial[i], strict=False) if a]
-        if i == stop:
-            before = (index[i - 1], abbe[i - 1]) if i else (1.0, math.inf)
-            if not words and math.isinf(row[0]) and before == (row[2], row[3]):
-                curve, glass = "0", "0"
-            else:
-                words.append("stop")
-        written.append(" ".join([curve, f"{row[1]:.9g}", glass, f"{row[5]:.9g}", *words]))
-    return written
+def _surface(words: list[str], before: Glass, defined: dict[str, Glass]) -> tuple[Surface, bool]:
+    """The surface of a line behind a medium, and whether it is the stop."""
+    if len(words) < 4:
+        raise ValueError(f"expected the columns {_COLUMNS}, got {len(words)}: {' '.join(words)!r}")
+    radius, thickness, diameter = (_number(_COLUMNS.split()[i], words[i]) for i in (0, 1, 3))
+    is_stop, shape = "stop" in words[4:], dict.fromkeys(_SHAPE, 0.0)
+    for word in words[4:]:
+        name, _, text = word.partition("=")
+        if name in shape:
+            shape[name] = _number(name, text)
+        elif word != "stop":
+            raise ValueError(f"behind the columns expected stop, k=NUMBER or A2=NUMBER to A16=NUMBER, got {word!r}")
+    glass = before if radius == 0.0 and words[2] == "0" else _glass(words[2], defined)
+    if radius == 0.0:
+        if glass.index() != before.index():
+            raise ValueError("index: the stop does not change the index, write 0")
+        radius, glass, is_stop = math.inf, before, True
+    conic, *polynomial = shape.values()
+    return Surface(radius, thickness, glass, diameter, conic, tuple(polynomial) * any(polynomial)), is_stop
 
 
-def _defined(fields: list[str], line: int) -> Glass:
-    """The glass that a line defines."""
-    try:
-        name, *numbers = fields
-        b1, b2, b3, c1, c2, c3 = map(float, numbers)
-    except ValueError:
-        raise ValueError(f"line {line}: expected glass NAME B1 B2 B3 C1 C2 C3, got {' '.join(fields)!r}") from None
-    try:
-        return Glass(name, (b1, b2, b3, c1, c2, c3))
-    except ValueError as error:
-        raise ValueError(f"line {line}: {error}") from None
-
-
-def _glass(text: str, defined: dict[str, Glass], line: int) -> Glass | None:
-    """The glass of a name; None for what is a number."""
+def _glass(text: str, defined: dict[str, Glass]) -> Glass:
     if text in defined:
         return defined[text]
-    if not text[0].isalpha() or text.lower() in ("inf", "nan"):
-        return None
-    try:
+    if text[0].isalpha() and text.lower() not in ("inf", "nan"):
         return Glass.named(text)
-    except ValueError as error:
-        raise ValueError(f"line {line}, column index: {error}") from None
+    numbers = [_number("index", part) for part in text.split("/")]
+    if len(numbers) > 3:
+        raise ValueError(f"index: expected a number, index/V, index/V/P_gF or a glass, got {text!r}")
+    return Glass.of_numbers(*numbers)
 
 
-def _is_in_catalogue(glass: Glass) -> bool:
+def _number(name: str, text: str) -> float:
     try:
-        return Glass.named(glass.name) == glass
+        return float(text)
     except ValueError:
-        return False
+        raise ValueError(f"{name}: expected a number, got {text!r}") from None
 
 
-def _shape(words: list[str], line: int) -> list[float]:
-    """Conic constant and polynomial of a surface, from what stands behind its columns."""
-    names = ("k", *(f"A{power}" for power in _POWERS))
-    shape = dict.fromkeys(names, 0.0)
-    for word in words:
-        name, _, text = word.partition("=")
-        try:
-            if name not in names:
-                raise ValueError
-            shape[name] = float(text)
-        except ValueError:
-            raise ValueError(
-                f"line {line}: behind the columns expected stop, k=NUMBER or A2=NUMBER to A{_POWERS[-1]}=NUMBER, "
-                f"got {word!r}"
-            ) from None
-        if not math.isfinite(shape[name]):
-            raise ValueError(f"line {line}: {name} must be finite, got {text!r}")
-    return list(shape.values())
-
-
-def _number(text: str, column: str, line: int) -> tuple[float, float, float]:
-    """A field's number, and for an index its Abbe number (inf without one) and partial dispersion (NaN without one)."""
-    value, *dispersion = text.split("/")
-    try:
-        if len(dispersion) > (2 if column == "index" else 0):
-            raise ValueError
-        number = float(value)
-        abbe = float(dispersion[0]) if dispersion else math.inf
-        partial = float(dispersion[1]) if len(dispersion) == 2 else math.nan
-    except ValueError:
-        kind = "a number, index/V, index/V/P_gF or a glass" if column == "index" else "a number"
-        raise ValueError(f"line {line}, column {column}: expected {kind}, got {text!r}") from None
-    if problem := fault("abbe", abbe):
-        raise ValueError(f"line {line}, column {column}: {problem}")
-    if len(dispersion) == 2 and not 0 < partial < 1:
-        raise ValueError(f"line {line}, column {column}: P_gF must be between 0 and 1, got {partial:g}")
-    return number, abbe, partial
-
-
-def fault(column: str, value: float) -> str:
-    """What is wrong with a number of a column, or nothing."""
-    if column == "radius" and not (abs(value) == math.inf or _SMALLEST_MM <= abs(value) <= _LARGEST_MM):
-        return f"radius must be a number other than 0, {_SMALLEST_MM:g} to {_LARGEST_MM:g} mm or inf, got {value:g}"
-    if column == "thickness" and not 0 <= value <= _LARGEST_MM:
-        return f"thickness must be >= 0 and finite, at most {_LARGEST_MM:g} mm, got {value:g}"
-    if column == "index" and not 1 <= value < 5:
-        return f"index must be between 1 and 5 (0 at the stop only), got {value:g}"
-    if column == "abbe" and not value >= 1:
-        return f"the Abbe number must be positive, at least 1, got {value:g}"
-    if column == "diameter" and not _SMALLEST_MM <= value <= _LARGEST_MM:
-        return f"diameter must be positive and finite, {_SMALLEST_MM:g} to {_LARGEST_MM:g} mm, got {value:g}"
-    return ""
+def lines(surfaces: Sequence[Surface], stop: int) -> list[str]:
+    """Surfaces as lines of a prescription, the inverse of :func:`parse`."""
+    media = [AIR, *(surface.glass for surface in surfaces)]
+    own = {glass.name: glass for glass in media if len(glass.coefficients) == 6 and glass not in catalogue().values()}
+    written = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in own.items()]
+    for i, surface in enumerate(surfaces):
+        shape = zip(_SHAPE, (surface.conic, *surface.polynomial), strict=False)
+        words = [f"{name}={value:.9g}" for name, value in shape if value]
+        is_plain = not words and math.isinf(surface.radius) and media[i + 1] == media[i]
+        curve, index = ("0", "0") if i == stop and is_plain else (f"{surface.radius:.9g}", surface.glass.name)
+        words += ["stop"] * (i == stop and not is_plain)
+        written.append(" ".join([curve, f"{surface.thickness:.9g}", index, f"{surface.diameter:.9g}", *words]))
+    return written

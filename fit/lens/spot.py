@@ -16,23 +16,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from torchdof.validation import number, show
+from torchdof.validation import number, show, whole
 
 from ..result import Array
 from .lens import Lens
 from .rays import Rays, trace_rays
 
-__all__ = ["Focus", "Reference", "Spot", "focus_sensor", "point_spread", "vertex_distance_mm"]
+__all__ = ["Focus", "Reference", "Spot", "focus_sensor", "one_of", "point_spread", "vertex_distance_mm"]
 
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
 
-_PROBES = 64
-_MOST_RAYS = 10**8
+_PROBES = 64  # along each side of a box in the pupil
+_FAN = 4096
 _FARTHEST_M, _WIDEST_MM = 1e12, 1e9
 
 
@@ -69,7 +69,7 @@ class Spot:
     @property
     def rms(self) -> float:
         """Root of the mean squared distance from the centroid, in mm."""
-        return float(np.sqrt(self.weight @ (self.x**2 + self.y**2)))
+        return float(np.sqrt(self.weight @ self.r**2))
 
     @property
     def asymmetry(self) -> float:
@@ -81,15 +81,11 @@ class Spot:
         if self.meridional:
             return 0.0
         order = np.argsort(self.r)
-        ring = np.minimum((np.cumsum(self.weight[order]) * 16).astype(int), 15)
-        turn = np.exp(1j * np.arctan2(self.y, self.x))[order]
-        total = np.bincount(ring, self.weight[order], 16)
-        power = np.zeros(16)
-        for harmonic in range(1, 5):
-            wave = self.weight[order] * turn**harmonic
-            mean = (np.bincount(ring, wave.real, 16) + 1j * np.bincount(ring, wave.imag, 16)) / total
-            power += 2.0 * np.abs(mean) ** 2
-        return float(np.sqrt(power.mean()))
+        light = self.weight[order]
+        ring = np.minimum((np.cumsum(light) * 16).astype(int), 15)
+        turn = np.arctan2(self.y, self.x)[order]
+        waves = [np.bincount(ring, light * wave(n * turn), 16) for n in range(1, 5) for wave in (np.cos, np.sin)]
+        return math.sqrt(2.0 * float(np.mean(np.sum(np.square(waves), 0) / np.bincount(ring, light, 16) ** 2)))
 
 
 def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Reference = "principal") -> float:
@@ -97,10 +93,10 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
 
     Args:
         lens: The prescription; its stop counts for the best focus.
-        focus_m: Object distance in metres from the reference; ``inf`` allowed.
+        focus_m: Object distance in metres; ``inf`` allowed.
         kind: ``"paraxial"`` is where rays close to the axis meet; ``"best"`` where the spot on the axis has the least
             root mean square radius, which is where a photographer (or an autofocus) puts the sensor.
-        reference: What distances are measured from, see the module.
+        reference: What the distance is measured from, see the module.
 
     Raises:
         ValueError: If the object is too near to be focused, or an argument is not as described.
@@ -110,8 +106,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
         >>> round(focus_sensor(lens, float("inf"), kind="paraxial"), 4)
         36.1059
     """
-    if kind not in get_args(Focus):
-        raise ValueError(f"focus must be one of {', '.join(get_args(Focus))}, got {kind!r}")
+    one_of("focus", kind, get_args(Focus))
     first = lens.paraxial()
     sensor = first.back_focal
     for _ in range(100 if reference == "sensor" else 1):
@@ -147,7 +142,7 @@ def point_spread(
         rays: Number of rays aimed at the lens; the share that passes depends on the vignetting.
         wavelength_um: Wavelength in micrometres; None is the d line.
         reference: What ``z_m`` is measured from, see the module.
-        meridional: On the axis only: trace a fan that stands for its full turn. Exact, and as good with 2,000 rays.
+        meridional: On the axis only: trace a fan that stands for its full turn. As good with 2,000 rays.
 
     Raises:
         ValueError: If an argument is not as described, or no ray reaches the sensor.
@@ -158,61 +153,45 @@ def point_spread(
         >>> round(point_spread(lens, 1.0, sensor, meridional=True).radius, 4)
         0.3705
     """
-    if isinstance(rays, bool) or not isinstance(rays, int) or not 16 <= rays <= _MOST_RAYS:
-        raise ValueError(f"rays must be at least 16, got {show(rays)} (and {_MOST_RAYS} at most)")
+    whole("rays", rays, 16, 10**8)
     number("field_mm", field_mm, low=-_WIDEST_MM, high=_WIDEST_MM, unit="millimetres")
     if meridional and field_mm:
         raise ValueError(f"meridional is for points on the axis, got field_mm = {field_mm}")
-    object_mm = vertex_distance_mm(lens, z_m, reference, sensor_mm)
-    point = _object_point(lens, object_mm, sensor_mm, field_mm)
-    low, high = _pupil_box(lens, point, wavelength_um)
-    if meridional:
-        # rings of equal solid angle; of equal area for an object at infinity
-        share = (np.arange(rays) + 0.5) / rays
-        x, y = np.zeros(rays), high[1] * np.sqrt(share)
-        if math.isfinite(object_mm):
-            # 1 - cosine, without the cancellation that a far object would suffer
-            secant = math.hypot(1.0, high[1] / point.distance)
-            fall = share * (high[1] / point.distance) ** 2 / (secant * (1.0 + secant))
-            y = point.distance * np.sqrt(fall * (2.0 - fall)) / (1.0 - fall)
-    else:
-        side = max(4, round(math.sqrt(rays)))
-        steps = (np.arange(side) + 0.5) / side
-        x, y = (v.ravel() for v in np.meshgrid(*(low[i] + (high[i] - low[i]) * steps for i in (0, 1))))
-    traced, weight = _aim(lens, point, x, y, wavelength_um)
-    keep = traced.alive
-    if not keep.any():
+    source = _Source(lens, vertex_distance_mm(lens, z_m, reference, sensor_mm), sensor_mm, field_mm, wavelength_um)
+    low, high = source.pupil_box()
+    side = max(4, round(math.sqrt(rays)))
+    points = _fan(high[1], rays) if meridional else _grid(low, high, (np.arange(side) + 0.5) / side)
+    traced, weight = source.aim(points)
+    alive = traced.alive
+    if not alive.any():
         raise ValueError(f"no ray from z = {z_m} m at field {field_mm} mm passes lens {lens.name!r}")
-    hit_x, hit_y = (v[keep] for v in traced.at(lens.vertices[-1] + sensor_mm))
-    cell = float(np.prod(high - low)) / len(x)
+    hits, weight = traced.at(lens.vertices[-1] + sensor_mm)[:, alive], weight[alive] / weight[alive].sum()
     if meridional:
-        weight = np.ones_like(weight)
-        return Spot(hit_x, hit_y, weight[keep] / keep.sum(), 0.0, math.pi * float(y[keep].max()) ** 2, True)
-    weight = weight[keep] / weight[keep].sum()
-    centre = weight @ hit_x, weight @ hit_y
-    return Spot(hit_x - centre[0], hit_y - centre[1], weight, -float(centre[1]), cell * int(keep.sum()))
+        return Spot(*hits, weight, 0.0, math.pi * float(points[1, alive].max()) ** 2, True)
+    centre = hits @ weight
+    return Spot(*(hits - centre[:, None]), weight, -float(centre[1]), float(np.prod(high - low) * alive.mean()))
 
 
 def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
     """Distance of an object in front of the first vertex, in mm."""
-    if reference not in get_args(Reference):
-        raise ValueError(f"reference must be one of {', '.join(get_args(Reference))}, got {reference!r}")
+    one_of("reference", reference, get_args(Reference))
     first = lens.paraxial()
-    behind_vertex = {
-        "principal": first.front_principal,
-        "pupil": first.entrance_pupil,
-        "vertex": 0.0,
-        "sensor": float(lens.vertices[-1]) + sensor_mm,
-    }[reference]
-    object_mm = 1000.0 * z_m - behind_vertex
+    places = first.front_principal, first.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
+    behind_vertex = dict(zip(get_args(Reference), places, strict=True))[reference]
     if _FARTHEST_M < z_m < math.inf:
         raise ValueError(f"objects must be at most {_FARTHEST_M:g} m away, or at infinity, got {z_m} m")
-    if not object_mm > 0:
+    if not 1000.0 * z_m - behind_vertex > max(0.0, -first.entrance_pupil):
         raise ValueError(
             f"objects must lie in front of the lens, more than {max(behind_vertex, 0.0) / 1000:.4g} m from its "
             f"{reference}, got {z_m} m"
         )
-    return object_mm
+    return 1000.0 * z_m - behind_vertex
+
+
+def one_of(name: str, value: Any, known: tuple[str, ...]) -> None:
+    """Refuse what is none of some words."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {show(value)}")
 
 
 def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
@@ -227,10 +206,8 @@ def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
     paraxial = first.rear_principal + 1.0 / (1.0 / first.focal_length - 1.0 / distance)
     if kind == "paraxial":
         return paraxial
-    point = _object_point(lens, object_mm, paraxial, 0.0)
-    _, high = _pupil_box(lens, point, None)
-    fan = high[1] * np.sqrt((np.arange(4096) + 0.5) / 4096)
-    traced, weight = _aim(lens, point, np.zeros_like(fan), fan, None)
+    source = _Source(lens, object_mm, paraxial)
+    traced, weight = source.aim(_fan(source.pupil_box()[1][1], _FAN))
     weight = weight * traced.alive
     height = traced.at(lens.vertices[-1] + paraxial)[1]
     slope = traced.direction[1] / traced.direction[2]
@@ -241,53 +218,52 @@ def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
     return paraxial - float(weight @ (height * slope)) / steepness
 
 
-class _Point(NamedTuple):
-    """An object point: the tangent of its direction seen from H, and its distance in mm before the entrance pupil."""
-
-    tangent: float
-    distance: float
+def _fan(reach: float, rays: int) -> Array:
+    """Points ``[2, N]`` of the pupil along y, each of which stands for a ring of the same area."""
+    return np.stack([np.zeros(rays), reach * np.sqrt((np.arange(rays) + 0.5) / rays)])
 
 
-def _object_point(lens: Lens, object_mm: float, sensor_mm: float, field_mm: float) -> _Point:
-    first = lens.paraxial()
-    distance = object_mm + first.entrance_pupil
-    if distance <= 0:
-        raise ValueError(f"the object at {object_mm:.4g} mm before the lens lies behind its entrance pupil")
-    return _Point(field_mm / (sensor_mm - first.rear_principal), distance)
+def _grid(low: Array, high: Array, steps: Array) -> Array:
+    """Points ``[2, N^2]`` of a box at shares ``[N]`` of its sides."""
+    return np.stack(np.meshgrid(*(low + (high - low) * steps[:, None]).T)).reshape(2, -1)
 
 
-def _aim(lens: Lens, point: _Point, x: Array, y: Array, wavelength_um: float | None) -> tuple[Rays, Array]:
-    """Rays of an object point through points of the entrance pupil's plane, and the solid angle each stands for."""
-    first = lens.paraxial()
-    pupil = first.entrance_pupil
-    if math.isfinite(point.distance):
-        height = point.tangent * (point.distance - pupil + first.front_principal)
-        run = np.stack([x, y - height, np.full_like(x, point.distance)])
-    else:
-        run = np.stack([np.zeros_like(x), np.full_like(x, -point.tangent), np.ones_like(x)])
-    length = np.sqrt((run * run).sum(0))
-    direction = run / length
-    # start at the first vertex's plane: the pupil's plane may lie inside the lens
-    start = np.stack([x, y, np.full_like(x, pupil)]) - direction * (pupil / direction[2])
-    return trace_rays(lens, start, direction, wavelength_um), 1.0 / length**3
+class _Source:
+    """An object point that sends rays of one wavelength through a lens."""
 
+    def __init__(
+        self, lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
+    ) -> None:
+        self.lens, self.wavelength_um, first = lens, wavelength_um, lens.paraxial()
+        self.pupil = first.entrance_pupil
+        self.distance = object_mm + self.pupil  # before the entrance pupil
+        self.tangent = field_mm / (sensor_mm - first.rear_principal)  # of its direction, seen from H
+        self.slope = self.tangent * (1.0 + (first.front_principal - self.pupil) / self.distance)  # from the pupil
 
-def _pupil_box(lens: Lens, point: _Point, wavelength_um: float | None) -> tuple[Array, Array]:
-    """Box ``(low, high)`` in the entrance pupil's plane that just holds the rays that pass."""
-    first = lens.paraxial()
-    # every ray that passes goes through the first surface's clear diameter
-    reach = lens.diameter[0] / 2 + abs(first.entrance_pupil) * (abs(point.tangent) + lens.diameter[0] / point.distance)
-    low, high = np.array([-reach, -reach]), np.array([reach, reach])
-    for _ in range(8):
-        steps = np.linspace(0.0, 1.0, _PROBES + 1)
-        x, y = np.meshgrid(*(low[i] + (high[i] - low[i]) * steps for i in (0, 1)))
-        alive = _aim(lens, point, x.ravel(), y.ravel(), wavelength_um)[0].alive
-        if not alive.any():
-            raise ValueError(f"no ray of the object point passes lens {lens.name!r}; is it outside the field of view?")
-        cell = (high - low) / _PROBES
-        before = np.prod(high - low)
-        passed = np.stack([x.ravel()[alive], y.ravel()[alive]])
-        low, high = np.maximum(passed.min(1) - cell, low), np.minimum(passed.max(1) + cell, high)
-        if np.prod(high - low) > 0.95 * before:
-            break
-    return low, high
+    def aim(self, points: Array) -> tuple[Rays, Array]:
+        """Rays through points ``[2, R]`` of the entrance pupil's plane, and the solid angle that each stands for."""
+        slopes = points / self.distance - np.array([[0.0], [self.slope]])
+        run = np.concatenate([slopes, np.ones_like(slopes[:1])])
+        length = np.sqrt((run * run).sum(0))
+        # start at the first vertex's plane: the pupil's plane may lie inside the lens
+        start = np.concatenate([points - self.pupil * slopes, np.zeros_like(slopes[:1])])
+        return trace_rays(self.lens, start, run / length, self.wavelength_um), length**-3
+
+    def pupil_box(self) -> tuple[Array, Array]:
+        """Box ``(low, high)`` in the entrance pupil's plane that just holds the rays that pass."""
+        # every ray that passes goes through the first surface's clear diameter
+        front = self.lens.surfaces[0].diameter
+        reach = front / 2 + abs(self.pupil) * (abs(self.tangent) + front / self.distance)
+        low, high = np.array([-reach, -reach]), np.array([reach, reach])
+        for _ in range(8):
+            points = _grid(low, high, np.linspace(0.0, 1.0, _PROBES + 1))
+            passed = points[:, self.aim(points)[0].alive]
+            if not passed.size:
+                raise ValueError(
+                    f"no ray of the object point passes lens {self.lens.name!r}; is it in the field of view?"
+                )
+            cell, before = (high - low) / _PROBES, np.prod(high - low)
+            low, high = np.maximum(passed.min(1) - cell, low), np.minimum(passed.max(1) + cell, high)
+            if np.prod(high - low) > 0.95 * before:
+                break
+        return low, high

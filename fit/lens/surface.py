@@ -9,110 +9,113 @@ with the curvature c = 1 / radius and the conic constant k: 0 is a sphere, -1 a 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import math
+from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 
-from ..result import Array
+from torchdof.validation import show
 
-__all__ = ["Meeting", "Shape", "meet"]
+from ..result import Array, Mask
+from .glass import Glass
 
+__all__ = ["Surface"]
+
+_SMALLEST_MM, _LARGEST_MM, _MOST_CONIC, _DEEPEST_MM = 1e-3, 1e7, 1e6, 1e15  # beyond, sums of lengths overflow
 _STEPS = 50  # of Newton's method; four do for most aspheres
 _CLOSE_MM = 1e-10
 
 
-class Shape(NamedTuple):
-    """What a surface looks like.
+@dataclass(frozen=True)
+class Surface:
+    """A sphere or even asphere, and the medium behind it.
 
-    Attributes:
-        curvature: c in 1/mm, 0 for a flat surface.
-        conic: The conic constant k.
-        polynomial: ``A_2, A_4, ...`` in mm, 1/mm, ...; empty for a conic.
+    Args:
+        radius: Radius of curvature at the vertex in mm, ``inf`` for a flat surface; positive is convex to the object.
+        thickness: Distance to the next surface in mm, >= 0; that of the last one is not used.
+        glass: The medium behind it.
+        diameter: Clear diameter in mm.
+        conic: Conic constant k.
+        polynomial: ``A_2, A_4, ...`` in powers of millimetres.
+
+    Raises:
+        ValueError: If a number is outside its range; the message begins with its name.
     """
 
-    curvature: float
+    radius: float
+    thickness: float
+    glass: Glass
+    diameter: float
     conic: float = 0.0
     polynomial: tuple[float, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Refuse shapes that no lens has."""
+        if not isinstance(self.glass, Glass) or not isinstance(self.polynomial, tuple):
+            raise ValueError(f"glass must be a Glass and polynomial a tuple of numbers, got {show(self)}")
+        _check("diameter", self.diameter, _SMALLEST_MM, _LARGEST_MM)
+        _check("thickness", self.thickness, 0.0, _LARGEST_MM)
+        _check("radius", self.radius, -math.inf, math.inf)
+        if not (_SMALLEST_MM <= abs(self.radius) <= _LARGEST_MM or abs(self.radius) == math.inf):
+            raise ValueError(f"radius must be inf, or {_SMALLEST_MM:g} to {_LARGEST_MM:g} mm long, got {self.radius}")
+        _check("conic constant", self.conic, -_MOST_CONIC, _MOST_CONIC)
+        for i, coefficient in enumerate(self.polynomial):
+            most = _DEEPEST_MM / (self.diameter / 2.0) ** (2 * i + 2)  # it bends the surface's rim no farther than that
+            _check(f"A{2 * i + 2}", coefficient, -most, most)
+
+    def bent(self, factor: float) -> Surface:
+        """The surface with all lengths of its shape multiplied by a factor; -1 turns it around."""
+        polynomial = tuple(a / factor ** (2 * i + 1) for i, a in enumerate(self.polynomial))
+        return replace(self, radius=self.radius * factor, polynomial=polynomial)
+
     def sag(self, square: Array) -> tuple[Array, Array]:
         """Height z over the vertex's plane at r^2, and its derivative by r^2; NaN beyond the conic's rim."""
+        curvature = 1.0 / self.radius
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            root = np.sqrt(1.0 - (1.0 + self.conic) * self.curvature**2 * square)
-            z, slope = self.curvature * square / (1.0 + root), self.curvature / (2.0 * root)
-            power = np.ones_like(square)
+            root = np.sqrt(1.0 - (1.0 + self.conic) * curvature**2 * square)
+            z, slope = curvature * square / (1.0 + root), curvature / (2.0 * root)
             for i, coefficient in enumerate(self.polynomial):
-                slope = slope + (i + 1) * coefficient * power
-                power = power * square
-                z = z + coefficient * power
+                if coefficient:
+                    z, slope = z + coefficient * square ** (i + 1), slope + (i + 1) * coefficient * square**i
         exists = np.isfinite(z) & np.isfinite(slope)
         return np.where(exists, z, np.nan), np.where(exists, slope, np.nan)
 
+    def meet(self, position: Array, direction: Array) -> tuple[Array, Array, Mask]:
+        """Where rays meet the surface; of several places it is the one nearest to the vertex's plane.
 
-class Meeting(NamedTuple):
-    """Where rays meet a surface, relative to its vertex.
+        Rays go from points ``[3, R]``, in mm from the vertex, along unit vectors ``[3, R]`` with a positive z.
 
-    Attributes:
-        x: ``[R]`` in mm.
-        y: See x.
-        z: See x.
-        run: Length of the way there in mm; negative where the surface lies behind the start.
-        normal: Unit vectors x, y, z with a positive z; the axis for a flat surface.
-        met: False where a ray misses the surface: the other numbers mean nothing there.
-    """
+        Returns:
+            The way there in mm ``[R]``, negative where the surface lies behind; the surface's normal there ``[3, R]``,
+            unit vectors with a positive z; and whether a ray meets it at all ``[R]``: else the rest means nothing.
 
-    x: Array
-    y: Array
-    z: Array
-    run: Array
-    normal: tuple[Array | float, Array | float, Array | float]
-    met: np.ndarray[Any, np.dtype[np.bool_]]
-
-
-def meet(x: Array, y: Array, z: Array, u: Array, v: Array, w: Array, shape: Shape) -> Meeting:
-    """Where rays from x, y, z ``[R]``, in mm from the vertex, along unit vectors u, v, w meet a surface.
-
-    Of several meetings it is the one nearest to the vertex's plane.
-
-    Reference:
-        Welford, "Aberrations of Optical Systems", 1986, section 4.5 (conics), 4.6 (aspheres, by iteration).
-
-    Example:
-        >>> start = np.array([3.0]), np.array([0.0]), np.array([-5.0])
-        >>> met = meet(*start, np.array([0.0]), np.array([0.0]), np.array([1.0]), Shape(0.1, conic=-1.0))
-        >>> met.z.round(12).tolist(), met.run.round(12).tolist()
-        ([0.45], [5.45])
-    """
-    run = -z / w
-    x, y = x + run * u, y + run * v
-    z, met = np.zeros_like(x), np.ones(x.shape, dtype=bool)
-    curvature, stretch = shape.curvature, 1.0 + shape.conic
-    if curvature == 0.0 and not any(shape.polynomial):
-        return Meeting(x, y, z, run, (0.0, 0.0, 1.0), met)
-    if curvature != 0.0:
-        half = w - curvature * (x * u + y * v)
-        away = curvature * (x * x + y * y)
-        along = curvature * (u * u + v * v + stretch * w * w) if shape.conic else curvature
-        discriminant = half * half - along * away
+        Reference:
+            Welford, "Aberrations of Optical Systems", 1986, section 4.5 (conics), 4.6 (aspheres, by iteration).
+        """
+        (x, y, z), (u, v, w) = position, direction
+        run = -z / w
+        x, y, z = x + run * u, y + run * v, np.zeros_like(x)
+        curvature = 1.0 / self.radius
+        half, away = w - curvature * (x * u + y * v), curvature * (x * x + y * y)
+        discriminant = half * half - curvature * (1.0 + self.conic * w * w) * away
         met = (discriminant >= 0) & (half > 0)
-        step = away / np.where(met, half + np.sqrt(np.maximum(discriminant, 0.0)), 1.0)
-        x, y, z, run = x + step * u, y + step * v, step * w, run + step
-    if not any(shape.polynomial):
-        normal = -curvature * x, -curvature * y, 1.0 - stretch * curvature * z
-        if shape.conic:
-            length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-            normal = normal[0] / length, normal[1] / length, normal[2] / length
-        return Meeting(x, y, z, run, normal, met)
-    height, slope = shape.sag(x * x + y * y)
-    for _ in range(_STEPS):
-        off = z - height
-        met &= np.isfinite(off)
-        if not (np.abs(off[met]) > _CLOSE_MM / 10.0).any():
-            break
-        fall = w - 2.0 * slope * (x * u + y * v)
-        step = np.where(met & (fall > 0), -off / np.where(fall > 0, fall, 1.0), 0.0)
-        x, y, z, run = x + step * u, y + step * v, z + step * w, run + step
-        height, slope = shape.sag(x * x + y * y)
-    met &= np.abs(z - height) <= _CLOSE_MM  # NaN is not
-    slope = np.where(met, slope, 0.0)
-    steep = 1.0 / np.sqrt(1.0 + 4.0 * slope * slope * (x * x + y * y))
-    return Meeting(x, y, z, run, (-2.0 * slope * x * steep, -2.0 * slope * y * steep, steep), met)
+        step = np.where(met, away / np.where(met, half + np.sqrt(np.maximum(discriminant, 0.0)), 1.0), 0.0)
+        for _ in range(_STEPS):
+            x, y, z, run = x + step * u, y + step * v, z + step * w, run + step
+            height, slope = self.sag(x * x + y * y)
+            off = z - height
+            met &= np.isfinite(off)
+            if not (np.abs(off[met]) > _CLOSE_MM / 10.0).any():
+                break
+            fall = w - 2.0 * slope * (x * u + y * v)
+            step = np.where(met & (fall > 0), -off / np.where(fall > 0, fall, 1.0), 0.0)
+        met &= np.abs(off) <= _CLOSE_MM  # NaN is not
+        slope = np.where(met, slope, 0.0)
+        normal = np.stack([-2.0 * slope * x, -2.0 * slope * y, np.ones_like(x)])
+        return run, normal / np.sqrt((normal * normal).sum(0)), met
+
+
+def _check(name: str, value: float, low: float, high: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, Real) or not low <= value <= high:
+        raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {show(value)}")

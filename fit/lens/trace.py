@@ -6,7 +6,8 @@ import datetime
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, get_args
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from ..solve import one_thread
 from .field import coc_nodes, trace_field
 from .lens import Lens
 from .nodes import Tracer, fit_radial, fit_shapes, place_nodes
-from .spot import Focus, Reference, Spot, focus_sensor, point_spread
+from .spot import Focus, Reference, Spot, focus_sensor, one_of, point_spread
 
 __all__ = ["signed_coc_mm", "trace_table"]
 
@@ -70,7 +71,7 @@ def trace_table(
             the same.
         field_mm: Image height in mm; off the axis the table holds the rotational average of the spot about its
             centroid, and ``provenance["asymmetry"]`` how far it was from round.
-        wavelengths_um: One wavelength a channel, such as :data:`torchdof.fit.lens.RGB_UM`, for a lens whose
+        wavelengths_um: One wavelength a channel, such as :data:`torchdof.fit.lens.lens.RGB_UM`, for a lens whose
             prescription has Abbe numbers; None traces the d line for all channels.
         sensor_width_mm: Width of the sensor.
         width_px: Width of the images the fit is made for: details far below their pixels do not count.
@@ -94,19 +95,8 @@ def trace_table(
         >>> trace_table(lens, f_number=4.0, focus_m=2.0, nodes=5, points=9, rays=200)
         BlurTable('double_gauss_50mm_f4', radial, 5 nodes)
     """
-    _check(lens, family, nodes, points, focus, reference, wavelengths_um, rays, name)
-    if not isinstance(focus_m, float) or focus_m != math.inf:
-        number("focus_m", focus_m, unit="metres")
-        if focus_m > 1e9:
-            raise ValueError(f"focus_m must be at most 1e9 metres, or inf, got {show(focus_m)}")
-    number("field_mm", field_mm, -1e6, 1e6)
-    if nodes is not None and nodes < (5 if math.isfinite(focus_m) else 3):
-        raise ValueError(f"nodes must be at least 5 (3 for a focus at infinity), got {nodes}")
-    _check_field(field, field_mm, field_nodes, field_rays)
-    number("sensor_width_mm", sensor_width_mm, 0, 1e9)
-    number("width_px", width_px, 0, 1e9, unit="pixels")
-    if wavelengths_um is not None and not lens.dispersive:
-        raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
+    given = dict(locals())
+    _check(given)
     stopped = lens.with_f_number(f_number)
     focal = lens.paraxial().focal_length
     sensor = focus_sensor(stopped, focus_m, focus, reference)
@@ -114,120 +104,93 @@ def trace_table(
         nearest_m = focus_m / 3.0 if math.isfinite(focus_m) else 0.025 * focal
     if not 0 < number("nearest_m", nearest_m, unit="metres") < focus_m:
         raise ValueError(f"nearest_m must be nearer than the focus at {focus_m} m, got {nearest_m}")
-    count = rays or (50_000 if field_mm else 2_000)
-    call = (
-        f"Lens.read({lens.name!r}), f_number={f_number!r}, focus_m={focus_m!r}, nearest_m={nearest_m!r}, "
-        f"nodes={nodes}, family={family!r}, points={points}, focus={focus!r}, reference={reference!r}, "
-        f"field_mm={field_mm:g}, wavelengths_um={wavelengths_um}, sensor_width_mm={sensor_width_mm:g}, "
-        f"width_px={width_px}, rays={count}"
-    )
+    if rays is None:
+        rays = 50_000 if field_mm else 2_000
+    near, far = (signed_coc_mm(z, focal, f_number, focus_m) for z in (nearest_m, math.inf))
 
     def distance(coc: float) -> float:
-        dioptres = 1.0 / focus_m - coc / _coc_per_dioptre(focal, f_number, focus_m)
+        dioptres = 1.0 / focus_m - coc / near * (1.0 / focus_m - 1.0 / nearest_m)
         return 1.0 / dioptres if dioptres > 1e-9 else math.inf
 
-    def spot(wavelength_um: float | None, coc: float) -> Spot:
-        return point_spread(
-            stopped,
-            distance(coc),
-            sensor,
-            field_mm=field_mm,
-            rays=count,
-            wavelength_um=wavelength_um,
-            reference=reference,
-            meridional=field_mm == 0.0,
-        )
+    options: dict[str, Any] = {"field_mm": field_mm, "rays": rays, "reference": reference, "meridional": not field_mm}
 
-    near, far = (signed_coc_mm(z, focal, f_number, focus_m) for z in (nearest_m, math.inf))
-    pixel = sensor_width_mm / width_px
+    def spot(coc: float, wavelength_um: float | None) -> Spot:
+        return point_spread(stopped, distance(coc), sensor, wavelength_um=wavelength_um, **options)
+
     with one_thread():
-        tracer = Tracer(partial(spot, None), points, pixel)
-        places = place_nodes(tracer, near, far, nodes)
-        fitted = []
-        for wavelength in wavelengths_um or (None,):
-            if wavelength is not None:
-                tracer = Tracer(partial(spot, wavelength), points, pixel)
-            fitted.append(fit_radial(tracer, places) if family == "radial" else fit_shapes(tracer, places, family))
+        first, *others = (
+            Tracer(partial(spot, wavelength_um=wavelength), points, sensor_width_mm / width_px)
+            for wavelength in (None, *(wavelengths_um or ()))
+        )
+        places = place_nodes(first, near, far, nodes)
+        channels = others or [first]
+        fitted = [fit_radial(t, places) if family == "radial" else fit_shapes(t, places, family) for t in channels]
         across = None
         if field is not None:
             blurs = coc_nodes(near, far, field_nodes)
             across = trace_field(stopped, sensor, distance, blurs, field, wavelengths_um, field_rays, reference)
-            call += f", field={tuple(field)}, field_nodes={field_nodes}, field_rays={field_rays}"
-    params = {key: [_rounded(channel[0][key]) for channel in fitted] for key in FAMILIES[family]}
-    residual = np.sqrt(np.mean([channel[1] ** 2 for channel in fitted], axis=0))
+    del given["lens"]
+    call = ", ".join(f"{key}={value!r}" for key, value in {**given, "nearest_m": nearest_m, "rays": rays}.items())
     provenance = {
         "lens": lens.name,
         "source": lens.source,
         "prescription": "; ".join(lens.lines()),
         "focal_length_mm": round(focal, 4),
-        "f_number": f_number,
         "f_number_paraxial": round(stopped.paraxial().f_number, 4),
+        **{key: given[key] for key in ("f_number", "focus", "reference", "field_mm")},
         "focus_m": focus_m if math.isfinite(focus_m) else "inf",
         "nearest_m": round(nearest_m, 6),
-        "focus": focus,
-        "reference": reference,
-        "field_mm": field_mm,
         "wavelengths_um": list(wavelengths_um or ()) or "d line",
-        "asymmetry": [round(tracer.spot(coc).asymmetry, 4) for coc in places] if field_mm else 0.0,
+        "asymmetry": [round(channels[-1].spot(coc).asymmetry, 4) for coc in places] if field_mm else 0.0,
         "fitted_for": f"{width_px} px on {sensor_width_mm:g} mm; geometric spots, no diffraction",
         "date": datetime.date.today().isoformat(),
-        "command": f"torchdof.fit.trace_table({call})",
+        "command": f"torchdof.fit.trace_table(Lens.read({lens.name!r}), {call})",
     }
     return BlurTable(
         family,
         _rounded(np.array(places), 9),
-        params,
+        {key: [_rounded(params[key]) for params, _ in fitted] for key in FAMILIES[family]},
         unit="mm",
         sensor_width_mm=sensor_width_mm,
         name=f"{lens.name}_f{f_number:g}" if name is None else name,
         provenance=provenance,
-        residual=_rounded(residual),
+        residual=_rounded(np.sqrt(np.mean([residual**2 for _, residual in fitted], axis=0))),
         field=across,
     )
 
 
-def _check(
-    lens: Any, family: Any, nodes: Any, points: Any, focus: Any, reference: Any, wavelengths: Any, rays: Any, name: Any
-) -> None:
+def _check(given: dict[str, Any]) -> None:
     """Refuse arguments of :func:`trace_table` that make no sense, by name."""
+    lens, focus_m, wavelengths, field = (given[key] for key in ("lens", "focus_m", "wavelengths_um", "field"))
     if not isinstance(lens, Lens):
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
-    for what, value, known in (
-        ("family", family, tuple(FAMILIES)),
-        ("focus", focus, get_args(Focus)),
-        ("reference", reference, get_args(Reference)),
-    ):
-        if not isinstance(value, str) or value not in known:
-            raise ValueError(f"{what} must be one of {', '.join(known)}, got {show(value)}")
-    if isinstance(points, bool) or not isinstance(points, int) or not 3 <= points <= 1000:
-        raise ValueError(f"points must be at least 3, got {show(points)} (and 1000 at most)")
-    if nodes is not None:
-        whole("nodes", nodes, 3, 1000)
-    if rays is not None:
-        if isinstance(rays, bool) or not isinstance(rays, int) or not 16 <= rays <= 10**7:
-            raise ValueError(f"rays must be at least 16 (and 10 million at most), got {show(rays)}")
-    if name is not None and not isinstance(name, str):
-        raise ValueError(f"name must be a text, got {show(name)}")
-    if wavelengths is None:
-        return
-    if not isinstance(wavelengths, list | tuple) or not wavelengths:
-        raise ValueError(f"wavelengths_um must be a list of wavelengths in micrometres, got {show(wavelengths)}")
-    for value in wavelengths:
-        number("wavelengths_um", value, 0.299, 1.201, unit="micrometres")
-
-
-def _check_field(field: Any, field_mm: float, nodes: Any, rays: Any) -> None:
-    """Refuse distances across the field that make no sense."""
-    whole("field_nodes", nodes, 2, 100)
-    whole("field_rays", rays, 1000, 10**7)
-    if field is None:
-        return
-    if field_mm:
-        raise ValueError(f"field_mm averages one place, field traces several: give one of them, got {field_mm} mm too")
-    if not isinstance(field, list | tuple) or len(field) < 2 or field[0] != 0:
-        raise ValueError(f"field must be distances in mm from the middle of the frame, from 0 on, got {show(field)}")
-    for low, high in zip(field, field[1:], strict=False):
-        if not number("field", high, 0, 1e6, unit="mm") > low:
+    one_of("family", given["family"], tuple(FAMILIES))
+    number("focus_m", focus_m, 0, unit="metres", infinite=True)
+    number("field_mm", given["field_mm"], -1e6, 1e6)
+    number("sensor_width_mm", given["sensor_width_mm"], 0, 1e9)
+    number("width_px", given["width_px"], 0, 1e9, unit="pixels")
+    if given["nodes"] is not None:
+        whole("nodes", given["nodes"], 5 if math.isfinite(focus_m) else 3, 1000)
+    whole("points", given["points"], 3, 1000)
+    whole("field_nodes", given["field_nodes"], 2, 100)
+    whole("field_rays", given["field_rays"], 1000, 10**7)
+    if given["name"] is not None and not isinstance(given["name"], str):
+        raise ValueError(f"name must be a text, got {show(given['name'])}")
+    if wavelengths is not None:
+        if not isinstance(wavelengths, list | tuple) or not wavelengths:
+            raise ValueError(f"wavelengths_um must be a list of wavelengths in micrometres, got {show(wavelengths)}")
+        for value in wavelengths:
+            lens.indices(number("wavelengths_um", value, unit="micrometres"))
+        if not lens.dispersive:
+            raise ValueError(f"wavelengths_um need a lens with Abbe numbers (index/V); {lens.name!r} has none")
+    if field is not None:
+        if given["field_mm"]:
+            raise ValueError("field_mm averages one place, field traces several: give one of them")
+        if not isinstance(field, list | tuple) or len(field) < 2 or field[0] != 0:
+            raise ValueError(
+                f"field must be distances in mm from the middle of the frame, from 0 on, got {show(field)}"
+            )
+        if not all(low < number("field", high, 0, 1e6, unit="mm") for low, high in pairwise(field)):
             raise ValueError(f"field must be increasing distances in mm, got {show(field)}")
 
 
@@ -238,13 +201,8 @@ def signed_coc_mm(z_m: float, focal_length_mm: float, f_number: float, focus_m: 
         >>> round(signed_coc_mm(1.0, 50.3582, 2.03015, 2.0), 4)
         -0.3204
     """
-    return _coc_per_dioptre(focal_length_mm, f_number, focus_m) * (1.0 / focus_m - 1.0 / z_m)
-
-
-def _coc_per_dioptre(focal: float, f_number: float, focus_m: float) -> float:
-    if not focus_m > focal / 1000.0:
-        raise ValueError(f"focus_m must be longer than the focal length ({focal / 1000:.4g} m), got {focus_m}")
-    return focal / (2.0 * f_number) * focal / 1000.0 / (1.0 - focal / 1000.0 / focus_m)
+    aperture_mm, focal_m = focal_length_mm / f_number, focal_length_mm / 1000.0
+    return aperture_mm / 2.0 * focal_m / (1.0 - focal_m / focus_m) * (1.0 / focus_m - 1.0 / z_m)
 
 
 def _rounded(values: Array, digits: int = 6) -> Any:

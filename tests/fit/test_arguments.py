@@ -29,6 +29,7 @@ from torchdof.fit import (
     trace_table,
 )
 from torchdof.fit.lens.lens import Lens
+from torchdof.fit.lens.surface import Surface
 
 pytestmark = pytest.mark.hard
 
@@ -93,10 +94,11 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
          "focus": "best", "reference": "principal", "field_mm": 0.0, "wavelengths_um": None, "sensor_width_mm": 36.0,
          "width_px": 100, "rays": 100},
     ),
-    "Lens": (
-        Lens,
-        {"radius": [30.0, -30.0], "thickness": [5.0, 0.0], "index": [1.5, 1.0], "abbe": [math.inf] * 2,
-         "diameter": [10.0, 10.0], "stop": 0},
+    "Lens": (Lens, {"surfaces": LENS.surfaces, "stop": 0}),
+    "Surface": (
+        Surface,
+        {"radius": 30.0, "thickness": 5.0, "glass": LENS.surfaces[0].glass, "diameter": 10.0, "conic": 0.0,
+         "polynomial": ()},
     ),
     "Lens.with_f_number": (LENS.with_f_number, {"f_number": 4.0}),
     "Lens.scaled": (LENS.scaled, {"focal_length_mm": 35.0}),

@@ -229,13 +229,15 @@ def _zmx_seeds(folder: Path) -> None:
     for name, encoding in (("double_gauss_50mm", "utf-16"), ("telephoto_250mm", "utf-8")):
         lens = Lens.read(name)
         text = "MODE SEQ\nNAME A lens\nUNIT MM X W X CM MR CPMM\nSURF 0\n  CURV 0\n  DISZ INFINITY\n"
-        for i, (radius, thickness, diameter) in enumerate(zip(lens.radius, lens.thickness, lens.diameter, strict=True)):
+        for i, surface in enumerate(lens.surfaces):
+            index = surface.glass.index()
             text += f"SURF {i + 1}\n  TYPE {'EVENASPH' if i == 1 else 'STANDARD'}\n" + "  STOP\n" * (i == lens.stop)
-            text += f"  CURV {1 / radius:.6g} 0 0\n  DISZ {thickness:.6g}\n  DIAM {diameter / 2:.6g} 1 0 0 1\n"
+            text += f"  CURV {1 / surface.radius:.6g} 0 0\n  DISZ {surface.thickness:.6g}\n"
+            text += f"  DIAM {surface.diameter / 2:.6g} 1 0 0 1\n"
             text += "  PARM 1 0\n  PARM 2 -1.5e-8\n  CONI -0.1\n" if i == 1 else ""
             glass = "N-BK7" if i == 1 else "___BLANK"
-            text += f"  GLAS {glass} 1 0 {lens.index[i]:.6g} 50 0\n" if lens.index[i] > 1 else ""
-        text += f"SURF {len(lens.radius) + 1}\n  TYPE STANDARD\n  CURV 0\n  DISZ 0\n"
+            text += f"  GLAS {glass} 1 0 {index:.6g} 50 0\n" if index > 1 else ""
+        text += f"SURF {len(lens.surfaces) + 1}\n  TYPE STANDARD\n  CURV 0\n  DISZ 0\n"
         (folder / f"{name}.zmx").write_text(text, encoding=encoding)
 
 

@@ -117,7 +117,7 @@ def test_wavelengths_that_are_none_are_refused(wavelength: Any) -> None:
 @pytest.mark.parametrize("words", ["A2=1e308", "A2=1e300 A4=-1e300", "k=1e300", "A16=1e308"])
 def test_surfaces_beyond_any_lens_are_refused_without_a_warning(words: str, tmp_path: Path) -> None:
     (tmp_path / "lens.txt").write_text(SINGLET.format(words, 15))
-    with pytest.raises(ValueError, match="lens.txt: surface 0: (A16|A2|the conic constant) must"):
+    with pytest.raises(ValueError, match="lens.txt: line 1: (A16|A2|conic constant) must"):
         Lens.read(tmp_path / "lens.txt")
 
 
@@ -133,7 +133,7 @@ def test_a_stack_of_lenses_that_bends_light_beyond_measure_is_refused_without_a_
         ({"z_m": 1e300}, "at most 1e\\+12 m away"),
         ({"field_mm": 1e300}, "field_mm"),
         ({"field_mm": math.nan}, "field_mm"),
-        ({"rays": 10**12}, "rays must be at least 16, got 1000000000000"),
+        ({"rays": 10**12}, "rays must be a whole number from 16 to 100000000, got 1000000000000"),
         ({"rays": 16.5}, "rays must be"),
     ],
 )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from torchdof.fit.lens.glass import catalogue
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.rays import trace_rays
 from torchdof.fit.lens.spot import focus_sensor, point_spread
@@ -39,21 +40,18 @@ DEPTHS = (2.5, 2.0, 1.5, 1.2, 1.0, 0.7, 0.4, 0.0)  # in dioptres of the focus
 def their_lens(lens: Lens, sensor_mm: float, wavelength_um: float = 0.58756) -> Any:
     """Glasses of the catalogue by name are theirs; of other media they get our index."""
     materials = importlib.import_module("optiland.materials")
-    media = [
-        materials.IdealMaterial(n=n) if glass is None else materials.Material(glass.name, "schott")
-        for n, glass in zip(lens.indices(wavelength_um)[1:], lens.glass or (), strict=True)
-    ]
     optic = importlib.import_module("optiland.optic").Optic()
     optic.surfaces.add(index=0, radius=np.inf, thickness=10.0)
-    gaps = [*lens.thickness[:-1], sensor_mm]
-    for i, (radius, gap, medium) in enumerate(zip(lens.radius, gaps, media, strict=True)):
-        shape = lens.shape(i)
-        asphere = {"surface_type": "even_asphere", "coefficients": shape.polynomial} if any(shape.polynomial) else {}
+    last = len(lens.surfaces) - 1
+    for i, one in enumerate(lens.surfaces):
+        n, name = one.glass.index(wavelength_um), one.glass.name
+        medium = materials.Material(name, "schott") if name in catalogue() else materials.IdealMaterial(n=n)
+        asphere = {"surface_type": "even_asphere", "coefficients": one.polynomial} if one.polynomial else {}
         optic.surfaces.add(
-            index=i + 1, radius=radius, thickness=gap, material=medium, is_stop=i == lens.stop, conic=shape.conic,
-            **asphere,
+            index=i + 1, radius=one.radius, thickness=sensor_mm if i == last else one.thickness, material=medium,
+            is_stop=i == lens.stop, conic=one.conic, **asphere,
         )  # fmt: skip
-    optic.surfaces.add(index=len(gaps) + 1)
+    optic.surfaces.add(index=last + 2)
     optic.set_aperture(aperture_type="EPD", value=lens.paraxial().entrance_pupil_diameter)
     optic.fields.set_type("angle")
     optic.fields.add(y=0)
@@ -111,7 +109,7 @@ def test_largest_blur_radius_of_the_double_gauss_agrees() -> None:
     optic = their_lens(lens, sensor)
     rays = their_rays(start, direction)
     optic.surfaces.trace(rays, skip=1)
-    passes = np.abs(np.asarray(optic.surfaces.surfaces[lens.stop + 1].y)) <= lens.diameter[lens.stop] / 2
+    passes = np.abs(np.asarray(optic.surfaces.surfaces[lens.stop + 1].y)) <= lens.surfaces[lens.stop].diameter / 2
     theirs = float(np.abs(np.asarray(rays.y))[passes].max())
     print(f"largest blur radius: {ours:.5f} mm, optiland {theirs:.5f} mm")
     assert ours == pytest.approx(theirs, abs=5e-5)
@@ -130,8 +128,8 @@ def their_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) -> fl
     optic, rays = their_lens(lens, sensor, wavelength_um), their_rays(start, direction, wavelength_um)
     optic.surfaces.trace(rays, skip=1)
     passes = np.isfinite(np.asarray(rays.y))
-    for i, diameter in enumerate(lens.diameter):
-        passes &= np.abs(np.asarray(optic.surfaces.surfaces[i + 1].y)) <= diameter / 2
+    for i, surface in enumerate(lens.surfaces):
+        passes &= np.abs(np.asarray(optic.surfaces.surfaces[i + 1].y)) <= surface.diameter / 2
     return float(np.sqrt(np.mean(np.asarray(rays.y)[passes] ** 2)))
 
 

@@ -3,16 +3,25 @@ import math
 import numpy as np
 import pytest
 
+from torchdof.fit.lens.glass import Glass
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.rays import trace_rays
+from torchdof.fit.lens.surface import Surface
 
 LENSES = ("double_gauss_50mm", "wide_22mm", "telephoto_250mm")
+ALONG = np.array([[0.0], [0.0], [1.0]])
 
 
-def surfaces(radius: list[float], thickness: list[float], index: list[float], diameter: float = 1e3) -> Lens:
-    count = len(radius)
-    full = np.full(count, diameter)
-    return Lens(np.array(radius), np.array(thickness), np.array(index), np.full(count, math.inf), full, stop=0)
+def surfaces(*rows: tuple[float, float, float], conic: float = 0.0, polynomial: tuple[float, ...] = ()) -> Lens:
+    """A lens of radius, thickness and index, the stop in front; the last surface may be an asphere."""
+    shapes = [(0.0, ())] * (len(rows) - 1) + [(conic, polynomial)]
+    made = [Surface(r, t, Glass.of_numbers(n), 1e3, *shape) for (r, t, n), shape in zip(rows, shapes, strict=True)]
+    return Lens(tuple(made), stop=0)
+
+
+def shaped(radius: float, index: float, conic: float = 0.0, polynomial: tuple[float, ...] = ()) -> Lens:
+    """Glass behind a flat front that ends in a surface."""
+    return surfaces((math.inf, 30.0, index), (radius, 0.0, 1.0), conic=conic, polynomial=polynomial)
 
 
 def beam(count: int = 500, reach: float = 5.0, tilt: float = 0.1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -23,171 +32,136 @@ def beam(count: int = 500, reach: float = 5.0, tilt: float = 0.1, seed: int = 0)
     return np.stack([x, y, np.full(count, -1.0)]), direction / np.linalg.norm(direction, axis=0)
 
 
-def test_snell_holds_at_a_surface() -> None:
+def heights(*height: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Rays along the axis."""
+    y = np.array(height)
+    return np.stack([x * y, y, np.full(len(y), -1.0)]), np.repeat(ALONG, len(y), 1)
+
+
+@pytest.mark.parametrize(
+    ("radius", "conic", "polynomial"), [(30.0, 0.0, ()), (-30.0, 0.0, ()), (-30.0, -0.7, (0.0, 2e-5, -1e-7))]
+)
+def test_rays_meet_the_surface_and_snell_holds_there(radius, conic, polynomial):
+    lens = shaped(radius, 1.6, conic, polynomial)
+    position, direction = beam()
+    rays = trace_rays(lens, position, direction)
+    at, surface = rays.position - 30.0 * ALONG, lens.surfaces[1]
+    if not polynomial:
+        np.testing.assert_allclose(np.linalg.norm(at - radius * ALONG, axis=0), abs(radius))
+    square, step = at[0] ** 2 + at[1] ** 2, 1e-4
+    height, slope = surface.sag(square)
+    np.testing.assert_allclose(at[2], height, atol=1e-10)
+    numeric = (surface.sag(square + step)[0] - surface.sag(square - step)[0]) / 2 / step
+    np.testing.assert_allclose(slope, numeric, atol=1e-8)  # the slope is the sag's own
+    normal = np.stack([-2 * slope * at[0], -2 * slope * at[1], np.ones_like(slope)])
+    u, v = direction[:2] / 1.6  # behind the flat front
+    inside = np.stack([u, v, np.sqrt(1 - u * u - v * v)])
     # the tangential part of index x direction does not change; directions stay unit vectors
-    for radius in (30.0, -30.0):
-        lens = surfaces([math.inf, radius, math.inf], [1.0, 4.0, 0.0], [1.0, 1.6, 1.0])
-        position, direction = beam()
-        front = surfaces([math.inf, radius], [1.0, 0.0], [1.0, 1.0])
-        at = trace_rays(front, position, direction).position  # on the sphere, not refracted
-        normal = (at - np.array([[0.0], [0.0], [1.0 + radius]])) / radius
-        before = 1.0 * np.cross(direction, normal, axis=0)
-        inside = trace_rays(lens, position, direction)  # leaves through a plane: x and y of n * direction are kept
-        u, v = inside.direction[:2] / 1.6
-        behind = np.stack([u, v, np.sqrt(1 - u * u - v * v)])
-        after = 1.6 * np.cross(behind, normal, axis=0)
-        np.testing.assert_allclose(after, before, atol=1e-12)
-        np.testing.assert_allclose(np.linalg.norm(inside.direction, axis=0), 1.0, atol=1e-13)
-        np.testing.assert_allclose(np.linalg.norm(at - np.array([[0.0], [0.0], [1.0 + radius]]), axis=0), 30.0)
+    change = np.cross(1.6 * inside - rays.direction, normal, axis=0)
+    assert rays.alive.sum() > 400
+    np.testing.assert_allclose(change[:, rays.alive], 0.0, atol=1e-10)
+    np.testing.assert_allclose(np.linalg.norm(rays.direction, axis=0)[rays.alive], 1.0, atol=1e-12)
 
 
-def test_light_path_is_reversible() -> None:
-    for name in LENSES:
-        lens = Lens.read(name)
-        index = lens.indices()
-        back = Lens(
-            -lens.radius[::-1],
-            np.append(lens.thickness[:-1][::-1], 0.0),
-            np.append(index[1:-1][::-1], 1.0),
-            lens.abbe,
-            lens.diameter[::-1],
-            len(lens.radius) - 1 - lens.stop,
-        )
-        position, direction = beam(reach=2.0, tilt=0.05)
-        rays = trace_rays(lens, position, direction)
-        assert rays.alive.any()
-        length = lens.vertices[-1]
-        mirror = np.array([[1.0], [1.0], [-1.0]])
-        start = rays.position * mirror + np.array([[0.0], [0.0], [length]])
-        home = trace_rays(back, start, -rays.direction * mirror)
-        keep = rays.alive
-        np.testing.assert_allclose((-home.direction * mirror)[:, keep], direction[:, keep], atol=1e-12)
-        x, y = (v[keep] for v in home.at(length + 1.0))
-        np.testing.assert_allclose(np.stack([x, y]), position[:2, keep], atol=1e-10)
+@pytest.mark.parametrize("name", LENSES)
+def test_light_path_is_reversible(name):
+    lens = Lens.read(name)
+    position, direction = beam(reach=2.0, tilt=0.05)
+    rays = trace_rays(lens, position, direction)
+    assert rays.alive.any()
+    length, mirror, keep = lens.vertices[-1], np.array([[1.0], [1.0], [-1.0]]), rays.alive
+    home = trace_rays(lens.turned(), rays.position * mirror + length * ALONG, -rays.direction * mirror)
+    np.testing.assert_allclose((-home.direction * mirror)[:, keep], direction[:, keep], atol=1e-12)
+    np.testing.assert_allclose(home.at(length + 1.0)[:, keep], position[:2, keep], atol=1e-10)
 
 
-def test_sphere_images_its_aplanatic_point_without_aberration() -> None:
+def test_sphere_images_its_aplanatic_point_without_aberration():
     # Weierstrass: rays that head for R (1 + n) behind the vertex of a glass sphere meet at R (1 + 1 / n) inside it
     radius, n = 20.0, 1.5
-    angle = np.linspace(0.05, 0.6, 40)
+    angle = np.linspace(0.05, 0.58, 40)  # at 0.588 they meet its equator
     aim = radius * (1 + n)
     direction = np.stack([np.zeros_like(angle), -np.sin(angle), np.cos(angle)])
-    position = np.array([[0.0], [0.0], [aim]]) - direction * (aim + 5.0) / direction[2]
+    position = aim * ALONG - direction * (aim + 5.0) / direction[2]
     # the sphere around the image point receives rays along its radii: they leave unrefracted
     centre, small = radius * (1 + 1 / n), 8.0
-    ball = surfaces([radius, small], [centre - small, 0.0], [n, 1.0])
-    rays = trace_rays(ball, position, direction)
-    x, y = rays.at(centre)
+    rays = trace_rays(surfaces((radius, centre - small, n), (small, 0.0, 1.0)), position, direction)
     assert rays.alive.all()
-    np.testing.assert_allclose(np.hypot(x, y), 0.0, atol=1e-10)
+    np.testing.assert_allclose(rays.at(centre), 0.0, atol=1e-10)
 
 
-def test_rays_near_the_axis_follow_the_paraxial_matrix() -> None:
-    for name in LENSES:
-        lens = Lens.read(name)
-        height, angle = 1e-4, 2e-5
-        start = np.array([[0.0], [height], [0.0]])
-        direction = np.array([[0.0], [math.sin(angle)], [math.cos(angle)]])
-        rays = trace_rays(lens, start, direction)
-        expected = lens.matrix(0, len(lens.radius)) @ np.array([height, angle])
-        found = rays.at(lens.vertices[-1])[1][0], rays.direction[1, 0] / rays.direction[2, 0]
-        np.testing.assert_allclose(found, expected, rtol=1e-7)
+@pytest.mark.parametrize("name", LENSES)
+def test_rays_near_the_axis_follow_first_order_optics(name):
+    lens, height = Lens.read(name), 1e-4
+    first = lens.paraxial()
+    rays = trace_rays(lens, *heights(height))
+    assert rays.at(lens.vertices[-1] + first.back_focal)[1, 0] == pytest.approx(0.0, abs=1e-7 * height)
+    assert rays.direction[1, 0] == pytest.approx(-height / first.focal_length, rel=1e-7)
+    # through the middle of the entrance pupil, out through that of the exit pupil
+    direction = np.array([[0.0], [2e-5], [1.0]]) / math.hypot(2e-5, 1.0)
+    rays = trace_rays(lens, first.entrance_pupil * ALONG - 100.0 * direction, direction, clip=False)
+    exit_pupil = lens.vertices[-1] - lens.turned().paraxial().entrance_pupil
+    assert rays.at(exit_pupil)[1, 0] == pytest.approx(0.0, abs=1e-10)
 
 
-def test_totally_reflected_rays_end() -> None:
-    prism = surfaces([math.inf, -20.0], [30.0, 0.0], [1.5, 1.0])
-    height = np.array([0.0, 13.0, 13.4, 15.0])  # the critical angle on a sphere of 20 is at 20 / 1.5 = 13.33
-    position = np.stack([np.zeros(4), height, np.full(4, -1.0)])
-    rays = trace_rays(prism, position, np.tile([[0.0], [0.0], [1.0]], 4))
-    assert rays.alive.tolist() == [True, True, False, False]
-
-
-def test_rays_that_miss_or_are_clipped_end_without_warnings() -> None:
-    lens = surfaces([math.inf, 10.0, math.inf], [1.0, 5.0, 0.0], [1.0, 1.5, 1.0])
-    height = np.array([5.0, 9.99, 10.01, 1e6])
-    position = np.stack([np.zeros(4), height, np.full(4, -1.0)])
-    forward = np.tile([[0.0], [0.0], [1.0]], 4)
-    assert trace_rays(lens, position, forward).alive.tolist() == [True, False, False, False]
-    air = surfaces([math.inf, 10.0], [1.0, 0.0], [1.0, 1.0])  # a sphere without glass can only be missed
-    assert trace_rays(air, position, forward).alive.tolist() == [True, True, False, False]
-    small = lens.with_stop(8.0)
-    assert trace_rays(small, position, forward).alive.tolist() == [False] * 4
-    assert trace_rays(small, position, forward, clip=False).alive[0]
-
-
-def shaped(radius: float, index: float, conic: float = 0.0, polynomial: tuple[float, ...] = ()) -> Lens:
-    """A surface of glass behind a wide stop, and a sphere of glass that ends behind it where light has its focus."""
-    wide = np.full(2, 1e3)
-    return Lens(
-        np.array([math.inf, radius]), np.array([30.0, 0.0]), np.array([index, 1.0]), np.full(2, math.inf), wide, stop=0,
-        conic=np.array([0.0, conic]), polynomial=np.array([[0.0] * len(polynomial), polynomial]),
-    )  # fmt: skip
-
-
-def test_hyperboloid_focuses_a_beam_in_one_point() -> None:
+def test_hyperboloid_focuses_a_beam_in_one_point():
     # Descartes: glass ends in a hyperboloid of conic constant -n^2; the focus lies at R / (1 - n), for any height
     n, radius = 1.5, -20.0
-    height = np.linspace(-15.0, 15.0, 31)
-    position = np.stack([0.3 * height, height, np.full_like(height, -3.0)])
-    forward = np.tile([[0.0], [0.0], [1.0]], 31)
-    rays = trace_rays(shaped(radius, n, -n * n), position, forward)
+    rays = trace_rays(shaped(radius, n, -n * n), *heights(*np.linspace(-15.0, 15.0, 31), x=0.3))
     assert rays.alive.all()
     np.testing.assert_allclose(rays.at(30.0 + radius / (1 - n)), 0.0, atol=1e-10)
     assert np.abs(rays.at(29.0 + radius / (1 - n))[1]).max() > 0.1
 
 
-def test_polynomial_asphere_is_the_conic_whose_series_it_is() -> None:
+def test_polynomial_asphere_is_the_conic_whose_series_it_is():
     # sag of a sphere: c r^2 / 2 + c^3 r^4 / 8 + c^5 r^6 / 16 + 5 c^7 r^8 / 128 + 7 c^9 r^10 / 256 + ...
     c = -1 / 60.0
     series = tuple(factor * c**power for factor, power in ((1 / 2, 1), (1 / 8, 3), (1 / 16, 5), (5 / 128, 7)))
-    position, direction = beam(reach=5.0, tilt=0.2)
-    made = trace_rays(shaped(math.inf, 1.5, 0.0, series), position, direction)
-    sphere = trace_rays(shaped(-60.0, 1.5), position, direction)
+    made, sphere = (
+        trace_rays(lens, *beam(tilt=0.2)) for lens in (shaped(math.inf, 1.5, 0.0, series), shaped(-60.0, 1.5))
+    )
     assert made.alive.all()
     np.testing.assert_allclose(made.position, sphere.position, atol=1e-7)
     np.testing.assert_allclose(made.direction, sphere.direction, atol=1e-8)
 
 
-def test_snell_holds_at_an_asphere() -> None:
-    lens = shaped(-30.0, 1.6, -0.7, (0.0, 2e-5, -1e-7))
-    position, direction = beam()
-    rays = trace_rays(lens, position, direction)
-    at, shape = rays.position - np.array([[0.0], [0.0], [30.0]]), lens.shape(1)
-    height, slope = shape.sag(at[0] ** 2 + at[1] ** 2)
-    np.testing.assert_allclose(at[2], height, atol=1e-10)
-    step = 1e-4  # the slope is the sag's own
-    np.testing.assert_allclose(
-        slope, (shape.sag(at[0] ** 2 + at[1] ** 2 + step)[0] - shape.sag(at[0] ** 2 + at[1] ** 2 - step)[0]) / 2 / step,
-        atol=1e-8,
-    )  # fmt: skip
-    normal = np.stack([-2 * slope * at[0], -2 * slope * at[1], np.ones_like(slope)])
-    u, v = direction[:2] / 1.6  # behind the flat front
-    inside = np.stack([u, v, np.sqrt(1 - u * u - v * v)])
-    change = np.cross(1.6 * inside - rays.direction, normal, axis=0)
-    np.testing.assert_allclose(change[:, rays.alive], 0.0, atol=1e-10)
-    np.testing.assert_allclose(np.linalg.norm(rays.direction, axis=0)[rays.alive], 1.0, atol=1e-12)
+WALL = surfaces((math.inf, 1.0, 1.0), (10.0, 5.0, 1.5), (math.inf, 0.0, 1.0))
 
 
-def test_rays_beyond_the_rim_of_a_conic_end() -> None:
-    height = np.array([5.0, 9.9, 10.1, 40.0, 1e6])
-    position = np.stack([np.zeros(5), height, np.full(5, -1.0)])
-    forward = np.tile([[0.0], [0.0], [1.0]], 5)
-    for conic, polynomial in ((0.0, (0.0, 1e-7)), (0.0, ())):
-        lens = shaped(-10.0, 1.0, conic, polynomial)
-        assert trace_rays(lens, position, forward).alive.tolist() == [True, True, False, False, False]
+@pytest.mark.parametrize(
+    ("lens", "height", "alive"),
+    [
+        # the critical angle on a sphere of 20 is at 20 / 1.5 = 13.33
+        (surfaces((math.inf, 30.0, 1.5), (-20.0, 0.0, 1.0)), (0.0, 13.0, 13.4, 15.0), (1, 1, 0, 0)),
+        (WALL, (5.0, 9.99, 10.01, 1e6), (1, 0, 0, 0)),  # totally reflected behind the sphere, or beside it
+        (surfaces((math.inf, 1.0, 1.0), (10.0, 0.0, 1.0)), (5.0, 9.99, 10.01, 1e6), (1, 1, 0, 0)),
+        (WALL.with_stop(8.0), (3.9, 4.1, 9.99, 1e6), (1, 0, 0, 0)),
+        (shaped(-10.0, 1.0), (5.0, 9.9, 10.1, 40.0, 1e6), (1, 1, 0, 0, 0)),
+        (shaped(-10.0, 1.0, 0.0, (0.0, 1e-7)), (5.0, 9.9, 10.1, 40.0, 1e6), (1, 1, 0, 0, 0)),
+        # surfaces that cross at a height of 6 mm: beyond, there is no glass between them
+        (
+            surfaces((math.inf, 1.0, 1.0), (20.0, 2 * (20.0 - math.sqrt(400.0 - 36.0)), 1.5), (-20.0, 0.0, 1.0)),
+            (0.0, 5.9, 6.1, 8.0),
+            (1, 1, 0, 0),
+        ),
+    ],
+    ids=["reflected", "missed", "missed in air", "stopped", "beyond a sphere", "beyond an asphere", "out of order"],
+)
+def test_rays_that_do_not_pass_end_without_warnings(lens, height, alive):
+    assert trace_rays(lens, *heights(*height)).alive.tolist() == [bool(one) for one in alive]
 
 
-def test_rays_that_meet_surfaces_out_of_order_end() -> None:
-    # a lens whose surfaces cross at a height of 6 mm: beyond, there is no glass between them
-    lens = surfaces([math.inf, 20.0, -20.0], [1.0, 2 * (20.0 - math.sqrt(400.0 - 36.0)), 0.0], [1.0, 1.5, 1.0])
-    height = np.array([0.0, 5.9, 6.1, 8.0])
-    position = np.stack([np.zeros(4), height, np.full(4, -1.0)])
-    rays = trace_rays(lens, position, np.tile([[0.0], [0.0], [1.0]], 4))
-    assert rays.alive.tolist() == [True, True, False, False]
+def test_rays_are_not_clipped_where_that_is_asked_for_and_many_are_as_few():
+    position, direction = heights(*np.linspace(0.0, 12.0, 40_000))
+    small = WALL.with_stop(8.0)
+    assert trace_rays(small, position[:, 20_000:20_001], direction[:, :1], clip=False).alive[0]
+    few = [trace_rays(small, position[:, one : one + 100], direction[:, :100]) for one in (0, 16_300, 39_900)]
+    many = trace_rays(small, position, direction)
+    for start, rays in zip((0, 16_300, 39_900), few, strict=True):
+        for found, wanted in zip(many, rays, strict=True):
+            np.testing.assert_array_equal(found[..., start : start + 100], wanted)
 
 
-def test_wrong_shapes_are_refused() -> None:
-    lens = Lens.read("wide_22mm")
-    for position, direction in ((np.zeros(3), np.zeros(3)), (np.zeros((3, 2)), np.zeros((3, 1)))):
-        with pytest.raises(ValueError, match=r"position and direction must both be \[3, R\]"):
-            trace_rays(lens, position, direction)
+@pytest.mark.parametrize("shapes", [((3,), (3,)), ((3, 2), (3, 1)), ((2, 5), (2, 5))])
+def test_wrong_shapes_are_refused(shapes):
+    with pytest.raises(ValueError, match=r"position and direction must both be \[3, R\]"):
+        trace_rays(WALL, *map(np.zeros, shapes))
