@@ -10,11 +10,8 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
-from ..bench import scaling, speed
-from ..bench.accuracy import compare_with_truth
-from ..bench.degraded import compare_degraded
-from ..bench.inputs import BenchScene, shipped
-from ..bench.report import existing_folder
+from ..bench import accuracy, speed
+from ..bench.measurement import BenchScene, shipped
 from .arguments import (
     DEPTH,
     ApertureImage,
@@ -65,9 +62,9 @@ def bench(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png."),
+        typer.Option("--out", "-o", help="Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png; is made."),
     ] = None,
-    repeat: Annotated[int, typer.Option(help="Timed renderings of each setting.", min=1)] = 5,
+    repeat: Annotated[int, typer.Option(help="Cameras that each setting is timed with.", min=1)] = 5,
     focus_m: FocusMOrMedian = None,
     focus_at: FocusAt = None,
     focus_range: FocusRange = None,
@@ -139,7 +136,7 @@ def bench(
     peer: Annotated[
         list[Path] | None,
         typer.Option(
-            help="With --degrade, a Python file with another renderer, blur(image, coc_px); may be repeated.",
+            help="A Python file with another renderer, blur(image, coc_px); may be repeated.",
             rich_help_panel=_ACCURACY,
         ),
     ] = None,
@@ -147,25 +144,25 @@ def bench(
 ) -> None:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
-    Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU; with --onnx also an
-    exported file, with --compile also torch.compile, with --scan also how cost grows with blur and frame:
+    Each tolerance against the exact rendering, on the CPU: time of pictures by cameras that were not rendered before,
+    and of the same again; memory; RMS error, PSNR and SSIM. Also a focus pull and fresh processes; with --onnx an
+    exported file, with --compile torch.compile, with --scan how cost grows with blur and frame:
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
     Camera, depth and blur are told as to torchdof render.
 
-    torchdof and simpler renderers against scenes whose depth of field is known:
+    torchdof and simpler renderers against scenes whose depth of field is known, beside GEGL:
 
-        torchdof bench --truth scenes --out results
+        torchdof bench --truth scenes --peer examples/benchmarks/tools/gegl.py --out results
 
-    The same with depth as bad as real depth is, and with GEGL on the same maps:
+    The same with depth as bad as real depth is:
 
-        torchdof bench --truth scenes --degrade --peer examples/benchmarks/tools/gegl.py --out results
+        torchdof bench --truth scenes --degrade --out results
 
     The picture that --truth alone writes shows, for each scene, the place where torchdof is farthest from the truth:
-    sharp, truth, each renderer with its error below it, four times enlarged.
+    sharp, truth, each renderer.
     """
-    existing_folder(out)
     how = settings_of(locals())
     if truth is not None:
         if image is not None or onnx or compiled or scan:
@@ -180,14 +177,10 @@ def bench(
             raise ValueError("--truth writes its numbers as CSV to the folder --out; leave --json out")
         if out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
-        if not degrade and peer:
-            raise ValueError("--peer goes with --degrade")
         if degrade and views:
             raise ValueError("--degrade compares without the reference; leave --views out")
-        if degrade:
-            compare_degraded(truth, out, peer or [])
-        else:
-            compare_with_truth(truth, out, views)
+        out.mkdir(parents=True, exist_ok=True)
+        accuracy.compare(truth, out, [] if degrade else views or [256], degrade, peer or [])
         return
     if views or degrade or peer:
         raise ValueError("--views, --degrade and --peer compare with a truth; name its folder with --truth")
@@ -210,19 +203,13 @@ def bench(
         runtimes.append("onnxruntime")
     if compiled:
         runtimes.append("compiled")
-    rows, unit = speed.measure_all(scene, repeat, console, runtimes)
-    scan_costs = scaling.measure_scans(scene, repeat, unit, console) if scan else []
-    scans = [scaling.table_of(scan_costs)] if scan_costs else []
-    if as_json:
-        facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table), "unit_s": unit}
-        costs = {"settings": [dataclasses.asdict(row) for row in rows]}
-        typer.echo(json_line({**facts, **costs, "scans": [dataclasses.asdict(cost) for cost in scan_costs]}))
-    else:
-        speed.show(rows, scene, unit)
-        for of_scan in scans:
-            of_scan.show()
     if out is not None:
-        speed.write(out, rows, scene, unit, repeat, scans)
+        out.mkdir(parents=True, exist_ok=True)
+    rows = speed.compare(scene, repeat, console, runtimes, scan)
+    if as_json:
+        facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table)}
+        typer.echo(json_line({**facts, "settings": rows}))
+    speed.report(rows, scene, out, quiet=as_json)
 
 
 def from_files(image: Path, depth: Path | None, how: RenderSettings) -> BenchScene:
