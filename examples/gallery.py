@@ -137,8 +137,23 @@ def draw_bokeh(path: Path) -> None:
 
 
 def draw_field(path: Path) -> None:
-    """A street at night through a lens that is traced across the field, as ``examples/benchmarks`` draws it."""
-    subprocess.run([sys.executable, ROOT / "examples/benchmarks/across_field.py", "--picture", path], check=True)
+    """The left half of a street at night, through the middle of a traced lens all over and through all its field."""
+    from torchdof.fit import trace_table
+    from torchdof.fit.lens import Lens
+    from torchdof.fit.lens.lens import RGB_UM
+
+    street = runpy.run_path(str(ROOT / "examples/bokeh.py"))["street"]
+    lens = Lens.read("double_gauss_50mm").with_f_number(2.0)
+    camera = torchdof.Camera(lens.paraxial().focal_length, f_number=2.0, focus_m=2.0, sensor_width_mm=36.0)
+    field_mm = (0.0, 2.7, 5.4, 8.1, 10.9, 13.7, 16.5, 19.8, 21.6)
+    across = {"wavelengths_um": RGB_UM, "field": field_mm, "field_nodes": 8, "field_rays": 30_000}
+    table = trace_table(lens, 2.0, 2.0, nodes=9, **across)
+    image, depth = street(640, 960)
+    shown = {}
+    for name, spots in {"as in the middle of the frame": None, "traced across the field": table.field}.items():
+        picture = torchdof.DepthOfField(camera, table.replace(field=spots), depth_edges="as given")(image, depth)
+        shown[name] = picture[..., 40:400, :480].clamp(0.0, 1.0)
+    write_sheet(path, shown)
 
 
 def draw_lights(path: Path, tables: dict[str, torchdof.BlurTable]) -> None:

@@ -11,10 +11,10 @@ import torch
 
 import torchdof.render
 from torchdof import DepthOfField
-from torchdof.bench.accuracy import ikoma
 from torchdof.optics import placed_kernels
 from torchdof.optics.kernel_cache import KernelCache
 from torchdof.reference import metrics
+from torchdof.reference.ikoma import ikoma
 from torchdof.reference.scenes import Scene, read_scenes
 from torchdof.render import downsampling, plan
 

@@ -1,6 +1,6 @@
+"""Accuracy against the truth, with exact depth and with worse, beside other tools."""
+
 import csv
-import dataclasses
-import math
 import shutil
 from pathlib import Path
 
@@ -12,10 +12,11 @@ from torchdof.bench import accuracy
 from torchdof.cli.main import app
 from torchdof.io.images import read_image
 from torchdof.reference import metrics
+from torchdof.reference.ikoma import ikoma
 from torchdof.reference.scenes import Plane, Scene, camera_of, plane_scene, posts, read_scenes, waves
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
-CAMERA = camera_of(200.0, 96, aperture_radius_m=0.04, focus_m=2.0)
+TOY = "NAME = 'toy'\ndef blur(image, coc_px):\n    return image, 2.5\n"
 
 
 def run(*arguments: object) -> Result:
@@ -26,62 +27,80 @@ def test_ikoma_renders_two_planes_focused_on_the_near_one() -> None:
     planes = [Plane(2.0, waves(1, (0.6, 0.3, 0.2)), posts(40, 15)), Plane(6.0, waves(2))]
     camera = camera_of(200.0, 96, aperture_radius_m=0.1, focus_m=2.0)
     scene = plane_scene(planes, camera, (60, 96), samples=512)
-    out = metrics.display(accuracy.ikoma(scene))
+    out = metrics.display(ikoma(scene))
     assert metrics.psnr(metrics.display(scene.image), metrics.display(scene.truth), scene.inner) < 32
     assert metrics.psnr(out, metrics.display(scene.truth), scene.inner) > 36
 
 
 def test_ikoma_leaves_a_scene_in_focus_alone() -> None:
     image, depth = torch.rand(1, 3, 20, 30), torch.full((1, 1, 20, 30), 2.0)
-    out = accuracy.ikoma(Scene("flat", image, depth, CAMERA, image))
+    out = ikoma(Scene("flat", image, depth, camera_of(200.0, 96, aperture_radius_m=0.04, focus_m=2.0), image))
     torch.testing.assert_close(out, image, rtol=1e-6, atol=1e-6)
 
 
-def test_a_score_tells_the_inner_frame_apart() -> None:
-    truth = torch.full((1, 3, 40, 50), 0.5)
-    image = truth.clone()
-    image[..., :3, :] = 0.9
-    known = truth[:, :1] == 0.5
-    known[..., :2, :] = False
-    scene = Scene("flat", truth, truth[:, :1], CAMERA, truth, margin_px=3)
-    score = accuracy.score("a", image, scene, known)
-    assert score.psnr_inner == math.inf and score.psnr_known > score.psnr_display > 20
-    wider = dataclasses.replace(scene, margin_px=2)
-    assert accuracy.score("a", image, wider).psnr_inner < 40 and math.isnan(
-        accuracy.score("a", image, wider).psnr_known
-    )
-    nothing_left = dataclasses.replace(scene, margin_px=20)
-    assert math.isnan(accuracy.score("a", image, nothing_left).psnr_inner)
-
-
-def test_bench_writes_a_table_and_a_picture(tmp_path: Path) -> None:
-    scenes, out = tmp_path / "scenes", tmp_path / "out"
+def test_bench_scores_renderers_peers_and_references_and_draws_the_worst_places(tmp_path: Path) -> None:
+    scenes, out, peer = tmp_path / "scenes", tmp_path / "out", tmp_path / "peer.py"
     shutil.copytree(DATA / "room", scenes / "room")
-    out.mkdir()
-    result = run("--truth", scenes, "--out", out, "--views", 128, "--views", 4)
+    peer.write_text(TOY)
+    result = run("--truth", scenes, "--out", out, "--views", 128, "--views", 4, "--peer", peer)
     assert result.exit_code == 0, result.output
     assert sorted(p.name for p in out.iterdir()) == ["accuracy.csv", "accuracy.md", "accuracy.png"]
     with (out / "accuracy.csv").open() as file:
         rows = {row["renderer"]: row for row in csv.DictReader(file)}
-    assert list(rows) == [*accuracy.renderers(), "reference 4", "reference 128"]
+    names = [*accuracy.renderers(degraded=False), "toy", "reference 4", "reference 128"]
+    assert list(rows) == names
     scene = next(read_scenes(scenes))
-    assert float(rows["reference 128"]["psnr_known"]) > float(rows["reference 4"]["psnr_known"]) + 3
-    score = accuracy.score("untouched", scene.image, scene)
-    assert float(rows["untouched"]["psnr_display"]) == pytest.approx(score.psnr_display, rel=1e-5)
-    assert float(rows["torchdof"]["psnr_display"]) > float(rows["untouched"]["psnr_display"]) + 10
-    assert f"| room/1 | {score.psnr_display:.2f} |" in (out / "accuracy.md").read_text()
-    assert read_image(out / "accuracy.png").pixels.shape == (1, 3, 2 * 128, 9 * 128)
+    shown, truth = metrics.display(scene.image), metrics.display(scene.truth)
+    for name, mask in (("psnr_db", None), ("psnr_inner", scene.inner)):
+        assert float(rows["untouched"][name]) == pytest.approx(metrics.psnr(shown, truth, mask), rel=1e-5)
+    assert float(rows["torchdof"]["psnr_db"]) > float(rows["untouched"]["psnr_db"]) + 10
+    assert float(rows["reference 128"]["psnr_db"]) > float(rows["reference 4"]["psnr_db"])
+    assert rows["toy"]["psnr_db"] == rows["untouched"]["psnr_db"] and float(rows["toy"]["new_ms"]) == 2500.0
+    text = (out / "accuracy.md").read_text()
+    assert text.count("| toy |") == 2 and all(name in result.output for name in names)
+    assert read_image(out / "accuracy.png").pixels.shape[-1] == (len(names) + 2) * (128 + 8) + 8
+
+
+def test_the_worst_place_is_where_the_error_is() -> None:
+    (scene,) = read_scenes(DATA / "planes")
+    picture = scene.truth.clone()
+    picture[..., 25:29, 31:35] += 0.1
+    window = accuracy._worst(picture, scene, 4)
+    assert torch.equal(picture[window], picture[..., 25:29, 31:35])
+
+
+def test_every_kind_of_depth_is_scored_with_every_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accuracy, "KINDS", {kind: accuracy.KINDS[kind] for kind in ("exact", "near -1px")})
+    peer = tmp_path / "peer.py"
+    peer.write_text(TOY)
+    accuracy.compare(DATA / "planes", tmp_path, [], True, [peer])
+    rows = list(csv.DictReader((tmp_path / "degraded.csv").read_text().splitlines()))
+    value = {(row["depth"], row["renderer"]): float(row["psnr_db"]) for row in rows}
+    assert len(value) == len(rows) == 2 * 4
+    assert value["exact", "torchdof"] == pytest.approx(value["exact", "as given"], abs=0.05)
+    assert value["near -1px", "torchdof"] > value["near -1px", "as given"] + 0.3
+    assert value["exact", "toy"] == value["near -1px", "toy"]
+    assert "| near -1px | torchdof |" in (tmp_path / "degraded.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", "has no function blur"),
+        ("def blur(image, coc_px): ...\ndef available(): return 'apt install it'", "cannot run here; apt install it"),
+    ],
+)
+def test_a_peer_that_cannot_run_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    peer = tmp_path / "peer.py"
+    peer.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        accuracy.read_peer(peer)
+    result = run("--truth", DATA, "--out", tmp_path, "--peer", tmp_path / "none.py")
+    assert result.exit_code == 2 and "No such file or directory" in result.output
 
 
 def test_bench_without_scenes_writes_nothing(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
     result = run("--truth", tmp_path, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "no scene here" in result.output
     assert not list((tmp_path / "out").iterdir())
-
-
-def test_bench_asks_for_its_folder_before_it_renders(tmp_path: Path) -> None:
-    result = run("--truth", DATA, "--out", tmp_path / "missing")
-    assert result.exit_code == 2
-    assert "no such folder" in result.output

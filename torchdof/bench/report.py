@@ -1,15 +1,16 @@
-"""What every benchmark writes: the machine it ran on, paragraphs and tables to read, and the numbers as CSV."""
+"""What every benchmark prints and writes: the machine it ran on, tables to read, and the numbers as CSV."""
 
 import contextlib
 import csv
-import dataclasses
 import importlib.metadata
 import io
+import math
 import os
 import platform
-from collections.abc import Callable, Collection, Iterable, Sequence
+import statistics
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -17,112 +18,94 @@ from rich.console import Console
 from ..io.atomic import whole_file
 from ..io.columns import print_columns
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+__all__ = ["LEGEND", "Row", "publish", "summary"]
 
-__all__ = ["Report", "ReportTable", "csv_of", "existing_folder", "machine"]
+Row = Mapping[str, Any]
+"""A line of a table: values by the names of its columns."""
+
+LEGEND = (
+    "new_ms, spread_ms: median and interquartile range of the clock over pictures by cameras that were not rendered "
+    "before; cpu_ms: their processor time over all threads; again_ms: the same camera a second time; beside_ms: a "
+    "reference run beside each, unless it is named a depthwise 17 x 17 convolution of 1 x 16 x 540 x 960; over_again, "
+    "over_beside: ratios of processor times; peak_mb: growth of resident memory. Errors are as displayed (clipped to "
+    "[0, 1], sRGB curve): rms_255 of 255, psnr_db, ssim."
+)
 
 
-def existing_folder(out: Path | None) -> Path | None:
-    """The folder for a report, or None for none.
+def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float]], float]) -> list[Row]:
+    """A row for each combination of what stands under the keys: means of columns of fractions, but for their NaN.
+
+    Example:
+        >>> rows = [{"a": "x", "new_ms": v, "spread_ms": 0.0} for v in (4.0, 1.0, 2.0, 3.0, 20.0)]
+        >>> summary(rows, ["a"], statistics.median)
+        [{'a': 'x', 'new_ms': 3.0, 'spread_ms': 2.0}]
+    """
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    found = []
+    for of, group in groups.items():
+        measured = [name for name, value in group[0].items() if isinstance(value, float) and name not in keys]
+        values = {name: [row[name] for row in group if not math.isnan(row[name])] for name in measured}
+        means = {name: mean(value) if value else math.nan for name, value in values.items()}
+        if len(values["new_ms"]) > 1:
+            low, _, high = statistics.quantiles(values["new_ms"], n=4, method="inclusive")
+            means["spread_ms"] = high - low
+        found.append(dict(zip(keys, of, strict=True)) | means)
+    return found
+
+
+def publish(
+    title: str,
+    tables: Mapping[str, Sequence[Row]],
+    remarks: Sequence[str],
+    stem: Path | None,
+    picture: Callable[[Path], object] | None = None,
+    quiet: bool = False,
+) -> None:
+    """Prints the first table and the remarks; writes ``stem.md``, ``.csv`` of the last table and ``.png``: all or none.
+
+    Args:
+        title: Above everything.
+        tables: Rows by what stands above them, all of a table with the same columns.
+        remarks: Paragraphs, which hardware, threads, versions and :data:`LEGEND` precede.
+        stem: Folder and name of the files; None writes none.
+        picture: Writes a picture to a path; None: there is none.
+        quiet: Print nothing.
 
     Raises:
-        FileNotFoundError: If it is not there.
+        OSError: If a file cannot be written.
     """
-    if out is not None and not out.is_dir():
-        raise FileNotFoundError(f"{out}: there is no such folder; make it first")
-    return out
-
-
-def machine(threads: str = "") -> str:
-    """Hardware, threads and versions; ``threads`` says more of the threads than their number."""
-    threads = threads or f"{torch.get_num_threads()} threads"
-    return (
-        f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {threads}; "
+    machine = (
+        f"{platform.processor() or platform.machine()}, {os.cpu_count()} CPUs, {torch.get_num_threads()} threads; "
         f"torchdof {importlib.metadata.version('torchdof')}, torch {torch.__version__}, "
-        f"Python {platform.python_version()}, {platform.system()}"
+        f"Python {platform.python_version()}, {platform.system()}."
     )
+    console = Console(quiet=quiet)
+    text = [f"# {title}", machine, LEGEND, *remarks]
+    for number, (name, rows) in enumerate(tables.items()):
+        head, body = list(rows[0]), [[_cell(value) for value in row.values()] for row in rows]
+        if number == 0:
+            words = [column for column, value in rows[0].items() if isinstance(value, str)]
+            print_columns(console, name, dict(zip(head, zip(*body, strict=True), strict=True)), words)
+        lines = ["| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)]
+        text.append(f"## {name}\n\n" + "\n".join(lines))
+    console.print(*text[1 : 3 + len(remarks)], sep="\n", markup=False, highlight=False)
+    if stem is None:
+        return
+    numbers = io.StringIO()
+    writer = csv.DictWriter(numbers, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows)
+    with contextlib.ExitStack() as files:
+        if picture is not None:
+            picture(files.enter_context(whole_file(stem.with_suffix(".png"))))
+        for suffix, content in ((".csv", numbers.getvalue()), (".md", "\n\n".join(text) + "\n")):
+            files.enter_context(whole_file(stem.with_suffix(suffix))).write_text(content, encoding="utf-8")
 
 
-def csv_of(rows: Iterable["DataclassInstance"]) -> str:
-    """A line for each row, below the names of their fields."""
-    text, head = io.StringIO(), None
-    writer = csv.writer(text, lineterminator="\n")
-    for row in rows:
-        if head is None:
-            head = [field.name for field in dataclasses.fields(row)]
-            writer.writerow(head)
-        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in dataclasses.astuple(row)])
-    return text.getvalue()
-
-
-@dataclasses.dataclass(frozen=True)
-class ReportTable:
-    """One table of a report.
-
-    Args:
-        title: Above it.
-        lines: Its columns, and a line for each further row.
-        words: Columns of words, which are aligned to the left; the others hold numbers.
-        remark: A paragraph between title and table, where it is written.
-    """
-
-    title: str
-    lines: Sequence[Sequence[str]]
-    words: Collection[str] = ("",)
-    remark: str = ""
-
-    def markdown(self) -> str:
-        """The table below its title.
-
-        Example:
-            >>> print(ReportTable("Title", [["a", "b"], ["1", "2"]]).markdown())
-            ## Title
-            <BLANKLINE>
-            | a | b |
-            | --- | --- |
-            | 1 | 2 |
-        """
-        head, *body = self.lines
-        rows = "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *body))
-        return "\n\n".join([f"## {self.title}", *([self.remark] * bool(self.remark)), rows])
-
-    def show(self) -> None:
-        """Prints it."""
-        columns = {name: cells for name, *cells in zip(*self.lines, strict=True)}
-        print_columns(Console(), self.title, columns, self.words)
-
-
-@dataclasses.dataclass(frozen=True)
-class Report:
-    """What a benchmark writes: paragraphs and tables to read, and the same numbers to compute with.
-
-    Args:
-        name: Of its files, without suffix.
-        title: Above everything.
-        parts: Paragraphs and tables, in order.
-        csv: The numbers.
-    """
-
-    name: str
-    title: str
-    parts: Sequence[str | ReportTable]
-    csv: str
-
-    def markdown(self) -> str:
-        """Title, paragraphs and tables."""
-        texts = [part if isinstance(part, str) else part.markdown() for part in self.parts]
-        return "\n\n".join([f"# {self.title}", *texts]) + "\n"
-
-    def write(self, folder: Path, picture: Callable[[Path], object] | None = None) -> None:
-        """Writes ``name.csv`` and ``name.md``, and ``name.png`` where there is a picture: all of them or none.
-
-        Raises:
-            OSError: If a file cannot be written.
-        """
-        with contextlib.ExitStack() as files:
-            if picture is not None:
-                picture(files.enter_context(whole_file(folder / f"{self.name}.png")))
-            for suffix, text in (("csv", self.csv), ("md", self.markdown())):
-                part = files.enter_context(whole_file(folder / f"{self.name}.{suffix}"))
-                part.write_text(text, encoding="utf-8")
+def _cell(value: object) -> str:
+    """Numbers to four digits, NaN as nothing."""
+    if isinstance(value, float):
+        return "" if value != value else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return {True: "yes", False: "NO"}[value] if isinstance(value, bool) else str(value)

@@ -14,7 +14,7 @@ from .options import Blur, Scene, json_option
 from .printed import WarnOnce, json_line
 
 if TYPE_CHECKING:
-    from ..bench.inputs import BenchScene
+    from ..bench.measurement import BenchScene
 
 __all__ = ["Bench"]
 
@@ -23,7 +23,7 @@ __all__ = ["Bench"]
 class _Speed:
     """Speed."""
 
-    repeat: int = option("Timed renderings of each setting.", 5, least=1, basic=True)
+    repeat: int = option("Cameras that each setting is timed with.", 5, least=1, basic=True)
     onnx: bool = option("Also export and time the file in onnxruntime; takes minutes.", False)
     compiled: bool = option("Also time torch.compile; takes minutes.", False, names=("--compile",))
     scan: bool = option("Also show how cost grows with radius and frame size.", False)
@@ -42,32 +42,31 @@ class _Accuracy:
     degrade: bool = option(
         "Instead, what depth costs that is soft, displaced, too coarse or noisy; writes degraded.csv and .md.", False
     )
-    peer: tuple[Path, ...] = option(
-        "With --degrade, a Python file with another renderer, blur(image, coc_px); may be repeated.", ()
-    )
+    peer: tuple[Path, ...] = option("A Python file with another renderer, blur(image, coc_px); may be repeated.", ())
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
     """Measure speed against error on your own scene, or accuracy where the truth is known.
 
-    Each tolerance against the exact rendering: time, memory, RMS error, PSNR and SSIM, on the CPU; with --onnx also an
-    exported file, with --compile also torch.compile, with --scan also how cost grows with blur and frame:
+    Each tolerance against the exact rendering, on the CPU: time of pictures by cameras that were not rendered before,
+    and of the same again; memory; RMS error, PSNR and SSIM. Also a focus pull and fresh processes; with --onnx an
+    exported file, with --compile torch.compile, with --scan how cost grows with blur and frame:
 
         torchdof bench photo.png depth.exr --f-number 1.8 --out results
 
     Camera, depth and blur are told as to torchdof render; without a focus it is at the median depth.
 
-    torchdof and simpler renderers against scenes whose depth of field is known:
+    torchdof and simpler renderers against scenes whose depth of field is known, beside GEGL:
 
-        torchdof bench --truth scenes --out results
+        torchdof bench --truth scenes --peer examples/benchmarks/tools/gegl.py --out results
 
-    The same with depth as bad as real depth is, and with GEGL on the same maps:
+    The same with depth as bad as real depth is:
 
-        torchdof bench --truth scenes --degrade --peer examples/benchmarks/tools/gegl.py --out results
+        torchdof bench --truth scenes --degrade --out results
 
     The picture that --truth alone writes shows, for each scene, the place where torchdof is farthest from the truth:
-    sharp, truth, each renderer with its error below it, four times enlarged.
+    sharp, truth, each renderer.
     """
 
     image: Path | None = argument(
@@ -75,7 +74,7 @@ class Bench:
     )
     depth: Path | None = argument("Its depth; not needed if IMAGE has a Z channel.", "[DEPTH]", None)
     out: Path | None = option(
-        "Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png.", names=("--out", "-o")
+        "Folder for speed.csv, .md and .png, or accuracy.csv, .md and .png; is made.", names=("--out", "-o")
     )
     scene: Scene
     blur: Blur
@@ -85,8 +84,6 @@ class Bench:
 
     def run(self) -> None:
         """Measures, prints and writes."""
-        if self.out is not None and not self.out.is_dir():
-            raise FileNotFoundError(f"{self.out}: there is no such folder; make it first")
         if self.accuracy.truth is not None:
             self._compare_with_truth(self.accuracy.truth)
             return
@@ -119,24 +116,20 @@ class Bench:
             raise ValueError("--truth writes its numbers as CSV to the folder --out; leave --json out")
         if self.out is None:
             raise ValueError("--truth writes tables and pictures; give a folder with --out")
-        if not self.accuracy.degrade and self.accuracy.peer:
-            raise ValueError("--peer goes with --degrade")
         if self.accuracy.degrade and self.accuracy.views:
             raise ValueError("--degrade compares without the reference; leave --views out")
-        from ..bench.accuracy import compare_with_truth
-        from ..bench.degraded import compare_degraded
+        from ..bench import accuracy
 
-        if self.accuracy.degrade:
-            compare_degraded(truth, self.out, list(self.accuracy.peer))
-        else:
-            compare_with_truth(truth, self.out, list(self.accuracy.views) or None)
+        self.out.mkdir(parents=True, exist_ok=True)
+        views = [] if self.accuracy.degrade else list(self.accuracy.views) or [256]
+        accuracy.compare(truth, self.out, views, self.accuracy.degrade, list(self.accuracy.peer))
 
     def _measure_speed(self) -> None:
         """Speed against error on the user's scene, or the one that is built in."""
         from rich.console import Console
 
-        from ..bench import scaling, speed
-        from ..bench.inputs import shipped
+        from ..bench import speed
+        from ..bench.measurement import shipped
 
         table, console = self.blur.table_of(self.blur.table), Console(stderr=True)
         if (self.speed.onnx or self.speed.compiled) and table.depends_on_place:
@@ -144,23 +137,17 @@ class Bench:
         scene = dataclasses.replace(shipped() if self.image is None else self._read(self.image), table=table)
         chosen: dict[speed.Runtime, bool] = {"onnxruntime": self.speed.onnx, "compiled": self.speed.compiled}
         runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
-        rows, unit = speed.measure_all(scene, self.speed.repeat, console, runtimes)
-        scan_costs = scaling.measure_scans(scene, self.speed.repeat, unit, console) if self.speed.scan else []
-        scans = [scaling.table_of(scan_costs)] if scan_costs else []
-        if self.as_json:
-            facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table), "unit_s": unit}
-            costs = {"settings": [dataclasses.asdict(row) for row in rows]}
-            click.echo(json_line({**facts, **costs, "scans": [dataclasses.asdict(cost) for cost in scan_costs]}))
-        else:
-            speed.show(rows, scene, unit)
-            for of_scan in scans:
-                of_scan.show()
         if self.out is not None:
-            speed.write(self.out, rows, scene, unit, self.speed.repeat, scans)
+            self.out.mkdir(parents=True, exist_ok=True)
+        rows = speed.compare(scene, self.speed.repeat, console, runtimes, self.speed.scan)
+        if self.as_json:
+            facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table)}
+            click.echo(json_line({**facts, "settings": rows}))
+        speed.report(rows, scene, self.out, quiet=self.as_json)
 
     def _read(self, image: Path) -> "BenchScene":
         """The user's image and its blur, without alpha."""
-        from ..bench.inputs import BenchScene
+        from ..bench.measurement import BenchScene
         from .frame import coc_of, read_frame
 
         frame = read_frame(image, self.depth, self.scene)

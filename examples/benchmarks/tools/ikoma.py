@@ -6,7 +6,7 @@ Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics
 import torch
 from torch import Tensor
 
-from torchdof.bench.accuracy import layered_fft
+from torchdof.reference.ikoma import layered_fft
 
 NAME = "Ikoma, FFT"
 NOTE = "float32; a layer each 0.75 px of circle of confusion, exact discs. Time: the whole call."

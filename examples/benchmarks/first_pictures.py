@@ -1,0 +1,226 @@
+"""What first pictures cost: by new cameras, in fresh processes, as commands and in sequences.
+
+    python examples/benchmarks/first_pictures.py SCENES [--parts cameras pull] [--out results]
+    python examples/benchmarks/first_pictures.py SCENES --python OTHER/.venv/bin/python
+
+SCENES is a folder of scenes as for ``torchdof bench --truth``; other pictures are made here, cameras drawn by seeded
+numbers. With ``--python`` another installation takes turns with this one. Each turn of a part is a process of its own,
+which makes sure that this installation keeps its tolerance. The columns are those of ``torchdof bench``.
+"""
+
+import argparse
+import functools
+import itertools
+import json
+import math
+import os
+import resource
+import runpy
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torchdof.bench
+from torchdof import Camera, blur_by_coc
+from torchdof.io.images import Picture, read_image, write_image
+from torchdof.reference.scenes import read_scenes
+
+ROOT = Path(__file__).parents[2]
+torchdof.bench.__path__.insert(0, str(ROOT / "torchdof" / "bench"))  # one harness for either installation
+from torchdof.bench.measurement import BenchScene, Seconds, measure, shipped  # noqa: E402
+
+PARTS = "cameras fresh-39 fresh-60 command large pull small augmentation lamps noise demo gegl".split()
+COMMANDS = ("command", "large", "demo")
+COUNT = 4  # cameras a turn
+DATA = ROOT / "examples" / "data" / "motorcycle"
+Figure = tuple[str, str, Callable[..., Any], list[BenchScene], str, Callable[[], Any] | None]
+"""What is measured, its goal, what renders, the scene by new cameras, name and run of the reference; None: unit Y."""
+
+
+def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
+    """The figures of a part, in order; its name is one of :data:`PARTS`."""
+    if part in ("cameras", "gegl"):
+        gegl = runpy.run_path(str(Path(__file__).parent / "tools" / "gegl.py"))
+        for _, settings in itertools.groupby(read_scenes(folder), lambda scene: scene.name.rpartition("/")[0]):
+            known = next(settings)
+            scene = BenchScene(known.name, known.image, known.coc_px).seen(0.0, 64.0)
+            blur_by_coc(scene.image, scene.coc_px)
+            if part == "cameras":
+                seen = scene.cameras(COUNT, 4 / 64, f"{turn} {scene.name}")
+                yield f"{scene.name}, 4 to 64 px", "over_again at most 1.3", blur_by_coc, seen, "Y", None
+            elif gegl["available"]() is None:
+                seen = (
+                    scene.resized(1920 / scene.image.shape[-1])
+                    .seen(0.0, 32.0)
+                    .cameras(COUNT, 8 / 32, f"{turn} {scene.name}")
+                )
+                theirs = map(gegl["blur"], [s.image for s in seen], [s.coc_px for s in seen])
+                beside = functools.partial(next, theirs)
+                yield f"{scene.name}, 1080p, 8 to 32 px", "", blur_by_coc, seen, "GEGL lens-blur", beside
+    elif part in ("fresh-39", "fresh-60"):
+        size = (1350, 1080) if part == "fresh-39" else (1333, 2000)
+        seen = shipped(*size).seen(0.0, float(part[-2:])).cameras(1, 1.0, f"{turn}")
+        yield f"{size[1]} x {size[0]}, {part[-2:]} px, fresh process", "", blur_by_coc, seen, "Y", None
+    elif part == "pull":
+        frames = shipped(1080, 1920).seen(0.0, 69.0 - 0.1 * turn).pull(24)
+        yield "focus pull, 1080p, 69 px: frame 1", "", blur_by_coc, frames[:1], "Y", None
+        yield "focus pull, 1080p, 69 px: frames 2 to 24", "", blur_by_coc, frames[1:], "Y", None
+    elif part == "small":
+        torch.set_num_threads(1)
+        photo = shipped(256, 256).seen(0.0, 8.0)
+        for occlusion, goal_ms in ((True, 7), (False, 3.5)):
+            blur = functools.partial(blur_by_coc, occlusion=occlusion)
+            blur(photo.image, photo.coc_px)
+            figure = "256 x 256, 8 px, one thread" + ", without occlusion" * (not occlusion)
+            seen = photo.cameras(5 * COUNT, 2 / 8, f"{turn} {occlusion}")
+            yield figure, f"cpu_ms at most {goal_ms}", blur, seen, "Y", None
+        maps = torch.cat([camera.coc_px for camera in photo.cameras(16 * COUNT, 2 / 8, f"{turn} batch")]).split(8)
+        batches = [BenchScene("batch", photo.image.repeat(8, 1, 1, 1), coc_px) for coc_px in maps[:COUNT]]
+        beside = functools.partial(next, ([blur_by_coc(photo.image, m) for m in ms.split(1)] for ms in maps[COUNT:]))
+        yield "8 of these with a focus each", "over_beside at most 1", blur_by_coc, batches, "8 one by one", beside
+    elif part == "augmentation":
+        from kornia.augmentation import RandomBoxBlur
+
+        from torchdof.augmentation import RandomDepthOfField
+        from torchdof.depth.reading import read_depth
+
+        torch.set_num_threads(1)
+        torch.manual_seed(turn)
+        known = json.loads((DATA / "camera.json").read_text())
+        depth = read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
+        photo = torch.cat([read_image(DATA / "motorcycle_left.png").pixels, depth], 1)
+        crops = torch.cat([photo[..., y : y + 256, x : x + 256] for y in range(0, 241, 80) for x in range(0, 481, 160)])
+        camera = Camera.from_fov(math.degrees(2 * math.atan(128 / known["focal_length_px"])), 0.04, 3.0)
+        aug = RandomDepthOfField((2.2, 5.0), (1.4, 8.0), camera, transfer="linear", p=1.0, tolerance="preview")
+        batch = BenchScene("crops", *crops.split((3, 1), 1))  # metres in the place of the coc
+        aug(batch.image, batch.coc_px)
+        beside, goal = (
+            functools.partial(RandomBoxBlur((11, 11), p=1.0), batch.image),
+            "cpu_ms at most 145: 110 a second",
+        )
+        yield "RandomDepthOfField, preview, 16 crops", goal, aug, [batch] * 8, "kornia RandomBoxBlur, 11 x 11", beside
+    elif part in ("lamps", "noise"):
+        scene, dice = shipped(480, 640), torch.Generator().manual_seed(turn)
+        ordinary = scene.seen(0.0, 60.0).cameras(1, 1.0, f"{turn}")[0]
+        image, coc_px, figure = scene.image, 120 * torch.rand(1, 1, 480, 640, generator=dice) - 60, "noise, 60 px"
+        if part == "lamps":
+            image, coc_px = 0.02 * image, torch.linspace(0, 500, 480)[:, None].repeat(1, 1, 1, 640)
+            image.flatten(2)[..., torch.randperm(480 * 640, generator=dice)[:10_000]] = 300.0
+            figure = "ten thousand lamps, 500 px"
+        beside, goal = (
+            functools.partial(blur_by_coc, ordinary.image, ordinary.coc_px),
+            "over_beside at most 6, 1000 MiB",
+        )
+        yield f"{figure}, 640 x 480", goal, blur_by_coc, [BenchScene(part, image, coc_px)], "ordinary, 60 px", beside
+    elif part == "command":
+        for radius_px in (30.0, 60.0, 111.0):
+            seen, figure = (
+                shipped(1333, 2000).seen(0.0, radius_px).cameras(1, 1.0, f"{turn}"),
+                "torchdof render, 2000 x 1333",
+            )
+            goal = "over_beside at most 3"
+            yield f"{figure}, {radius_px:g} px", goal, rendered, seen, "import torch", import_torch
+    elif part == "large":
+        seen = shipped(1000, 1500).resized(4.0).seen(0.0, 219.0).cameras(1, 1.0, f"{turn}")
+        figure, goal = "torchdof render, 6000 x 4000, 219 px, less files", "cpu_ms at most 6000, 2500 MiB"
+        yield figure, goal, beyond_files, seen, "import torch", import_torch
+    elif part == "demo":
+        yield "make demo", "", demonstrated, [shipped(64, 96)], "import torch", import_torch
+
+
+def spent(*command: object, folder: str | None = None) -> Seconds:
+    """What a command took."""
+    wall, before = time.perf_counter(), os.times()
+    subprocess.run([sys.executable, *map(str, command)], check=True, cwd=folder, stdout=subprocess.DEVNULL)
+    after = os.times()
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return Seconds(time.perf_counter() - wall, cpu)
+
+
+def import_torch() -> tuple[None, Seconds]:
+    """What importing torch takes."""
+    return None, spent("-c", "import torch")
+
+
+def rendered(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
+    """The picture of ``torchdof render``, and what the command took."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_image(f"{folder}/photo.jpg", Picture(image, transfer="srgb", sample="8"))
+        write_image(f"{folder}/coc.exr", Picture(coc_px, ("Y",)), sample="float")
+        command = "-m torchdof render photo.jpg coc.exr -o out.jpg --depth-kind coc"
+        return read_image(f"{folder}/out.jpg").pixels, spent(*command.split(), folder=folder)
+
+
+def beyond_files(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
+    """The same less what the command takes where all is in focus, and only files are read and written."""
+    picture, seconds = rendered(image, coc_px)
+    files = rendered(image, torch.zeros_like(coc_px))[1]
+    return picture, Seconds(seconds.wall - files.wall, seconds.cpu - files.cpu)
+
+
+def demonstrated(image: Tensor, _: Tensor) -> tuple[Tensor, Seconds]:
+    """What ``make demo`` runs, of the installation's own repository if it has one, and what it took."""
+    own = Path(torchdof.__file__).parents[1] / "examples" / "demo.py"
+    with tempfile.TemporaryDirectory() as out:
+        return image, spent(own if own.exists() else ROOT / "examples" / "demo.py", "--data", DATA, "--out", out)
+
+
+def turn_of(part: str, folder: Path, turn: int) -> list[dict[str, Any]]:
+    """A row for each camera of each figure of a part.
+
+    Raises:
+        RuntimeError: If this installation does not keep its tolerance.
+    """
+    rows = []
+    for figure, goal, blur, cameras, name, beside in figures(part, folder, turn):
+        for camera in cameras:
+            row = measure(blur, camera, None, beside, part not in COMMANDS, part in ("lamps", "noise"))[0]
+            if part in COMMANDS:
+                row["peak_mb"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+            rows.append({"figure": figure, "goal": goal, "beside": name, **row})
+    scene = shipped(64, 96).seen(0.0, 6.0)
+    exact = functools.partial(blur_by_coc, scene.image, scene.coc_px, tolerance=0.0)
+    if not measure(blur_by_coc, scene, exact)[0]["rms_255"] <= 1.0:
+        raise RuntimeError(f"{torchdof.__file__}: does not keep its tolerance")
+    return rows
+
+
+def main() -> None:
+    """Measure the parts and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("scenes", type=Path, help="folder of scenes, as torchdof bench --truth takes it")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--python", help="interpreter of another installation of torchdof, which takes turns")
+    parser.add_argument("--repeat", type=int, default=3, help="turns; by default %(default)s")
+    parser.add_argument("--out", type=Path, help="folder for first_pictures.csv and .md")
+    parser.add_argument("--turn", type=int, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.turn is not None:
+        with torch.inference_mode():
+            print(json.dumps(turn_of(arguments.parts[0], arguments.scenes, arguments.turn)))
+        return
+    from torchdof.bench.report import publish, summary
+
+    pythons, rows = {"here": sys.executable, "other": arguments.python or sys.executable}, []
+    names = list(pythons)[: 1 + (arguments.python is not None)]
+    for part, turn, name in itertools.product(arguments.parts, range(arguments.repeat), names):
+        call = [pythons[name], __file__, arguments.scenes, "--parts", part, "--turn", str(turn)]
+        done = subprocess.run(call, stdout=subprocess.PIPE, text=True, check=True)
+        rows += [{"by": name, **row} for row in json.loads(done.stdout.splitlines()[-1])]
+    if arguments.out is not None:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    table = summary(rows, ["figure", "by", "goal", "beside"], statistics.median)
+    remark = f"{arguments.repeat} turns, each by other cameras, of " + ", ".join(f"{n}: {pythons[n]}" for n in names)
+    publish("First pictures", {"First pictures": table}, [remark], arguments.out and arguments.out / "first_pictures")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""What is measured: new cameras, the same again, a reference run beside; and what is told of them."""
+
+import functools
+import math
+import statistics
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchdof import Camera
+from torchdof.bench import measurement, memory
+from torchdof.bench.measurement import BenchScene, Seconds, measure, shipped
+from torchdof.bench.report import publish, summary
+from torchdof.reference import metrics
+
+SCENE = shipped(36, 64)
+
+
+def test_a_row_holds_the_first_picture_the_same_again_and_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = iter([0.0, 4.0, 10.0, 11.0, 20.0, 22.0])
+    monkeypatch.setattr(time, "perf_counter", lambda: next(ticks))
+    calls: list[Tensor] = []
+
+    def blur(image: Tensor, coc_px: Tensor) -> Tensor:
+        calls.append(coc_px)
+        return image
+
+    row, picture = measure(blur, SCENE, beside=lambda: calls.append(torch.zeros(())))
+    assert picture is SCENE.image and [coc.numel() for coc in calls] == [36 * 64, 36 * 64, 1]
+    assert (row["new_ms"], row["again_ms"], row["beside_ms"]) == (4000.0, 1000.0, 2000.0)
+    assert all(math.isnan(row[name]) for name in ("peak_mb", "rms_255", "psnr_db", "ssim"))
+
+
+def test_ratios_are_of_processor_time_and_a_tool_may_time_itself() -> None:
+    taken = iter([Seconds(9.0, 6.0), Seconds(1.0, 2.0), 5.0])
+    row, _ = measure(lambda image, _: (image, next(taken)), SCENE, beside=lambda: (None, next(taken)))
+    assert (row["cpu_ms"], row["over_again"], row["beside_ms"]) == (6000.0, 3.0, 5000.0)
+    assert math.isnan(row["over_beside"])  # the last told the clock alone
+
+
+def test_errors_are_those_of_what_is_displayed() -> None:
+    wanted = (SCENE.image + 0.01).clamp(0.0, 1.0)
+    row, _ = measure(lambda image, _: image, SCENE, lambda: wanted)
+    shown, right = metrics.display(SCENE.image), metrics.display(wanted)
+    assert row["rms_255"] == pytest.approx(255 * float((shown - right).square().mean().sqrt()), abs=1e-4)
+    assert (row["psnr_db"], row["ssim"]) == (metrics.psnr(shown, right), metrics.ssim(shown, right))
+
+
+def test_a_picture_that_is_not_finite_is_not_timed() -> None:
+    with pytest.raises(RuntimeError, match="slope with posts: the picture is not finite"):
+        measure(lambda image, _: image / 0.0, SCENE)
+
+
+@pytest.mark.skipif(math.isnan(memory.peak_mb()), reason="this system does not tell the memory of a process")
+def test_peak_memory_is_that_of_the_picture_alone() -> None:
+    for mib in (64, 8):
+
+        def greedy(image: Tensor, _: Tensor, mib: int = mib) -> Tensor:
+            torch.ones(mib * 2**18).sum()
+            return image
+
+        assert measure(greedy, SCENE, peak=True)[0]["peak_mb"] == pytest.approx(mib, rel=0.25, abs=4.0)
+
+
+def test_another_camera_is_one_of_a_thin_lens() -> None:
+    depth = torch.linspace(1.0, 5.0, 64).expand(1, 1, 36, 64)
+    given = Camera(50.0, 2.0, focus_m=2.0, focus_breathing=False).coc_px(depth, 64)
+    scene = BenchScene("x", SCENE.image, given)
+    focused = Camera(50.0, 2.0, focus_m=3.0, focus_breathing=False).coc_px(depth, 64)
+    share = 2 * float((given - focused).mean() / (given.max() - given.min()))
+    assert share > 0  # farther
+    torch.testing.assert_close(scene.seen(share, float(focused.abs().max())).coc_px, focused, rtol=1e-4, atol=1e-5)
+
+
+def test_cameras_are_new_ones_and_the_same_for_each_seed() -> None:
+    cameras, widest = SCENE.cameras(8, 0.5, "a"), float(SCENE.coc_px.abs().max())
+    radii = [float(camera.coc_px.abs().max()) for camera in cameras]
+    assert len({*radii, widest}) == 9 and all(0.5 * widest <= radius <= widest for radius in radii)
+    assert all(torch.equal(a.coc_px, b.coc_px) for a, b in zip(cameras, SCENE.cameras(8, 0.5, "a"), strict=True))
+    assert not torch.equal(cameras[0].coc_px, SCENE.cameras(1, 0.5, "b")[0].coc_px)
+    flat = BenchScene("flat", SCENE.image, torch.full_like(SCENE.coc_px, 3.0))
+    assert torch.equal(flat.seen(0.4, 3.0).coc_px, flat.coc_px), "one plane stays blurred"
+    assert not SCENE.seen(0.0, 0.0).seen(0.4, 0.0).coc_px.any()
+
+
+def test_the_focus_of_a_pull_moves_from_near_to_far() -> None:
+    nearest, *_, farthest = SCENE.pull(5)
+    assert float(nearest.coc_px.mean()) > 0 > float(farthest.coc_px.mean())
+    assert len({float(frame.coc_px.mean()) for frame in SCENE.pull(5)}) == 5
+
+
+def test_a_scene_of_another_size_is_as_blurred_for_its_width() -> None:
+    small = SCENE.resized(0.5)
+    assert small.image.shape[-2:] == (18, 32)
+    assert float(small.coc_px.abs().max()) == pytest.approx(0.5 * float(SCENE.coc_px.abs().max()), rel=0.05)
+    assert set(small.coc_px.flatten().tolist()) <= set((0.5 * SCENE.coc_px).flatten().tolist())
+
+
+def test_the_built_in_scene_is_blurred_alike_before_and_behind_the_focus() -> None:
+    scene = shipped()
+    assert scene.image.shape == (1, 3, 540, 960)
+    assert float(scene.coc_px.min()) == pytest.approx(-16, abs=0.5)
+    assert float(scene.coc_px.max()) == pytest.approx(16, abs=0.5)
+    assert 0 < (scene.coc_px.abs() < 0.5).float().mean() < 0.1
+
+
+def test_what_was_not_measured_has_no_part_in_a_summary() -> None:
+    rows = [{"a": a, "new_ms": v, "spread_ms": 0.0, "other": "z"} for a, v in (("x", 1.0), ("y", 5.0), ("x", math.nan))]
+    assert summary(rows, ["a"], statistics.fmean) == [
+        {"a": "x", "new_ms": 1.0, "spread_ms": 0.0},
+        {"a": "y", "new_ms": 5.0, "spread_ms": 0.0},
+    ]
+
+
+def test_a_report_is_written_whole_or_not_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tables = {"Means": [{"a": "x", "b": 1234.56, "c": True}], "All": [{"a": "x", "d": math.nan}, {"a": "y", "d": 0.25}]}
+    written = functools.partial(publish, "Title", tables, ["remark"], tmp_path / "name")
+
+    def full(path: Path) -> None:
+        raise OSError("no space left")
+
+    (tmp_path / "name.md").write_text("before")
+    with pytest.raises(OSError, match="no space"):
+        written(full)
+    assert [path.name for path in tmp_path.iterdir()] == ["name.md"]
+    assert (tmp_path / "name.md").read_text() == "before"
+    capsys.readouterr()
+    written(quiet=True)
+    assert not capsys.readouterr().out
+    text = (tmp_path / "name.md").read_text()
+    assert (
+        "## Means\n\n| a | b | c |\n| --- | --- | --- |\n| x | 1235 | yes |" in text
+        and "| x |  |\n| y | 0.25 |" in text
+    )
+    assert f" {torch.get_num_threads()} threads; " in text and f"torch {torch.__version__}" in text and "remark" in text
+    assert (tmp_path / "name.csv").read_text() == "a,d\nx,nan\ny,0.25\n"
+
+
+def test_a_scene_that_fits_nothing_is_refused() -> None:
+    for image, coc_px, message in (
+        (torch.ones(1, 3, 20, 20), torch.ones(1, 1, 20, 24), "depth is 24 x 20 pixels but the image is 20 x 20"),
+        (torch.ones(1, 3, 8, 20), torch.ones(1, 1, 8, 20), "from 16 pixels a side on"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            measurement.BenchScene("x", image, coc_px)

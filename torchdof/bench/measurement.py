@@ -1,0 +1,160 @@
+"""The one measurement of all benchmarks: what first pictures cost, and how far they are from the right ones."""
+
+import dataclasses
+import functools
+import math
+import random
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from ..optics.blur_table import BlurTable
+from ..reference import metrics
+from ..reference.scenes import posts, waves
+from . import memory
+
+__all__ = ["TIMES", "BenchScene", "Renderer", "Seconds", "measure", "shipped", "timed"]
+
+TIMES = ("new_ms", "spread_ms", "cpu_ms", "again_ms", "over_again", "beside_ms", "over_beside")
+"""Columns of times, as :data:`torchdof.bench.report.LEGEND` explains them."""
+
+_LEAST_PX = 16
+
+
+class Seconds(NamedTuple):
+    """What a call took: seconds of the clock, and of the processor over all threads of this process."""
+
+    wall: float
+    cpu: float = math.nan
+
+
+Renderer = Callable[[Tensor, Tensor], Any]
+"""The picture of an image ``[B, C, H, W]`` by its coc ``[B, 1, H, W]``; or picture and seconds, if it times itself."""
+
+
+def timed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Seconds]:
+    """What a call returns, and what it took."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = work(*arguments)
+    seconds = Seconds(time.perf_counter() - wall, time.process_time() - cpu)
+    if not isinstance(result, tuple):
+        return result, seconds
+    return result[0], result[1] if isinstance(result[1], Seconds) else Seconds(result[1])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BenchScene:
+    """What is rendered.
+
+    Args:
+        name: For the report.
+        image: ``[B, C, H, W]``, linear light, without alpha.
+        coc_px: ``[B, 1, H, W]``, signed radius in pixels.
+        remark: Camera and focus, in words.
+        table: Of the lens; the disc unless given.
+    """
+
+    name: str
+    image: Tensor
+    coc_px: Tensor
+    remark: str = ""
+    table: BlurTable = dataclasses.field(default_factory=BlurTable.disc)
+
+    def __post_init__(self) -> None:
+        (h, w), (height, width) = self.coc_px.shape[-2:], self.image.shape[-2:]
+        if (h, w) != (height, width):
+            raise ValueError(f"{self.name}: depth is {w} x {h} pixels but the image is {width} x {height}")
+        if min(h, w) < _LEAST_PX:
+            raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {_LEAST_PX} pixels a side on")
+
+    def seen(self, focus: float, radius_px: float) -> "BenchScene":
+        """By another camera: focused nearer (down to -1) or farther (up to 1), with another largest radius.
+
+        A thin lens's circle of confusion is linear in 1 / distance: another focus adds a constant to it, here at most
+        half of what lies between its least and its greatest, and another opening multiplies it.
+        """
+        moved = self.coc_px - 0.5 * focus * (self.coc_px.max() - self.coc_px.min())
+        return dataclasses.replace(self, coc_px=moved * (radius_px / moved.abs().max().clamp_min(1e-9)))
+
+    def cameras(self, count: int, least: float, seed: str) -> "list[BenchScene]":
+        """By so many cameras at random, the same for each seed, the largest radius ``least`` to 1 times this one."""
+        dice, widest_px = random.Random(seed), float(self.coc_px.abs().max())
+        return [self.seen(dice.uniform(-0.5, 0.5), widest_px * least ** dice.random()) for _ in range(count)]
+
+    def pull(self, count: int) -> "list[BenchScene]":
+        """A sequence whose focus moves through the scene."""
+        widest_px = float(self.coc_px.abs().max())
+        return [self.seen(2 * k / max(1, count - 1) - 1, widest_px) for k in range(count)]
+
+    def resized(self, share: float) -> "BenchScene":
+        """The same picture in a frame of another size, as blurred for its width."""
+        height, width = (max(_LEAST_PX, round(share * n)) for n in self.image.shape[-2:])
+        image = functional.interpolate(self.image, (height, width), mode="area")
+        coc_px = functional.interpolate(self.coc_px, (height, width), mode="nearest")  # no radius that no surface has
+        return dataclasses.replace(self, image=image, coc_px=coc_px * (width / self.image.shape[-1]))
+
+
+def measure(
+    blur: Renderer,
+    scene: BenchScene,
+    wanted: Callable[[], Tensor] | None = None,
+    beside: Callable[[], Any] | None = None,
+    again: bool = True,
+    peak: bool = False,
+) -> tuple[dict[str, float], Tensor]:
+    """Renders a scene for the first time, then the same again, then a reference run.
+
+    Args:
+        blur: What renders.
+        scene: By a camera that was not rendered before.
+        wanted: The right picture; None measures no error.
+        beside: The reference run; None is unit Y, a depthwise 17 x 17 convolution of ``[1, 16, 540, 960]``, channels
+            last: times over its time compare between machines.
+        again: Whether to render the same again.
+        peak: Whether to watch the memory, for which the process gives back first what it holds unused.
+
+    Returns:
+        A row, whose columns :data:`torchdof.bench.report.LEGEND` explains, NaN being what was not measured; and the
+        picture.
+
+    Raises:
+        RuntimeError: If the picture is not finite.
+    """
+    if beside is None:
+        frame = torch.rand(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
+        beside = functools.partial(functional.conv2d, frame, torch.rand(16, 1, 17, 17), padding=8, groups=16)
+    held_mb = memory.reset_peak() if peak else math.nan
+    time.sleep(0.02)  # PyTorch's threads spin for a while after each operation
+    picture, new = timed(blur, scene.image, scene.coc_px)
+    peak_mb = memory.peak_mb() - held_mb
+    same = timed(blur, scene.image, scene.coc_px)[1] if again else Seconds(math.nan)
+    reference = timed(beside)[1]
+    if not bool(picture.isfinite().all()):
+        raise RuntimeError(f"{scene.name}: the picture is not finite")
+    ratios = (new.cpu / same.cpu, 1e3 * reference.wall, new.cpu / reference.cpu)
+    row = dict(zip(TIMES, (1e3 * new.wall, 0.0, 1e3 * new.cpu, 1e3 * same.wall, *ratios), strict=True))
+    row |= {"peak_mb": peak_mb, **dict.fromkeys(("rms_255", "psnr_db", "ssim"), math.nan)}
+    if wanted is not None:
+        shown, right = metrics.display(picture), metrics.display(wanted())
+        row["rms_255"] = 255 * math.sqrt(float((shown.double() - right.double()).square().mean()))
+        row |= {"psnr_db": metrics.psnr(shown, right), "ssim": metrics.ssim(shown, right)}
+    return row, picture
+
+
+def shipped(height: int = 540, width: int = 960) -> BenchScene:
+    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m, with a blur radius of up to a 60th of the width.
+
+    Example:
+        >>> shipped(54, 96).image.shape
+        torch.Size([1, 3, 54, 96])
+    """
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, width)), indexing="ij")
+    near = posts(width / 6, width / 40)(x, y)
+    light = torch.where(near, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]
+    nearness = torch.where(near, 1.0 + 0.1 * x / width, 0.1 + 0.9 * y / height).float()[None, None]
+    coc_px = (0.6 - nearness) * (width / 60 / 0.5)  # as blurred far away as at the posts
+    return BenchScene("slope with posts", light, coc_px, "a thin lens focused at 1.67 m")
