@@ -23,7 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,14 +35,24 @@ from torchdof.reference.scenes import read_scenes
 
 ROOT = Path(__file__).parents[2]
 torchdof.bench.__path__.insert(0, str(ROOT / "torchdof" / "bench"))  # one harness for either installation
-from torchdof.bench.measurement import BenchScene, Seconds, measure, shipped  # noqa: E402
+from torchdof.bench.measurement import BenchScene, Seconds, error, measure, peak_of, shipped, timed  # noqa: E402
 
 PARTS = "cameras fresh-39 fresh-60 command large pull small augmentation lamps noise demo gegl".split()
 COMMANDS = ("command", "large", "demo")
+ALONE = ("fresh-39", "fresh-60", "lamps", "noise")  # one picture a process, so that its memory shows
 COUNT = 4  # cameras a turn
 DATA = ROOT / "examples" / "data" / "motorcycle"
-Figure = tuple[str, str, Callable[..., Any], list[BenchScene], str, Callable[[], Any] | None]
-"""What is measured, its goal, what renders, the scene by new cameras, name and run of the reference; None: unit Y."""
+
+
+class Figure(NamedTuple):
+    """What is measured, what renders, the scene by new cameras, the goal, and the reference run, None for unit Y."""
+
+    name: str
+    blur: Callable[..., Any]
+    scenes: list[BenchScene]
+    goal: str = ""
+    reference: str = "Y"
+    beside: Callable[[], Any] | None = None
 
 
 def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
@@ -55,37 +65,34 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
             blur_by_coc(scene.image, scene.coc_px)
             if part == "cameras":
                 seen = scene.cameras(COUNT, 4 / 64, f"{turn} {scene.name}")
-                yield f"{scene.name}, 4 to 64 px", "over_again at most 1.3", blur_by_coc, seen, "Y", None
+                yield Figure(f"{scene.name}, 4 to 64 px", blur_by_coc, seen, "over_again at most 1.3")
             elif gegl["available"]() is None:
-                seen = (
-                    scene.resized(1920 / scene.image.shape[-1])
-                    .seen(0.0, 32.0)
-                    .cameras(COUNT, 8 / 32, f"{turn} {scene.name}")
-                )
-                theirs = map(gegl["blur"], [s.image for s in seen], [s.coc_px for s in seen])
-                beside = functools.partial(next, theirs)
-                yield f"{scene.name}, 1080p, 8 to 32 px", "", blur_by_coc, seen, "GEGL lens-blur", beside
+                frame = scene.resized(1920 / scene.image.shape[-1]).seen(0.0, 32.0)
+                seen = frame.cameras(COUNT, 8 / 32, f"{turn} {scene.name}")
+                beside = functools.partial(next, (gegl["blur"](camera.image, camera.coc_px) for camera in seen))
+                yield Figure(f"{scene.name}, 1080p, 8 to 32 px", blur_by_coc, seen, "", gegl["NAME"], beside)
     elif part in ("fresh-39", "fresh-60"):
         size = (1350, 1080) if part == "fresh-39" else (1333, 2000)
         seen = shipped(*size).seen(0.0, float(part[-2:])).cameras(1, 1.0, f"{turn}")
-        yield f"{size[1]} x {size[0]}, {part[-2:]} px, fresh process", "", blur_by_coc, seen, "Y", None
+        yield Figure(f"{size[1]} x {size[0]}, {part[-2:]} px, fresh process", blur_by_coc, seen)
     elif part == "pull":
         frames = shipped(1080, 1920).seen(0.0, 69.0 - 0.1 * turn).pull(24)
-        yield "focus pull, 1080p, 69 px: frame 1", "", blur_by_coc, frames[:1], "Y", None
-        yield "focus pull, 1080p, 69 px: frames 2 to 24", "", blur_by_coc, frames[1:], "Y", None
+        yield Figure("focus pull, 1080p, 69 px: frame 1", blur_by_coc, frames[:1])
+        yield Figure("focus pull, 1080p, 69 px: frames 2 to 24", blur_by_coc, frames[1:])
     elif part == "small":
         torch.set_num_threads(1)
         photo = shipped(256, 256).seen(0.0, 8.0)
         for occlusion, goal_ms in ((True, 7), (False, 3.5)):
             blur = functools.partial(blur_by_coc, occlusion=occlusion)
             blur(photo.image, photo.coc_px)
-            figure = "256 x 256, 8 px, one thread" + ", without occlusion" * (not occlusion)
+            name = "256 x 256, 8 px, one thread" + ", without occlusion" * (not occlusion)
             seen = photo.cameras(5 * COUNT, 2 / 8, f"{turn} {occlusion}")
-            yield figure, f"cpu_ms at most {goal_ms}", blur, seen, "Y", None
+            yield Figure(name, blur, seen, f"cpu_ms at most {goal_ms}")
         maps = torch.cat([camera.coc_px for camera in photo.cameras(16 * COUNT, 2 / 8, f"{turn} batch")]).split(8)
         batches = [BenchScene("batch", photo.image.repeat(8, 1, 1, 1), coc_px) for coc_px in maps[:COUNT]]
         beside = functools.partial(next, ([blur_by_coc(photo.image, m) for m in ms.split(1)] for ms in maps[COUNT:]))
-        yield "8 of these with a focus each", "over_beside at most 1", blur_by_coc, batches, "8 one by one", beside
+        goal = "over_beside at most 1"
+        yield Figure("8 of these with a focus each", blur_by_coc, batches, goal, "8 others one by one", beside)
     elif part == "augmentation":
         from kornia.augmentation import RandomBoxBlur
 
@@ -102,38 +109,36 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
         aug = RandomDepthOfField((2.2, 5.0), (1.4, 8.0), camera, transfer="linear", p=1.0, tolerance="preview")
         batch = BenchScene("crops", *crops.split((3, 1), 1))  # metres in the place of the coc
         aug(batch.image, batch.coc_px)
-        beside, goal = (
-            functools.partial(RandomBoxBlur((11, 11), p=1.0), batch.image),
-            "cpu_ms at most 145: 110 a second",
-        )
-        yield "RandomDepthOfField, preview, 16 crops", goal, aug, [batch] * 8, "kornia RandomBoxBlur, 11 x 11", beside
+        beside = functools.partial(RandomBoxBlur((11, 11), p=1.0), batch.image)
+        name, goal = "RandomDepthOfField, preview, 16 images, one thread", "16000 / cpu_ms at least 110"
+        yield Figure(name, aug, [batch] * 2 * COUNT, goal, "kornia RandomBoxBlur, 11 x 11", beside)
     elif part in ("lamps", "noise"):
         scene, dice = shipped(480, 640), torch.Generator().manual_seed(turn)
-        ordinary = scene.seen(0.0, 60.0).cameras(1, 1.0, f"{turn}")[0]
-        image, coc_px, figure = scene.image, 120 * torch.rand(1, 1, 480, 640, generator=dice) - 60, "noise, 60 px"
+        image, coc_px, name = scene.image, 120 * torch.rand(1, 1, 480, 640, generator=dice) - 60, "noise, 60 px"
         if part == "lamps":
-            image, coc_px = 0.02 * image, torch.linspace(0, 500, 480)[:, None].repeat(1, 1, 1, 640)
+            image = 0.02 * image
+            coc_px = 250 * (torch.linspace(0, 1, 480)[:, None] + torch.linspace(0, 1, 640)).expand(1, 1, 480, 640)
             image.flatten(2)[..., torch.randperm(480 * 640, generator=dice)[:10_000]] = 300.0
-            figure = "ten thousand lamps, 500 px"
-        beside, goal = (
-            functools.partial(blur_by_coc, ordinary.image, ordinary.coc_px),
-            "over_beside at most 6, 1000 MiB",
-        )
-        yield f"{figure}, 640 x 480", goal, blur_by_coc, [BenchScene(part, image, coc_px)], "ordinary, 60 px", beside
+            name = "ten thousand lamps, 500 px"
+        ordinary = scene.seen(0.0, 60.0).cameras(1, 1.0, f"{turn}")[0]
+
+        def beside() -> tuple[Tensor, Seconds]:
+            blur_by_coc(ordinary.image, ordinary.coc_px)
+            return timed(blur_by_coc, ordinary.image, ordinary.coc_px)
+
+        seen, goal = [BenchScene(part, image, coc_px)], "over_beside at most 6, 1000 MiB"
+        yield Figure(f"{name}, 640 x 480", blur_by_coc, seen, goal, "ordinary, 60 px, again", beside)
     elif part == "command":
-        for radius_px in (30.0, 60.0, 111.0):
-            seen, figure = (
-                shipped(1333, 2000).seen(0.0, radius_px).cameras(1, 1.0, f"{turn}"),
-                "torchdof render, 2000 x 1333",
-            )
-            goal = "over_beside at most 3"
-            yield f"{figure}, {radius_px:g} px", goal, rendered, seen, "import torch", import_torch
+        for radius_px in (30, 60, 111):
+            seen = shipped(1333, 2000).seen(0.0, radius_px).cameras(1, 1.0, f"{turn}")
+            name, goal = f"torchdof render, 2000 x 1333, {radius_px} px", "over_beside at most 3"
+            yield Figure(name, rendered, seen, goal, "import torch", import_torch)
     elif part == "large":
         seen = shipped(1000, 1500).resized(4.0).seen(0.0, 219.0).cameras(1, 1.0, f"{turn}")
-        figure, goal = "torchdof render, 6000 x 4000, 219 px, less files", "cpu_ms at most 6000, 2500 MiB"
-        yield figure, goal, beyond_files, seen, "import torch", import_torch
+        name, goal = "torchdof render, 6000 x 4000, 219 px, less files", "cpu_ms at most 6000, 2500 MiB"
+        yield Figure(name, beyond_files, seen, goal, "import torch", import_torch)
     elif part == "demo":
-        yield "make demo", "", demonstrated, [shipped(64, 96)], "import torch", import_torch
+        yield Figure("make demo", demonstrated, [shipped(64, 96)], "", "import torch", import_torch)
 
 
 def spent(*command: object, folder: str | None = None) -> Seconds:
@@ -156,7 +161,8 @@ def rendered(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
         write_image(f"{folder}/photo.jpg", Picture(image, transfer="srgb", sample="8"))
         write_image(f"{folder}/coc.exr", Picture(coc_px, ("Y",)), sample="float")
         command = "-m torchdof render photo.jpg coc.exr -o out.jpg --depth-kind coc"
-        return read_image(f"{folder}/out.jpg").pixels, spent(*command.split(), folder=folder)
+        seconds = spent(*command.split(), folder=folder)
+        return read_image(f"{folder}/out.jpg").pixels, seconds
 
 
 def beyond_files(image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
@@ -180,15 +186,17 @@ def turn_of(part: str, folder: Path, turn: int) -> list[dict[str, Any]]:
         RuntimeError: If this installation does not keep its tolerance.
     """
     rows = []
-    for figure, goal, blur, cameras, name, beside in figures(part, folder, turn):
-        for camera in cameras:
-            row = measure(blur, camera, None, beside, part not in COMMANDS, part in ("lamps", "noise"))[0]
+    for figure in figures(part, folder, turn):
+        for scene in figure.scenes:
+            work = functools.partial(measure, figure.blur, scene, figure.beside, part not in COMMANDS)
+            (_, row), peak_mb = peak_of(work) if part in ALONE else (work(), math.nan)
             if part in COMMANDS:
-                row["peak_mb"] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-            rows.append({"figure": figure, "goal": goal, "beside": name, **row})
+                peak_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+            facts = {"figure": figure.name, "goal": figure.goal, "beside": figure.reference}
+            rows.append({**facts, **row, "peak_mb": peak_mb})
     scene = shipped(64, 96).seen(0.0, 6.0)
-    exact = functools.partial(blur_by_coc, scene.image, scene.coc_px, tolerance=0.0)
-    if not measure(blur_by_coc, scene, exact)[0]["rms_255"] <= 1.0:
+    picture, exact = (blur_by_coc(scene.image, scene.coc_px, tolerance=t) for t in (1 / 255, 0.0))
+    if not error(picture, exact)["rms_255"] <= 1.0:
         raise RuntimeError(f"{torchdof.__file__}: does not keep its tolerance")
     return rows
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchdof import Camera
 from torchdof.bench import measurement, memory
-from torchdof.bench.measurement import BenchScene, Seconds, measure, shipped
+from torchdof.bench.measurement import BenchScene, Seconds, error, measure, peak_of, shipped
 from torchdof.bench.report import publish, summary
 from torchdof.reference import metrics
 
@@ -28,22 +28,22 @@ def test_a_row_holds_the_first_picture_the_same_again_and_the_reference(monkeypa
         calls.append(coc_px)
         return image
 
-    row, picture = measure(blur, SCENE, beside=lambda: calls.append(torch.zeros(())))
+    picture, row = measure(blur, SCENE, beside=lambda: calls.append(torch.zeros(())))
     assert picture is SCENE.image and [coc.numel() for coc in calls] == [36 * 64, 36 * 64, 1]
     assert (row["new_ms"], row["again_ms"], row["beside_ms"]) == (4000.0, 1000.0, 2000.0)
-    assert all(math.isnan(row[name]) for name in ("peak_mb", "rms_255", "psnr_db", "ssim"))
+    assert "again_ms" not in measure(lambda image, _: (image, 1.0), SCENE, beside=lambda: (None, 1.0), again=False)[1]
 
 
 def test_ratios_are_of_processor_time_and_a_tool_may_time_itself() -> None:
     taken = iter([Seconds(9.0, 6.0), Seconds(1.0, 2.0), 5.0])
-    row, _ = measure(lambda image, _: (image, next(taken)), SCENE, beside=lambda: (None, next(taken)))
+    _, row = measure(lambda image, _: (image, next(taken)), SCENE, beside=lambda: (None, next(taken)))
     assert (row["cpu_ms"], row["over_again"], row["beside_ms"]) == (6000.0, 3.0, 5000.0)
     assert math.isnan(row["over_beside"])  # the last told the clock alone
 
 
 def test_errors_are_those_of_what_is_displayed() -> None:
     wanted = (SCENE.image + 0.01).clamp(0.0, 1.0)
-    row, _ = measure(lambda image, _: image, SCENE, lambda: wanted)
+    row = error(SCENE.image, wanted)
     shown, right = metrics.display(SCENE.image), metrics.display(wanted)
     assert row["rms_255"] == pytest.approx(255 * float((shown - right).square().mean().sqrt()), abs=1e-4)
     assert (row["psnr_db"], row["ssim"]) == (metrics.psnr(shown, right), metrics.ssim(shown, right))
@@ -57,12 +57,8 @@ def test_a_picture_that_is_not_finite_is_not_timed() -> None:
 @pytest.mark.skipif(math.isnan(memory.peak_mb()), reason="this system does not tell the memory of a process")
 def test_peak_memory_is_that_of_the_picture_alone() -> None:
     for mib in (64, 8):
-
-        def greedy(image: Tensor, _: Tensor, mib: int = mib) -> Tensor:
-            torch.ones(mib * 2**18).sum()
-            return image
-
-        assert measure(greedy, SCENE, peak=True)[0]["peak_mb"] == pytest.approx(mib, rel=0.25, abs=4.0)
+        _, grown_mb = peak_of(lambda mib=mib: float(torch.ones(mib * 2**18).sum()))
+        assert grown_mb == pytest.approx(mib, rel=0.25, abs=4.0)
 
 
 def test_another_camera_is_one_of_a_thin_lens() -> None:
@@ -107,16 +103,16 @@ def test_the_built_in_scene_is_blurred_alike_before_and_behind_the_focus() -> No
     assert 0 < (scene.coc_px.abs() < 0.5).float().mean() < 0.1
 
 
-def test_what_was_not_measured_has_no_part_in_a_summary() -> None:
-    rows = [{"a": a, "new_ms": v, "spread_ms": 0.0, "other": "z"} for a, v in (("x", 1.0), ("y", 5.0), ("x", math.nan))]
-    assert summary(rows, ["a"], statistics.fmean) == [
-        {"a": "x", "new_ms": 1.0, "spread_ms": 0.0},
-        {"a": "y", "new_ms": 5.0, "spread_ms": 0.0},
+def test_a_summary_joins_what_was_measured_of_one_thing() -> None:
+    rows = [{"a": a, "new_ms": value, "other": "z"} for a, value in (("x", 1.0), ("y", 5.0), ("x", 4.0))]
+    assert summary([*rows, {"a": "y", "psnr_db": 30.0}], ["a"], statistics.fmean) == [
+        {"a": "x", "new_ms": 2.5, "spread_ms": 1.5},
+        {"a": "y", "new_ms": 5.0, "psnr_db": 30.0},
     ]
 
 
 def test_a_report_is_written_whole_or_not_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tables = {"Means": [{"a": "x", "b": 1234.56, "c": True}], "All": [{"a": "x", "d": math.nan}, {"a": "y", "d": 0.25}]}
+    tables = {"Means": [{"a": "x", "b": 1234.56, "c": True}], "All": [{"a": "x", "d": math.nan}, {"a": "y", "e": 0.25}]}
     written = functools.partial(publish, "Title", tables, ["remark"], tmp_path / "name")
 
     def full(path: Path) -> None:
@@ -133,10 +129,10 @@ def test_a_report_is_written_whole_or_not_at_all(tmp_path: Path, capsys: pytest.
     text = (tmp_path / "name.md").read_text()
     assert (
         "## Means\n\n| a | b | c |\n| --- | --- | --- |\n| x | 1235 | yes |" in text
-        and "| x |  |\n| y | 0.25 |" in text
+        and "| x |  |  |\n| y |  | 0.25 |" in text
     )
     assert f" {torch.get_num_threads()} threads; " in text and f"torch {torch.__version__}" in text and "remark" in text
-    assert (tmp_path / "name.csv").read_text() == "a,d\nx,nan\ny,0.25\n"
+    assert (tmp_path / "name.csv").read_text() == "a,d,e\nx,nan,\ny,,0.25\n"
 
 
 def test_a_scene_that_fits_nothing_is_refused() -> None:

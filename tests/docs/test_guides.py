@@ -200,7 +200,7 @@ _QUICK = ("lenses.jpg", "truth_lamps.jpg", "truth_bars.jpg")
 
 def test_every_picture_of_the_documentation_has_a_script() -> None:
     elsewhere = {
-        "worst_places.jpg",  # examples/benchmarks/worst_places.py, from scenes that are not in the repository
+        "worst_places.jpg",  # from scenes that are not in the repository
         "phone_sheet.jpg",  # tests/fit/phone.py, in minutes
     }
     assert {*_GALLERY, *elsewhere} == {path.name for path in (ROOT / "docs" / "pictures").iterdir()}

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from torchdof import blur_by_coc
-from torchdof.bench import exported
 
 pytestmark = pytest.mark.hard
 
@@ -37,7 +36,16 @@ np.save(sys.argv[3], out)
 def test_1080p_is_rendered_right_with_less_than_0_7_gb(layered: Any, tmp_path: Path) -> None:
     """In a process as those who deploy have it: onnxruntime and numpy, no PyTorch."""
     assert layered.dof.max_coc_px == 16.0
-    feed: dict[str, Any] = exported.feed(exported.session(str(layered.path), threads=1), SIZE, "blurred background")
+    camera, (height, width) = layered.dof.camera, SIZE
+    fraction = np.zeros((1, 1, *SIZE), np.float32)  # of the largest radius
+    fraction[..., width // 2 :] = np.linspace(0.0, 0.95, width - width // 2, dtype=np.float32)
+    wide = camera.replace(focus_m=2.0, f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), width)
+    feed: dict[str, Any] = {
+        "image": np.random.default_rng(0).random((1, 3, height, width), dtype=np.float32),
+        "depth": 2.0 / (1.0 - fraction),
+        "focus_m": np.full(1, 2.0, np.float32),
+        "f_number": wide.flatten().numpy().astype(np.float32) / 16.0,  # infinity has the largest radius
+    }
     np.savez(tmp_path / "feed.npz", **feed)
     call = [sys.executable, "-c", RENDER, str(layered.path), str(tmp_path / "feed.npz"), str(tmp_path / "out.npy")]
     done = subprocess.run(call, capture_output=True, text=True, timeout=300)

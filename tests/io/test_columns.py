@@ -6,7 +6,7 @@ import re
 import pytest
 from rich.console import Console
 
-from torchdof.bench.report import ReportTable
+from torchdof.bench.report import publish
 from torchdof.io.columns import print_columns
 
 COLUMNS = {
@@ -39,9 +39,7 @@ def test_a_benchmark_s_table_is_whole_at_80_columns(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     scenes = [f"scene/{k}" for k in range(9)]
-    ReportTable(
-        "losses", [["depth", *scenes], ["half-res", *("32.90 / 31.70 / 24.25" for _ in scenes)]], ("depth",)
-    ).show()
+    publish("Losses", {"losses": [{"depth": "half-res", **dict.fromkeys(scenes, "32.90 / 31.70 / 24.25")}]}, [], None)
     lines = capsys.readouterr().out.splitlines()
     assert max(map(len, lines)) <= 80 and sum(line.count("32.90 / 31.70 / 24.25") for line in lines) == len(scenes)
     assert sum(line.startswith("half-res") for line in lines) == 3

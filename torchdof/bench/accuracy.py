@@ -1,7 +1,6 @@
 """How close to the truth renderers come, on scenes whose depth of field is known, with exact depth and with worse."""
 
 import functools
-import math
 import runpy
 import statistics
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from ..reference.degraded import KINDS, degrade
 from ..reference.ikoma import layered_fft
 from ..reference.lens_views import lens_views_by_coc
 from ..reference.scenes import Scene, read_scenes
-from .measurement import BenchScene, Renderer, measure
+from .measurement import BenchScene, Renderer, error, measure
 from .report import publish, summary
 
 __all__ = ["compare", "read_peer", "renderers"]
@@ -48,7 +47,7 @@ def read_peer(path: Path) -> tuple[str, Renderer]:
     """Another renderer: a Python file with ``blur(image, coc_px)``, such as those in ``examples/benchmarks/tools``.
 
     Returns:
-        Its name and what renders.
+        Its name with the version that it tells, and what renders.
 
     Raises:
         OSError: If there is no such file.
@@ -60,7 +59,7 @@ def read_peer(path: Path) -> tuple[str, Renderer]:
     missing = peer.get("available", lambda: None)()
     if missing:
         raise ValueError(f"{path}: cannot run here; {missing}")
-    return peer.get("NAME", path.stem), peer["blur"]
+    return f"{peer.get('NAME', path.stem)} {peer.get('version', str)()}".strip(), peer["blur"]
 
 
 def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers: Sequence[Path]) -> None:
@@ -86,15 +85,17 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
     cases = [(scene, kind) for scene in scenes for kind in (KINDS if degraded else ["exact"])]
     for scene, kind in track(cases, "scenes", console=console, transient=True, disable=not console.is_terminal):
         coc_px, pictures = scene.camera.coc_px(degrade(scene.depth, kind), scene.image.shape[-1]), {}
-        seen, wanted = BenchScene(scene.name, scene.image, coc_px), functools.partial(getattr, scene, "truth")
         for name, blur in compared.items():
             with torch.inference_mode():
-                row, pictures[name] = measure(blur, seen, wanted, again=False)
-            shown = metrics.display(pictures[name]), metrics.display(scene.truth)
-            row["psnr_inner"] = metrics.psnr(*shown, scene.inner) if bool(scene.inner.any()) else math.nan
-            has_flip = metrics.has_flip() and shown[0].shape[1] == 3
-            row["flip"] = metrics.flip(*shown) if has_flip else math.nan
+                picture, row = measure(blur, BenchScene(scene.name, scene.image, coc_px), again=False)
+            row |= error(picture, scene.truth)
+            shown = metrics.display(picture), metrics.display(scene.truth)
+            if bool(scene.inner.any()):
+                row["psnr_inner"] = metrics.psnr(*shown, scene.inner)
+            if metrics.has_flip() and picture.shape[1] == 3:
+                row["flip"] = metrics.flip(*shown)
             rows.append({"scene": scene.name, "depth": kind, "renderer": name, **row})
+            pictures[name] = picture
         window = _worst(pictures["torchdof"], scene, side)
         for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
             panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))

@@ -6,7 +6,7 @@ import math
 import random
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as functional
@@ -17,12 +17,10 @@ from ..reference import metrics
 from ..reference.scenes import posts, waves
 from . import memory
 
-__all__ = ["TIMES", "BenchScene", "Renderer", "Seconds", "measure", "shipped", "timed"]
-
-TIMES = ("new_ms", "spread_ms", "cpu_ms", "again_ms", "over_again", "beside_ms", "over_beside")
-"""Columns of times, as :data:`torchdof.bench.report.LEGEND` explains them."""
+__all__ = ["BenchScene", "Renderer", "Seconds", "error", "measure", "peak_of", "shipped", "timed"]
 
 _LEAST_PX = 16
+_Result = TypeVar("_Result")
 
 
 class Seconds(NamedTuple):
@@ -99,27 +97,19 @@ class BenchScene:
 
 
 def measure(
-    blur: Renderer,
-    scene: BenchScene,
-    wanted: Callable[[], Tensor] | None = None,
-    beside: Callable[[], Any] | None = None,
-    again: bool = True,
-    peak: bool = False,
-) -> tuple[dict[str, float], Tensor]:
-    """Renders a scene for the first time, then the same again, then a reference run.
+    blur: Renderer, scene: BenchScene, beside: Callable[[], Any] | None = None, again: bool = True
+) -> tuple[Tensor, dict[str, float]]:
+    """Renders a scene by a camera that was not rendered before, then the same again, then a reference run.
 
     Args:
         blur: What renders.
-        scene: By a camera that was not rendered before.
-        wanted: The right picture; None measures no error.
+        scene: By that camera.
         beside: The reference run; None is unit Y, a depthwise 17 x 17 convolution of ``[1, 16, 540, 960]``, channels
             last: times over its time compare between machines.
         again: Whether to render the same again.
-        peak: Whether to watch the memory, for which the process gives back first what it holds unused.
 
     Returns:
-        A row, whose columns :data:`torchdof.bench.report.LEGEND` explains, NaN being what was not measured; and the
-        picture.
+        The picture, and a row whose columns :data:`torchdof.bench.report.LEGEND` explains.
 
     Raises:
         RuntimeError: If the picture is not finite.
@@ -127,22 +117,29 @@ def measure(
     if beside is None:
         frame = torch.rand(1, 16, 540, 960).contiguous(memory_format=torch.channels_last)
         beside = functools.partial(functional.conv2d, frame, torch.rand(16, 1, 17, 17), padding=8, groups=16)
-    held_mb = memory.reset_peak() if peak else math.nan
     time.sleep(0.02)  # PyTorch's threads spin for a while after each operation
     picture, new = timed(blur, scene.image, scene.coc_px)
-    peak_mb = memory.peak_mb() - held_mb
-    same = timed(blur, scene.image, scene.coc_px)[1] if again else Seconds(math.nan)
-    reference = timed(beside)[1]
     if not bool(picture.isfinite().all()):
         raise RuntimeError(f"{scene.name}: the picture is not finite")
-    ratios = (new.cpu / same.cpu, 1e3 * reference.wall, new.cpu / reference.cpu)
-    row = dict(zip(TIMES, (1e3 * new.wall, 0.0, 1e3 * new.cpu, 1e3 * same.wall, *ratios), strict=True))
-    row |= {"peak_mb": peak_mb, **dict.fromkeys(("rms_255", "psnr_db", "ssim"), math.nan)}
-    if wanted is not None:
-        shown, right = metrics.display(picture), metrics.display(wanted())
-        row["rms_255"] = 255 * math.sqrt(float((shown.double() - right.double()).square().mean()))
-        row |= {"psnr_db": metrics.psnr(shown, right), "ssim": metrics.ssim(shown, right)}
-    return row, picture
+    row = {"new_ms": 1e3 * new.wall, "spread_ms": 0.0, "cpu_ms": 1e3 * new.cpu}
+    if again:
+        same = timed(blur, scene.image, scene.coc_px)[1]
+        row |= {"again_ms": 1e3 * same.wall, "over_again": new.cpu / same.cpu}
+    reference = timed(beside)[1]
+    return picture, row | {"beside_ms": 1e3 * reference.wall, "over_beside": new.cpu / reference.cpu}
+
+
+def error(picture: Tensor, wanted: Tensor) -> dict[str, float]:
+    """How far a picture is from the right one, as displayed: RMS of 255, PSNR in dB, SSIM."""
+    shown, right = metrics.display(picture), metrics.display(wanted)
+    rms = math.sqrt(float((shown.double() - right.double()).square().mean()))
+    return {"rms_255": 255 * rms, "psnr_db": metrics.psnr(shown, right), "ssim": metrics.ssim(shown, right)}
+
+
+def peak_of(work: Callable[[], _Result]) -> tuple[_Result, float]:
+    """What a call returns, and by how many MiB resident memory grew; beforehand what was held unused is given back."""
+    held_mb = memory.reset_peak()
+    return work(), memory.peak_mb() - held_mb
 
 
 def shipped(height: int = 540, width: int = 960) -> BenchScene:

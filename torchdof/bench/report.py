@@ -4,7 +4,6 @@ import contextlib
 import csv
 import importlib.metadata
 import io
-import math
 import os
 import platform
 import statistics
@@ -33,25 +32,25 @@ LEGEND = (
 
 
 def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float]], float]) -> list[Row]:
-    """A row for each combination of what stands under the keys: means of columns of fractions, but for their NaN.
+    """A row for each combination of what stands under the keys: means of what its rows hold as fractions.
 
     Example:
         >>> rows = [{"a": "x", "new_ms": v, "spread_ms": 0.0} for v in (4.0, 1.0, 2.0, 3.0, 20.0)]
         >>> summary(rows, ["a"], statistics.median)
         [{'a': 'x', 'new_ms': 3.0, 'spread_ms': 2.0}]
     """
-    groups: dict[tuple[Any, ...], list[Row]] = {}
+    groups: dict[tuple[Any, ...], dict[str, list[float]]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+        columns = groups.setdefault(tuple(row[key] for key in keys), {})
+        for name, value in row.items():
+            if isinstance(value, float) and name not in keys:
+                columns.setdefault(name, []).append(value)
     found = []
-    for of, group in groups.items():
-        measured = [name for name, value in group[0].items() if isinstance(value, float) and name not in keys]
-        values = {name: [row[name] for row in group if not math.isnan(row[name])] for name in measured}
-        means = {name: mean(value) if value else math.nan for name, value in values.items()}
-        if len(values["new_ms"]) > 1:
-            low, _, high = statistics.quantiles(values["new_ms"], n=4, method="inclusive")
-            means["spread_ms"] = high - low
-        found.append(dict(zip(keys, of, strict=True)) | means)
+    for values, columns in groups.items():
+        found.append(dict(zip(keys, values, strict=True)) | {name: mean(of) for name, of in columns.items()})
+        if len(columns.get("new_ms", ())) > 1:
+            low, _, high = statistics.quantiles(columns["new_ms"], n=4, method="inclusive")
+            found[-1]["spread_ms"] = high - low
     return found
 
 
@@ -67,7 +66,7 @@ def publish(
 
     Args:
         title: Above everything.
-        tables: Rows by what stands above them, all of a table with the same columns.
+        tables: Rows by what stands above them; what one lacks stays empty.
         remarks: Paragraphs, which hardware, threads, versions and :data:`LEGEND` precede.
         stem: Folder and name of the files; None writes none.
         picture: Writes a picture to a path; None: there is none.
@@ -84,9 +83,10 @@ def publish(
     console = Console(quiet=quiet)
     text = [f"# {title}", machine, LEGEND, *remarks]
     for number, (name, rows) in enumerate(tables.items()):
-        head, body = list(rows[0]), [[_cell(value) for value in row.values()] for row in rows]
+        head = list(dict.fromkeys(column for row in rows for column in row))
+        body = [[_cell(row.get(column, "")) for column in head] for row in rows]
         if number == 0:
-            words = [column for column, value in rows[0].items() if isinstance(value, str)]
+            words = [column for column in head if isinstance(rows[0].get(column), str)]
             print_columns(console, name, dict(zip(head, zip(*body, strict=True), strict=True)), words)
         lines = ["| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)]
         text.append(f"## {name}\n\n" + "\n".join(lines))
@@ -94,7 +94,7 @@ def publish(
     if stem is None:
         return
     numbers = io.StringIO()
-    writer = csv.DictWriter(numbers, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(numbers, head, lineterminator="\n")
     writer.writeheader()
     writer.writerows({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows)
     with contextlib.ExitStack() as files:

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..module import DepthOfField, blur_by_coc
 from ..optics.camera import Camera
 from ..validation import whole
-from .measurement import TIMES, BenchScene, Renderer, Seconds, measure, timed
+from .measurement import BenchScene, Renderer, Seconds, error, measure, peak_of, timed
 from .report import Row, publish, summary
 
 __all__ = ["Runtime", "compare", "report", "works"]
@@ -57,15 +57,12 @@ def works(
     ]
     for name, level, render, seen in ways:
         setting = name + " without occlusion" * (not occlusion)
-        facts = {
-            "setting": setting,
-            "tolerance": level / 255,
-            "frame": f"{seen.image.shape[-1]} x {seen.image.shape[-2]}",
-        }
-        if seen in (scene, small):
-            yield facts, render, seen, True
+        frame = f"{seen.image.shape[-1]} x {seen.image.shape[-2]}"
+        facts = {"setting": setting, "tolerance": level / 255, "frame": frame}
         for camera in seen.pull(repeat) if name.startswith("focus pull") else seen.cameras(repeat, 0.7, setting):
             yield facts, render, camera, False
+        if seen in (scene, small):
+            yield facts, render, seen, True
 
 
 def _prepared(runtime: Runtime, scene: BenchScene, occlusion: bool) -> Renderer:
@@ -118,12 +115,14 @@ def compare(
             exact = functools.cache(lambda camera, dense=dense: dense(camera.image, camera.coc_px))
             todo = list(works(scene, occlusion, repeat, runtimes, scan))
             for facts, blur, camera, is_own in track(todo, "", console=console, transient=True, disable=silent):
-                wanted = functools.partial(exact, camera) if is_own else None
-                again = not is_own and not facts["setting"].startswith("fresh process")
-                row = measure(blur, camera, wanted, again=again, peak=is_own)[0]
-                rows.append(facts | row | dict.fromkeys(TIMES if is_own else (), math.nan))
+                if is_own:
+                    (picture, _), peak_mb = peak_of(functools.partial(timed, blur, camera.image, camera.coc_px))
+                    rows.append({**facts, "peak_mb": peak_mb, **error(picture, exact(camera))})
+                else:
+                    again = not facts["setting"].startswith("fresh process")
+                    rows.append(facts | measure(blur, camera, again=again)[1])
     found = summary(rows, ["setting", "tolerance", "frame"], statistics.median)
-    return [{**row, "kept": not row["rms_255"] > 255 * (row["tolerance"] + _ROUNDING)} for row in found]
+    return [{**row, "kept": row.get("rms_255", 0.0) <= 255 * (row["tolerance"] + _ROUNDING)} for row in found]
 
 
 def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool = False) -> None:
@@ -155,7 +154,7 @@ def _plot(path: Path, rows: Sequence[Row], title: str) -> None:
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     for row in rows:
-        if row["rms_255"] > 0 and row["frame"] == rows[0]["frame"]:
+        if row.get("rms_255", 0.0) > 0 and row["frame"] == rows[0]["frame"]:
             colour = "#1d4ed8" if row["setting"].endswith("without occlusion") else "#c2410c"
             axes.loglog(row["new_ms"], row["rms_255"], "o", color=colour)
             axes.annotate(row["setting"], (row["new_ms"], row["rms_255"]), fontsize=6, color=colour)

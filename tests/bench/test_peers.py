@@ -1,0 +1,67 @@
+"""Other tools blur by the circle of confusion that they are given."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from torchdof import blur_by_coc
+from torchdof.bench.accuracy import read_peer
+from torchdof.reference.ikoma import layered_fft
+
+TOOLS = Path(__file__).parents[2] / "examples" / "benchmarks" / "tools"
+SIDE = 65
+
+
+def wrong(blur: Any, radius_px: float) -> str:
+    """What is wrong with three dots, in focus, behind it and in front of it; empty if nothing is.
+
+    Each keeps its light within 3 %, its place within 0.75 px, and has the width (by second moments) of a disc of the
+    radius within 5 %, or within 1 px in focus.
+    """
+    place, radii = torch.arange(SIDE, dtype=torch.float64) - SIDE // 2, torch.tensor([0.0, radius_px, -radius_px])
+    image = torch.zeros(1, 3, SIDE, 3 * SIDE)
+    image[..., SIDE // 2, SIDE // 2 :: SIDE] = 8.0
+    out = blur(image, radii.repeat_interleave(SIDE).repeat(1, 1, SIDE, 1))
+    out = out[0] if isinstance(out, tuple) else out
+    if out.shape != image.shape or not bool(out.isfinite().all()):
+        return f"{list(out.shape)}, not finite numbers {list(image.shape)}"
+    for radius, dot in zip(radii.tolist(), out[0].double().mean(0).split(SIDE, 1), strict=True):
+        light = float(dot.sum())
+        y, x = (float((dot.sum(axis) * place).sum()) / light for axis in (1, 0))
+        square = float((dot * ((place[:, None] - y) ** 2 + (place - x) ** 2)).sum()) / light
+        disc_px = math.sqrt(max(2.0 * (square - 1.0 / 6.0), 0.0))  # a pixel itself has 1 / 6
+        if abs(light / 8.0 - 1.0) > 0.03:
+            return f"{radius:g} px: {light / 8.0:.3f} of its light"
+        if max(abs(x), abs(y)) > 0.75:
+            return f"{radius:g} px: moved by {x:.2f}, {y:.2f} px"
+        if abs(disc_px - abs(radius)) > (0.05 * abs(radius) or 1.0):
+            return f"{radius:g} px: as by a disc of {disc_px:.2f} px"
+    return ""
+
+
+@pytest.mark.parametrize("name", ["torchdof", "blender", "ffmpeg", "gegl", "ikoma", "kornia_bins"])
+def test_a_renderer_blurs_by_the_circle_of_confusion_that_it_is_given(name: str) -> None:
+    blur: Any = blur_by_coc
+    if name != "torchdof":
+        try:
+            blur = read_peer(TOOLS / f"{name}.py")[1]
+        except ValueError as error:
+            pytest.skip(str(error))
+    assert wrong(blur, 6.0) == wrong(blur, 11.3) == ""
+
+
+@pytest.mark.parametrize(
+    "blur, told",
+    [
+        (lambda image, coc: image, "6 px: as by a disc of 0.00 px"),
+        (lambda image, coc: layered_fft(image, coc.clamp_min(0)), "-6 px: as by a disc of 0.00 px"),
+        (lambda image, coc: 0.9 * layered_fft(image, coc), "0 px: 0.900 of its light"),
+        (lambda image, coc: layered_fft(image, coc).roll(1, -1), "0 px: moved by 1.00, 0.00 px"),
+        (lambda image, coc: layered_fft(image, coc)[..., 1:], "[1, 3, 65, 194], not finite numbers [1, 3, 65, 195]"),
+    ],
+)
+def test_a_renderer_that_does_something_else_is_found(blur: Any, told: str) -> None:
+    assert wrong(blur, 6.0) == told
