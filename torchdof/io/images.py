@@ -72,6 +72,11 @@ class Picture:
         """Whether the last channel is alpha."""
         return self.channels[-1] == "A"
 
+    @property
+    def light(self) -> Tensor:
+        """The pixels without alpha."""
+        return self.pixels[:, :-1] if self.has_alpha else self.pixels
+
 
 def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, layer: str | None = None) -> Picture:
     """Reads an image into linear light.

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from .. import native
 from ..optics.blur_table import BlurTable
@@ -298,8 +299,12 @@ _constants = KernelCache(64 * 2**20)
 
 def _constant_bank(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> tuple[Tensor, ...]:
     """Kernels of layers in what is traced, where they are constants: made before, and kept."""
-    key = (table.fingerprint(), tuple(coc_px), width, tuple(scales))
-    return _constants.get(key, lambda: tuple(_layer_kernels(table, coc_px, width, scales)))
+
+    def made() -> tuple[Tensor, ...]:
+        with _disable_current_modes():  # numbers, not what is traced
+            return tuple(_layer_kernels(table, coc_px, width, scales))
+
+    return _constants.get((table.fingerprint(), tuple(coc_px), width, tuple(scales)), made)
 
 
 def _constant_shapes(
