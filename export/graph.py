@@ -143,6 +143,7 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
     image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0
     example = (image, map_, *(torch.full(size[:1], value) for value in (1.5, 2.8)[: len(INPUTS[portable.inputs]) - 2]))
+    portable.plan.keep_constants(table, portable.dof.options.method == "layered")
     free = torch.export.Dim.AUTO
     batch, frame = {0: free}, {0: free, 2: free, 3: free}
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))

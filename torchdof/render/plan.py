@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import _disable_current_modes
 
 from .. import native
 from ..optics.blur_table import BlurTable
@@ -219,6 +218,10 @@ class Plan:
         shares = self.shares(table, scales, (int(size[0]), int(size[1])))
         return [Blur(*each) for each in zip(bank, scales, shares, strict=True)]
 
+    def keep_constants(self, table: BlurTable, coarse: bool) -> None:
+        """Makes the kernels that a trace then takes as constants, none of them cut to a frame."""
+        _constant_bank(table, self.coc_px, *self.layer_sizes(table, (1, 1), coarse))
+
     def shares(
         self, table: BlurTable, scales: Sequence[int], size: tuple[int, int], like: Tensor | None = None
     ) -> list[Shares]:
@@ -299,12 +302,8 @@ _constants = KernelCache(64 * 2**20)
 
 def _constant_bank(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> tuple[Tensor, ...]:
     """Kernels of layers in what is traced, where they are constants: made before, and kept."""
-
-    def made() -> tuple[Tensor, ...]:
-        with _disable_current_modes():  # numbers, not what is traced
-            return tuple(_layer_kernels(table, coc_px, width, scales))
-
-    return _constants.get((table.fingerprint(), tuple(coc_px), width, tuple(scales)), made)
+    key = (table.fingerprint(), tuple(coc_px), width, tuple(scales))
+    return _constants.get(key, lambda: tuple(_layer_kernels(table, coc_px, width, scales)))
 
 
 def _constant_shapes(
