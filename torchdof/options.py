@@ -22,7 +22,6 @@ __all__ = [
     "read_state",
     "spells_options",
     "tolerance_of",
-    "tolerance_of_text",
 ]
 
 Method = Literal["layered", "fold"]
@@ -182,22 +181,6 @@ def tolerance_of(value: Any) -> float:
         names = ", ".join(repr(name) for name in NAMED)
         raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, or one of {names}, got {show(value)}")
     return value
-
-
-def tolerance_of_text(text: str) -> float:
-    """The tolerance that a command line's words mean: a number or a name.
-
-    Raises:
-        ValueError: As :func:`tolerance_of`.
-
-    Example:
-        >>> tolerance_of_text("0.01"), tolerance_of_text("final") == 1 / 255
-        (0.01, True)
-    """
-    try:
-        return tolerance_of(float(text))
-    except ValueError:
-        return tolerance_of(text)
 
 
 def read_state(state: Any) -> tuple[Camera, Options]:

@@ -38,19 +38,10 @@ def test_a_folder_becomes_a_table_with_pictures(folder: Path, tmp_path: Path) ->
     table = BlurTable.load(tmp_path / "mine.json")
     assert table.family == "disc" and len(table.coc) == 3 and table.name == "my lens"
     assert table.provenance["command"].startswith("torchdof fit ")
-    assert "±" in result.output and "family: disc" in result.output and "x noise" in result.output
+    assert all(words in result.output for words in ("±", "family: disc", "x noise")) and "warning" not in result.output
     assert sorted(f.name for f in (tmp_path / "pictures").iterdir()) == [
         "mine_1000mm.png", "mine_400mm.png", "mine_800mm.png", "mine_table.png", "mine_texture.png",
     ]  # fmt: skip
-
-
-def test_json_holds_the_fits(folder: Path, tmp_path: Path) -> None:
-    result = run(folder, "-o", tmp_path / "mine.json", "--family", "disc", "--json")
-    assert result.exit_code == 0, result.output
-    facts = json.loads(result.stdout)
-    assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
-    assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
-    assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"]) and facts["warnings"] == []
 
 
 def test_pictures_whose_transfer_nobody_stated_are_said(folder: Path, tmp_path: Path) -> None:
@@ -60,8 +51,11 @@ def test_pictures_whose_transfer_nobody_stated_are_said(folder: Path, tmp_path: 
     result = run(tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc")
     assert result.exit_code == 0, result.output
     assert "warning: " in result.output and "nobody said how 0500mm.png and 3 more are encoded" in result.output
-    result = run(tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json")
-    assert "nobody said how 0500mm.png" in json.loads(result.stdout)["warnings"][0]
+    facts = json.loads(run(tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json").stdout)
+    assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
+    assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
+    assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"])
+    assert "nobody said how 0500mm.png" in facts["warnings"][0]
 
 
 def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(simulator: ModuleType, tmp_path: Path) -> None:
@@ -108,8 +102,6 @@ def test_the_target_is_written_and_nothing_else(tmp_path: Path) -> None:
     result = run("--target", tmp_path / "target.pdf", "--paper", "letter")
     assert result.exit_code == 0, result.output
     assert (tmp_path / "target.pdf").read_bytes().startswith(b"%PDF") and "print it at 100 %" in result.output
-    assert run("somewhere", "--target", tmp_path / "other.pdf").exit_code == 2
-    assert not (tmp_path / "other.pdf").exists()
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")

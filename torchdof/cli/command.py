@@ -55,15 +55,15 @@ def argument(help: str, metavar: str, default: Any = ...) -> Any:
     return option(help, default, metavar=metavar, names=("argument",))
 
 
-def numbers(count: int, expected: str) -> Callable[[str], tuple[float, ...]]:
-    """Reads so many numbers with commas between them; what was expected is the message where there are others."""
+def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ...]]:
+    """Reads so many numbers, or any, with commas between them; the message of an error is what was expected."""
 
     def read(text: str) -> tuple[float, ...]:
         try:
             values = tuple(map(float, text.split(",")))
         except ValueError:
             values = ()
-        if len(values) != count:
+        if len(values) != count and (count is not None or not values):
             raise ValueError(f"{expected}, got {text!r}")
         return values
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import click
 
 from .command import option
-from .options import Accuracy, Blur, Sensor, edges_option, json_option
+from .options import Accuracy, Blur, Sensor, edges_of, edges_option, json_option
 from .printed import Bar, json_line
 
 __all__ = ["Export"]
@@ -86,7 +86,7 @@ class Export:
                 dof,
                 self.out,
                 **dataclasses.asdict(self.graph),
-                depth_edges=self.depth_edges.replace("-", " "),
+                depth_edges=edges_of(self.depth_edges),
                 progress=bar.tell,
             )
         facts = {"out": str(self.out), **dataclasses.asdict(report)}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from torchdof.cli.command import argument, option
+from torchdof.cli.command import argument, numbers, option
 from torchdof.cli.options import json_option
 from torchdof.cli.printed import Bar, json_line
 
@@ -23,25 +23,20 @@ if TYPE_CHECKING:
 __all__ = ["Fit"]
 
 
+_micrometres = numbers(None, "--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45")
+_WANTED = "--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6"
+
+
 def _wavelengths(text: str) -> tuple[float, ...]:
     """Micrometres; none stands for red, green and blue."""
-    try:
-        return () if text == "rgb" else tuple(map(float, text.split(",")))
-    except ValueError:
-        raise ValueError(f"--wavelengths takes rgb, or micrometres like 0.65,0.55,0.45; got {text}") from None
+    return () if text == "rgb" else _micrometres(text)
 
 
 def _radii(text: str) -> tuple[float, ...]:
     """Distances from the middle of the frame, in mm, rising from 0."""
-    try:
-        radii_mm = tuple(map(float, text.split(",")))
-    except ValueError:
-        radii_mm = ()
-    rising = all(low < high < math.inf for low, high in pairwise(radii_mm))
-    if not (len(radii_mm) > 1 and radii_mm[0] == 0 and rising):
-        raise ValueError(
-            f"--field takes distances in mm from the middle of the frame, rising from 0, like 0,7,14,21.6; got {text}"
-        )
+    radii_mm = numbers(None, _WANTED)(text)
+    if len(radii_mm) < 2 or radii_mm[0] != 0 or not all(low < high < math.inf for low, high in pairwise(radii_mm)):
+        raise ValueError(f"{_WANTED}, got {text!r}")
     return radii_mm
 
 

@@ -25,7 +25,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..validation import coc_of_lens, same_aspect
-from .options import Scene, pick_device
+from .options import Scene, edges_of, pick_device
 from .printed import Bar, WarnOnce, json_line
 
 if TYPE_CHECKING:
@@ -206,8 +206,9 @@ class Renderer:
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
             table = _with_alpha(self.table) if picture.has_alpha else self.table
-            edges: Any = command.depth_edges.replace("-", " ")
-            blur = functools.partial(blur_by_coc, table=table, depth_edges=edges, **command.accuracy.options())
+            blur: Callable[..., Tensor] = functools.partial(
+                blur_by_coc, table=table, depth_edges=edges_of(command.depth_edges), **command.accuracy.options()
+            )
             with torch.no_grad():
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.expect(_seconds(blur, pixels, coc_px))
@@ -257,7 +258,7 @@ class Renderer:
         return words, facts
 
 
-def _seconds(blur: Callable[[Tensor, Tensor], Tensor], pixels: Tensor, coc_px: Tensor) -> float:
+def _seconds(blur: Callable[..., Tensor], pixels: Tensor, coc_px: Tensor) -> float:
     """How long an image is expected to take, by a strip across its middle."""
     start, height = time.perf_counter(), pixels.shape[-2]
     strip = (..., slice(height // 2, height // 2 + math.ceil(height / _STRIPS)), slice(None))

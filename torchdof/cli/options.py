@@ -31,6 +31,7 @@ __all__ = [
     "Opening",
     "Scene",
     "Sensor",
+    "edges_of",
     "edges_option",
     "json_option",
     "pick_device",
@@ -148,7 +149,7 @@ class Lens(Sensor):
             with _by_option(self._names()):
                 camera = Camera.from_fov(self.fov_deg, radius_m, focus_m).replace(**moved)
         else:
-            lens: dict[str, float] = {}
+            lens: dict[str, Any] = {}
             for name, assumed in _ASSUMED.items():
                 stated = getattr(self, name)
                 lens[name] = facts.get(name, assumed) if stated is None else stated
@@ -334,6 +335,11 @@ def edges_option(default: str) -> Any:
         default,
         group="Depth map",
     )
+
+
+def edges_of(name: str) -> Any:
+    """What the library calls that."""
+    return name.replace("-", " ")
 
 
 def json_option() -> Any:

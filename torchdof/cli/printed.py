@@ -85,8 +85,8 @@ class Bar:
         total: How many steps there are; None where nobody knows.
 
     Attributes:
+        what: What is being done now.
         done: Steps done.
-        expected_s: How long the step at hand is expected to take, from the moment that this was set.
     """
 
     def __init__(self, what: str, total: float | None = None) -> None:

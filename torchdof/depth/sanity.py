@@ -151,8 +151,8 @@ def _mistakes(
     ends = camera.focus_range_m or (camera.focus_m, camera.focus_m)
     before = torch.where(known <= float(ends[1]), known, nearest).max()
     behind = torch.where(known >= float(ends[0]), known, farthest).min()
-    told = torch.stack([before, behind, known.new_tensor(nearest), known.new_tensor(farthest)])
-    blur = camera.coc_px(torch.cat([told, _sample(known)]).reshape(1, 1, 1, -1), width).abs().flatten()
+    decisive = torch.stack([before, behind, known.new_tensor(nearest), known.new_tensor(farthest)])
+    blur = camera.coc_px(torch.cat([decisive, _sample(known)]).reshape(1, 1, 1, -1), width).abs().flatten()
     least, largest, blur = float(blur[:2].min()), float(blur[2:4].max()), blur[4:]
     extent = f"({near:.4g} to {far:.4g} m)" if near < far else f"({near:.4g} m)"
     of_bits = far <= 65535 and _whole_numbers(finite)
