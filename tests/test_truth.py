@@ -11,12 +11,11 @@ import torch
 
 import torchdof.render
 from torchdof import DepthOfField
-from torchdof.optics import placed_kernels
+from torchdof.optics import kernel_bank, placed_kernels
 from torchdof.optics.kernel_cache import KernelCache
 from torchdof.reference import metrics
 from torchdof.reference.ikoma import ikoma
 from torchdof.reference.scenes import Scene, read_scenes
-from torchdof.render import downsampling, plan
 
 SCENES = {scene.name: scene for scene in read_scenes(Path(__file__).parent / "data" / "scenes")}
 GAIN_DB = {"planes/0": 3.5, "room/1": 4.0, "highlights/0": 3.0}
@@ -73,16 +72,14 @@ def test_rms_error_against_exact_layers_stays_below_the_tolerance(name: str, tol
 
 SPEED_OR_ROUNDING = {
     "attention._ALIGN",
-    "compiled._AT_ONCE",
     "composite._LEAST",
     "convolution.CHANNELS",
     "convolution.DIRECT_TAPS",
     "convolution._FOURIER_STEP",
     "downsampling._CANDIDATES",
-    "downsampling._LARGEST_PX",
-    "downsampling._MOMENT_REACH",
     "downsampling._PERIOD",
-    "downsampling._STEP_PX",
+    "downsampling._RADIUS_PX",
+    "downsampling._SCALE",
     "headroom._SUMMED",
     "highlights.COARSE_CELL",
     "highlights._TAPS",
@@ -158,8 +155,8 @@ def test_what_is_held_elsewhere_exists() -> None:
 @pytest.mark.parametrize("name", sorted(set(numbers()) - SPEED_OR_ROUNDING - HELD_BESIDE_IT))
 def test_twice_a_number_is_another_picture(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
-    monkeypatch.setattr(plan, "_kernels", KernelCache(2**28))
-    monkeypatch.setattr(downsampling, "_factors", KernelCache(2**20))
+    monkeypatch.setattr(kernel_bank, "_templates", KernelCache(2**28))
+    kernel_bank._bank.cache_clear()
     value, constant = value_of(name), name.split(".")[1]
     twice = tuple(2 * part for part in value) if isinstance(value, tuple) else 2 * value
     for module in [m for key, m in sys.modules.items() if key.startswith(FOLDERS)]:

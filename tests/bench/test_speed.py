@@ -17,9 +17,7 @@ from torch import Tensor
 from torchdof import Camera, DepthOfField, blur_by_coc
 from torchdof.bench import speed
 from torchdof.bench.measurement import BenchScene, shipped, timed
-from torchdof.cli.bench import from_files
 from torchdof.cli.main import app
-from torchdof.cli.settings import RenderSettings
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.reference import metrics
 
@@ -152,16 +150,22 @@ def test_bench_measures_the_lens_and_focus_that_it_is_told(
     blur = {f["setting"]: blur for f, blur, _, _ in speed.works(measured[0], True, 1)}["exact"]
     even = blur_by_coc(measured[0].image, measured[0].coc_px, tolerance=0.0)
     assert float((blur(measured[0].image, measured[0].coc_px) - even).abs().max()) > 0.01
-    stated = from_files(*files, RenderSettings(focus=[(0, 1.0)]))
+    for options in (("--focus-m", 1.0), ("--depth-kind", "coc", "--depth-scale", 2.0)):
+        assert run(*files, *options, "--json").exit_code == 0
+    _, stated, given = measured
     assert float(stated.coc_px.min()) == pytest.approx(0.0, abs=1e-5) and "focus as stated" in stated.remark
-    given = from_files(*files, RenderSettings(depth_kind="coc", depth_scale=2.0))
     assert float(given.coc_px.max()) == pytest.approx(8.0)
 
 
-def test_alpha_is_left_out(tmp_path: Path) -> None:
+def test_alpha_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[BenchScene] = []
+    monkeypatch.setattr(
+        speed, "compare", lambda scene, *_: measured.append(scene) or [{"setting": "exact", "kept": True}]
+    )
     write_image(tmp_path / "a.exr", Picture(torch.full((1, 4, 20, 24), 0.5), ("R", "G", "B", "A")))
     write_image(tmp_path / "d.exr", Picture(torch.full((1, 1, 20, 24), 2.0), ("Y",)))
-    assert from_files(tmp_path / "a.exr", tmp_path / "d.exr", RenderSettings()).image.shape[1] == 3
+    assert run(tmp_path / "a.exr", tmp_path / "d.exr", "--json").exit_code == 0
+    assert measured[0].image.shape[1] == 3
 
 
 @pytest.mark.parametrize(

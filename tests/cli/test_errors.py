@@ -93,7 +93,6 @@ tables nothing                                   | no blur table 'nothing'
 tables --rotation 5                              | --rotation turns blades or an image
 bench --focus-m 2                                | the built-in scene has its own camera and depth
 bench --views 3                                  | name its folder with --truth
-bench image.exr depth.npy -o nowhere             | nowhere: there is no such folder
 export                                           | give either -o FILE to write or --show FILE to read
 export -o dof.onnx --show dof.onnx               | give either -o FILE
 export -o dof.bin                                | name it dof.onnx

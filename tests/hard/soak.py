@@ -18,11 +18,11 @@ from pathlib import Path
 import torch
 
 from torchdof import BlurTable, Camera, DepthOfField
-from torchdof.optics import placed_kernels, psf
+from torchdof.optics import kernel_bank, placed_kernels, psf
 from torchdof.optics.field import Field
-from torchdof.render import compiled, downsampling, plan
+from torchdof.render import plan
 
-CACHES = [plan._kernels, compiled._kernels, placed_kernels._shares, psf._quadrants, downsampling._factors]
+CACHES = [kernel_bank._templates, plan._constants, placed_kernels._shares, psf._quadrants]
 
 
 def lens_with_a_field() -> BlurTable:
