@@ -21,7 +21,7 @@ FLOORS = {
     "exporting": set(),
     "pixels": {"validation", "exporting"},
     "io": {"validation"},
-    "optics": {"validation", "io"},
+    "optics": {"validation", "native", "io"},
     "depth": {"validation", "pixels", "native", "io", "optics"},
     "options": {"validation", "optics", "depth"},
     "render": {"validation", "exporting", "pixels", "native", "optics", "options"},

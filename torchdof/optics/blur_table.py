@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 
 from ..validation import WHOLE_NUMBERS, floating, number, pixels_wide, real_tensor, show
@@ -335,6 +336,8 @@ class BlurTable:
         params = self.params(coc_px, width)
         if coc_px.ndim != 1 or not coc_px.numel():
             raise ValueError(f"coc_px must be [n] in pixels, got {list(coc_px.shape)}")
+        if not self.is_differentiated and self.field is None:
+            return self._from_templates(coc_px, width, size, window)
         kernels = psf.pixel_kernels(self.family, params, size, window, self.aperture).transpose(0, 1)
         if not self.is_round:
             behind = (coc_px.detach() >= 0).to(kernels.device)[:, None, None, None]
@@ -346,6 +349,18 @@ class BlurTable:
         centre = torch.zeros_like(kernels)
         centre[..., kernels.shape[-2] // 2, kernels.shape[-1] // 2] = 1.0
         return torch.lerp(centre, kernels, fade)
+
+    def _from_templates(self, coc_px: Tensor, width: float, size: int | None, window: int | None) -> Tensor:
+        """Kernels of :meth:`kernels` where no gradient to the aperture is taken."""
+        from .kernel_bank import bank_of  # which knows tables
+
+        signed = coc_px.to(torch.float64)
+        reach = psf.support(self.family, self.params(signed.detach(), width), self.aperture)
+        whole = psf.half_width(reach) if size is None and window is not None else psf.width_of(size, reach) // 2
+        half = whole if window is None else min(whole, psf.width_of(window, reach) // 2)
+        made = bank_of(self).kernels(signed, width, longest=[half + 1] * len(coc_px))
+        spare = half - made.shape[-1] // 2
+        return functional.pad(made, (spare,) * 4).to(coc_px.device)
 
     def moved_in_focus(self, width: float) -> Tensor:
         """Share ``[channels]`` of its light that the table's kernel in focus moves to other pixels."""
