@@ -14,6 +14,7 @@ from ..validation import WHOLE_NUMBERS, floating, number, pixels_wide, real_tens
 from . import psf, table_file
 from .aperture import Aperture, Number
 from .field import Field
+from .kernel_bank import FADE_IN, bank_of
 
 __all__ = ["BlurTable"]
 
@@ -25,8 +26,6 @@ _SMALLEST, _LARGEST = 1e-100, 1e100  # of parameters: their sums and products ar
 _STEEPEST = 100.0  # m of a tilt, whose light would lie in the tail of the edge
 _SEEN_PX = 1.5  # around a spot, in which pixels see some of it
 _RIM_POWER = 4.0  # of the radius, with which a rim grows
-FADE_IN = 4.0
-"""How much faster than a disc's blur the blur of a table in focus fades in, by the square of the coc in pixels."""
 _TRIED_AT_ONCE = 64
 _TRIED_PX = (0.5, 6.0)  # radii of the widest kernel tried
 
@@ -352,8 +351,6 @@ class BlurTable:
 
     def _from_templates(self, coc_px: Tensor, width: float, size: int | None, window: int | None) -> Tensor:
         """Kernels of :meth:`kernels` where no gradient to the aperture is taken."""
-        from .kernel_bank import bank_of  # which knows tables
-
         signed = coc_px.to(torch.float64)
         reach = psf.support(self.family, self.params(signed.detach(), width), self.aperture)
         whole = psf.half_width(reach) if size is None and window is not None else psf.width_of(size, reach) // 2

@@ -20,14 +20,15 @@ import bisect
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from ..validation import is_differentiated
 from . import psf
-from .blur_table import FADE_IN, BlurTable
+from .aperture import Aperture
+from .field import Field
 from .kernel_cache import KernelCache
 
 __all__ = ["LEAST_CELLS", "SPOT_MARGIN_PX", "KernelBank", "Spots", "bank_of"]
@@ -42,8 +43,41 @@ _BANKS = 32  # tables whose nodes are kept
 SPOT_MARGIN_PX = 1.0
 """Pixels around a spot of a field, none of whose light is at the border of its samples."""
 
+FADE_IN = 4.0
+"""How much faster than a disc's blur the blur of a table in focus fades in, by the square of the coc in pixels."""
+
 _WIDTHS = 64  # widths of images for which a table's blur in focus is kept
 _templates = KernelCache(128 * 2**20)
+
+
+class Lens(Protocol):
+    """What a bank asks of a table: :class:`torchdof.BlurTable`."""
+
+    family: str
+    unit: str
+    aperture: Aperture | None
+    field: Field | None
+    is_sharp_in_focus: bool
+
+    @property
+    def channels(self) -> int:
+        """Kernels at a node."""
+
+    @property
+    def is_round(self) -> bool:
+        """Whether kernels are the same turned by half."""
+
+    def fingerprint(self) -> str:
+        """Hash of all that kernels depend on."""
+
+    def px_per_unit(self, width: float) -> float:
+        """Pixels of an image of a width that the table's unit is long."""
+
+    def side_nodes(self, sign: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Unsigned coc and parameters of the nodes of one side of focus."""
+
+    def moved_in_focus(self, width: float) -> Tensor:
+        """Share of its light that the kernel in focus moves."""
 
 
 class Spots(NamedTuple):
@@ -94,7 +128,7 @@ class _Place(NamedTuple):
     reach_slopes: list[float]
 
 
-def bank_of(table: BlurTable) -> "KernelBank":
+def bank_of(table: Lens) -> "KernelBank":
     """The bank of a table; tables of the same numbers share it."""
     return _bank(table.fingerprint(), _Same(table))
 
@@ -102,7 +136,7 @@ def bank_of(table: BlurTable) -> "KernelBank":
 class _Same:
     """A table as an argument that does not count for :func:`functools.lru_cache`: its fingerprint does."""
 
-    def __init__(self, table: BlurTable) -> None:
+    def __init__(self, table: Lens) -> None:
         self.table = table
 
     def __eq__(self, other: object) -> bool:
@@ -128,7 +162,7 @@ class KernelBank:
         table: Its aperture's rotation and squeeze are taken as numbers, without gradients.
     """
 
-    def __init__(self, table: BlurTable) -> None:
+    def __init__(self, table: Lens) -> None:
         self.table, self.colours, self.is_even = table, table.channels, table.field is not None
         self.squeeze = 1.0 if table.aperture is None else float(table.aperture.squeeze)
         self.widest = max(1.0, 1.0 / self.squeeze)
