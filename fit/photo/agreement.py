@@ -8,38 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from torchdof.optics.camera import Camera
-
-from ..problems import CameraError, CameraWarning, warn
+from ..problems import FitError, warn
 from ..result import Array, Mask
-from .manifest import Captures
-from .scale import signed_coc
+from .captures import CAMERA, Captures
 
-__all__ = ["check_agreement", "frame_width", "promised_px"]
+__all__ = ["check_agreement", "frame_width"]
 
 _TELLING_PX = 2.0  # smaller blurs are the lens's aberrations as much as its defocus
 _WARNED, _REFUSED = math.log(1.15), math.log(1.35)  # a thick lens close by differs by a tenth; one stop is 1.41
 _EXPLAINED = math.log(1.12)
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
-
-
-@dataclass(frozen=True)
-class _Reading:
-    """One way to read the numbers: what it says, and how far the blur is from what it promises."""
-
-    text: str
-    misfit: float
-
-
-def promised_px(captures: Captures) -> list[float] | None:
-    """Signed circle of confusion in px of the frame at each distance, or None where the camera is not known."""
-    camera = _camera(captures)
-    return None if camera is None else [signed_coc(camera, p.distance_m, captures.width_px) for p in captures]
 
 
 def frame_width(captures: Captures, radius_px: Sequence[float]) -> int:
@@ -53,12 +35,9 @@ def frame_width(captures: Captures, radius_px: Sequence[float]) -> int:
         radius_px: of the uniform disc with the fitted kernels' second moment, for each pair.
 
     Returns:
-        The original's width for a crop, else that of the pictures.
-
-    Warns:
-        CameraWarning: the pictures were taken for a crop.
+        The original's width for a crop, with a warning of kind "camera"; else that of the pictures.
     """
-    promised, original = promised_px(captures), captures.original_width_px
+    promised, original = captures.promised_px, captures.original_width_px
     if promised is None or original is None or original == captures.width_px:
         return captures.width_px
     scaled = _common_factor(np.abs(promised), np.asarray(radius_px))
@@ -70,7 +49,7 @@ def frame_width(captures: Captures, radius_px: Sequence[float]) -> int:
         f"taken for a crop, as which their blur is {cropped:.2f} times what the camera promises (scaled down, "
         f"{scaled:.2f} times); state full_width_px = {original} to say so, or {captures.width_px} to deny it"
     )
-    warn(CameraWarning(text, file=captures.pairs[0].files[0], number=cropped))
+    warn(text, "camera", file=captures.pairs[0].files[0], number=cropped)
     return original
 
 
@@ -82,87 +61,87 @@ def check_agreement(captures: Captures, radius_px: Sequence[float]) -> None:
         radius_px: of the uniform disc with the fitted kernels' second moment, for each pair.
 
     Raises:
-        CameraError: they differ by more than a factor of 1.35.
-
-    Warns:
-        CameraWarning: they differ by more than a factor of 1.15.
+        FitError: of kind "camera" where they differ by more than a factor of 1.35; it warns from 1.15 on.
     """
-    distance = np.array([p.distance_m for p in captures])
-    defocus = 1 / captures.focus_m - 1 / distance
-    measured, promised = np.asarray(radius_px, dtype=np.float64), promised_px(captures)
-    known = promised is not None
-    expected = np.abs(defocus) * _common_factor(np.abs(defocus), measured) if promised is None else np.abs(promised)
+    measured, promised = np.asarray(radius_px, dtype=np.float64), captures.promised_px
+    defocus = np.abs(captures.defocus)
+    expected = defocus * _common_factor(defocus, measured) if promised is None else np.abs(promised)
     telling = np.maximum(expected, measured) > _TELLING_PX
     # without a camera the first distances set the scale
-    if int(telling.sum()) < (1 if known else 3):
+    if int(telling.sum()) < (3 if promised is None else 1):
         return
     off = _misfit(expected, measured, telling)
     if off < _WARNED:
         return
-    readings = _readings(captures, expected, measured, telling, known)
-    likely = [r for r in sorted(readings, key=lambda r: r.misfit) if r.misfit < min(_EXPLAINED, 0.5 * off)]
+    readings = _readings(captures, expected, measured, telling)
+    likely = [text for misfit, text in sorted(readings, key=lambda r: r[0]) if misfit < min(_EXPLAINED, 0.5 * off)]
     worst = int(np.argmax(np.where(telling, np.abs(np.log(measured / expected)), 0.0)))
-    what = "the camera's numbers promise" if known else "the other distances promise"
+    who = "the other distances" if promised is None else "the camera's numbers"
     text = (
-        f"at {distance[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, and {what} "
+        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, and {who} promise "
         f"{expected[worst]:.3g} px; "
     )
-    cause = "; or ".join(r.text for r in likely[:2])
+    cause = "; or ".join(likely[:2])
     text += f"likely {cause}" if cause else "no single number explains it: check them all, and the picture of the fit"
-    if known and off > _REFUSED:
-        text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
-    factor = float(measured[worst] / expected[worst])
+    file, factor = captures.pairs[worst].files[1], float(measured[worst] / expected[worst])
     if off > _REFUSED:
-        raise CameraError(text, file=captures.pairs[worst].files[1], number=factor)
-    warn(CameraWarning(text, file=captures.pairs[worst].files[1], number=factor))
+        if promised is not None:
+            text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
+        raise FitError(text, "camera", file=file, number=factor)
+    warn(text, "camera", file=file, number=factor)
 
 
-def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask, known: bool) -> list[_Reading]:
-    """What one mistake could each explain: a wrong scale, a wrong distance, two exchanged, another focus."""
-    distance = np.array([p.distance_m for p in captures])
-    defocus = 1 / captures.focus_m - 1 / distance
+def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask) -> list[tuple[float, str]]:
+    """What one mistake could each explain: a wrong scale, a wrong distance, two exchanged, another focus.
+
+    Returns:
+        How far the blur is then from what the numbers promise, and what the mistake is.
+    """
+    distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
     readings = []
-    if known:
+    if captures.promised_px is not None:
         factor = _common_factor(expected, measured)
-        readings.append(_Reading(_scale_causes(captures, factor), _misfit(factor * expected, measured, telling)))
-    count = int(telling.sum())
+        readings.append((_misfit(factor * expected, measured, telling), _scale_causes(captures, factor)))
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
         text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
-        readings.append(_Reading(text, _misfit(exchanged, measured, telling)))
-    if count >= 3:
-        for i in map(int, np.flatnonzero(telling)):
-            others = telling.copy()
-            others[i] = False
-            vergence = 1 / captures.focus_m - math.copysign(measured[i] / per_dioptre, defocus[i])
-            stands = f"{1 / vergence:.3g} m" if vergence > 0 else "beyond infinity"
-            text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands}"
-            readings.append(_Reading(text, _misfit(expected, measured, others)))
-    if count >= 3 and (defocus[telling] > 0).any() and (defocus[telling] < 0).any():
+        readings.append((_misfit(exchanged, measured, telling), text))
+    if telling.sum() < 3:
+        return readings
+    for i in map(int, np.flatnonzero(telling)):
+        others = telling.copy()
+        others[i] = False
+        stands = _stands(captures, math.copysign(measured[i] / per_dioptre, defocus[i]))
+        text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands or 'beyond infinity'}"
+        readings.append((_misfit(expected, measured, others), text))
+    if (defocus[telling] > 0).any() and (defocus[telling] < 0).any():
         moved = np.linspace(-1, 1, 401) * float(np.abs(defocus).max())
         misfits = [_misfit(per_dioptre * np.abs(defocus - m), measured, telling) for m in moved]
         best = int(np.argmin(misfits))
-        vergence = 1 / captures.focus_m - moved[best]
-        if vergence > 0:
-            text = f"the lens was focused at {1 / vergence:.3g} m, not at {captures.focus_m:g} m"
-            readings.append(_Reading(text, misfits[best]))
+        stands = _stands(captures, moved[best])
+        if stands:
+            text = f"the lens was focused at {stands}, not at {captures.focus_m:g} m"
+            readings.append((misfits[best], text))
     return readings
+
+
+def _stands(captures: Captures, defocus: float) -> str:
+    """The distance of a defocus [1/m], empty where there is none."""
+    vergence = 1 / captures.focus_m - defocus
+    return f"{1 / vergence:.3g} m" if vergence > 0 else ""
 
 
 def _scale_causes(captures: Captures, factor: float) -> str:
     """Every number that could be wrong by itself if all blurs are `factor` times what is promised."""
-    focal, stops, sensor = captures.focal_length_mm, captures.f_number, captures.sensor_width_mm
-    if focal is None or stops is None or sensor is None:
-        raise AssertionError("a scale is wrong only where the camera is known")
+    focal, stops, sensor = (float(getattr(captures, name)) for name in CAMERA)
     units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED]
     causes = [f"the distances are in {name}, not in metres" for name in units]
     if factor > 1:
-        width = round(captures.width_px * factor)
         causes.append(
-            f"the pictures are a crop of frames about {width} px wide (state full_width_px, or cut them by "
-            "crop = [left, top, width, height] instead of in an editor)"
+            f"the pictures are a crop of frames about {round(captures.width_px * factor)} px wide (state "
+            "full_width_px, or cut them by crop = [left, top, width, height] instead of in an editor)"
         )
     causes += [
         f"the f-number is {stops / factor:.2g}, not {stops:g}",
@@ -170,17 +149,6 @@ def _scale_causes(captures: Captures, factor: float) -> str:
         f"the focal length is {focal * math.sqrt(factor):.3g} mm, not {focal:g}",
     ]
     return ", or ".join(causes)
-
-
-def _camera(captures: Captures) -> Camera | None:
-    if captures.focal_length_mm is None or captures.f_number is None or captures.sensor_width_mm is None:
-        return None
-    return Camera(
-        focal_length_mm=captures.focal_length_mm,
-        f_number=captures.f_number,
-        focus_m=captures.focus_m,
-        sensor_width_mm=captures.sensor_width_mm,
-    )
 
 
 def _common_factor(expected: Array, measured: Array) -> float:

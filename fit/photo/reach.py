@@ -1,9 +1,8 @@
-"""Lengths of a blur in pixels, on the sensor and on the photographed paper; and how far a table reaches."""
+"""How far a table that was measured at one focus and f-number reaches."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 
@@ -11,58 +10,10 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
 from torchdof.validation import show
 
-from ..problems import FitError, OutsideMeasuredWarning, warn
+from ..problems import FitError, warn
 from ..validation import a_number
 
-__all__ = ["check_reach", "mm_to_px", "object_m_to_px", "px_to_mm", "px_to_object_m", "signed_coc"]
-
-
-def px_to_mm(length_px: float, width_px: int, sensor_width_mm: float) -> float:
-    """A length in pixels of a frame `width_px` wide, in mm on the sensor.
-
-    Example:
-        >>> px_to_mm(10.0, width_px=6000, sensor_width_mm=36.0)
-        0.06
-    """
-    return length_px * sensor_width_mm / width_px
-
-
-def mm_to_px(length_mm: float, width_px: int, sensor_width_mm: float) -> float:
-    """A length in mm on the sensor, in pixels of a frame `width_px` wide.
-
-    Example:
-        >>> mm_to_px(0.06, width_px=6000, sensor_width_mm=36.0)
-        10.0
-    """
-    return length_mm * width_px / sensor_width_mm
-
-
-def px_to_object_m(length_px: float, width_px: int, camera: Camera, distance_m: float) -> float:
-    """A length in pixels, in metres on a paper at `distance_m`: the unit of the paper's Table 1.
-
-    Example:
-        >>> camera = Camera(focal_length_mm=50.0, focus_m=0.2, sensor_width_mm=36.0, focus_breathing=True)
-        >>> round(px_to_object_m(100.0, 6000, camera, distance_m=0.5), 6)
-        0.0045
-    """
-    return length_px * distance_m / float(camera.focal_px(width_px))
-
-
-def object_m_to_px(length_m: float, width_px: int, camera: Camera, distance_m: float) -> float:
-    """A length in metres on a paper at `distance_m`, in pixels.
-
-    Example:
-        >>> camera = Camera(focal_length_mm=50.0, focus_m=0.2, sensor_width_mm=36.0)
-        >>> round(object_m_to_px(2.3476e-3, 512, camera, distance_m=0.5), 2)
-        4.45
-    """
-    return length_m / distance_m * float(camera.focal_px(width_px))
-
-
-def signed_coc(camera: Camera, distance_m: float, width_px: int) -> float:
-    """The thin lens's signed circle of confusion of a point at `distance_m`, px."""
-    depth = torch.full((1, 1, 1, 1), distance_m, dtype=torch.float64)
-    return float(camera.coc_px(depth, width=width_px))
+__all__ = ["check_reach"]
 
 
 def check_reach(
@@ -88,7 +39,7 @@ def check_reach(
         FitError: the depths are not 0 < near <= far.
 
     Warns:
-        OutsideMeasuredWarning: for each of the three that lies outside what was measured.
+        FitWarning: of kind "outside measured", for each of the three that lies outside what was measured.
 
     Example:
         >>> table = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="mm", sensor_width_mm=36.0)
@@ -105,21 +56,19 @@ def check_reach(
     plain = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
     if not plain or not 0 < near_m <= far_m or near_m > 1e300:
         raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
-    near_m, far_m = float(near_m), math.inf if far_m > 1e300 else float(far_m)
     factors = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
     if table.unit != "relative":
-        scale = width_px if table.sensor_width_mm is None else width_px / table.sensor_width_mm
-        for distance in (near_m, far_m):
-            coc = signed_coc(camera, distance, width_px) / scale
-            measured = [abs(c) for c in table.coc.tolist() if c * coc > 0]
-            factors["coc"] = max(factors["coc"], abs(coc) / max(measured) if measured else math.inf if coc else 0.0)
+        ends = [float(near_m), math.inf if far_m > 1e300 else float(far_m)]
+        depth = torch.tensor(ends, dtype=torch.float64)[None, None, None]
+        for coc in (camera.coc_px(depth, width=width_px) / table.px_per_unit(width_px)).flatten().tolist():
+            measured = max((abs(c) for c in table.coc.tolist() if c * coc > 0), default=0.0)
+            factors["coc"] = max(factors["coc"], abs(coc) / measured if measured else math.inf if coc else 0.0)
     if factors["coc"] > 1.0001:
         largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
         text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
-        warn(OutsideMeasuredWarning(text, number=factors["coc"]))
+        warn(text, "outside measured", number=factors["coc"])
     for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
-        measured_at: Any = table.provenance.get(name)
-        used_at = float(getattr(camera, name))
+        measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
         known = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
         if not known or not 0 < measured_at < math.inf or math.isinf(used_at):
             continue
@@ -129,5 +78,5 @@ def check_reach(
                 f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}; the size of the blur is "
                 "right, its shape is that of the measured one"
             )
-            warn(OutsideMeasuredWarning(text, number=factors[name]))
+            warn(text, "outside measured", number=factors[name])
     return factors
