@@ -2,13 +2,13 @@
 
 from .lens.trace import trace_table
 from .photo.across import table_of_dots
+from .photo.agreement import check_reach
 from .photo.captures import Capture, Captures
 from .photo.family_choice import highlight_psnr, natural_psnr
-from .photo.manifest import read_captures, read_pair
+from .photo.manifest import read_captures
 from .photo.pair import fit_pair
 from .photo.profile_fit import fit_profile
 from .photo.ratio import blur_strength
-from .photo.reach import check_reach
 from .photo.table import TableFit, fit_captures, fit_table
 from .problems import FitError, FitWarning
 from .result import BlurFit
@@ -29,7 +29,6 @@ __all__ = [
     "highlight_psnr",
     "natural_psnr",
     "read_captures",
-    "read_pair",
     "table_of_dots",
     "trace_table",
 ]

@@ -35,9 +35,6 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     Args:
         dots: What was photographed and fitted of each, the most central first, all with the scale of its fit.
 
-    Returns:
-        The first dot's table with a field.
-
     Raises:
         FitError: There are no two dots at different distances from the middle, or they were not fitted alike.
     """
@@ -59,15 +56,10 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
 
 
 def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], shrunk: Sequence[float]) -> Field:
-    """Spots over blur and distance from the middle, of tables of single places.
+    """Spots over blur and distance from the middle, of tables with the same nodes of single places (x, y).
 
-    Args:
-        tables: With the same nodes.
-        places: Of each in the sharp picture, (x, y) from the middle of the frame, in the tables' unit.
-        shrunk: By how much pictures shrink towards the middle at each node: the focus over the distance.
-
-    Raises:
-        FitError: There are no two distances from the middle.
+    Places are those in the sharp picture, from the middle of the frame, in the tables' unit; pictures shrink towards
+    the middle by the focus over the distance at each node.
     """
     away = np.hypot(*np.array(places, dtype=np.float64).T)
     order = np.argsort(away)

@@ -2,6 +2,7 @@
 
 A circle of confusion computed from a focal length, an f-number, a sensor's width and a distance stands beside a radius
 that was measured. Any number that was misread makes the two differ, and how they differ over the distances tells which.
+And a table that was measured at one focus and f-number reaches only so far.
 """
 
 from __future__ import annotations
@@ -11,12 +12,18 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
+import torch
+
+from torchdof.optics.blur_table import BlurTable
+from torchdof.optics.camera import Camera
+from torchdof.validation import show
 
 from ..problems import FitError, warn
 from ..result import Array, Mask
+from ..validation import a_number
 from .captures import CAMERA, Captures
 
-__all__ = ["check_agreement", "frame_width"]
+__all__ = ["check_agreement", "check_reach"]
 
 _TELLING_PX = 2.0  # smaller blurs are the lens's aberrations as much as its defocus
 _WARNED, _REFUSED = math.log(1.15), math.log(1.35)  # a thick lens close by differs by a tenth; one stop is 1.41
@@ -24,41 +31,8 @@ _EXPLAINED = math.log(1.12)
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
 
 
-def frame_width(captures: Captures, radius_px: Sequence[float]) -> int:
-    """Width of the frame that the sensor's width belongs to.
-
-    A picture smaller than EXIF says it was taken was either cropped, and its pixels are those of the sensor, or scaled
-    down, and its frame is the sensor's. The blur tells.
-
-    Args:
-        captures: with or without an `original_width_px`.
-        radius_px: of the uniform disc with the fitted kernels' second moment, for each pair.
-
-    Returns:
-        The original's width for a crop, with a warning of kind "camera"; else that of the pictures.
-    """
-    promised, original = captures.promised_px, captures.original_width_px
-    if promised is None or original is None or original == captures.width_px:
-        return captures.width_px
-    scaled = _common_factor(np.abs(promised), np.asarray(radius_px))
-    cropped = scaled * captures.width_px / original
-    if abs(math.log(cropped)) >= min(abs(math.log(scaled)), _REFUSED):
-        return captures.width_px
-    text = (
-        f"the pictures are {captures.width_px} px wide and EXIF says they were taken {original} px wide: they are "
-        f"taken for a crop, as which their blur is {cropped:.2f} times what the camera promises (scaled down, "
-        f"{scaled:.2f} times); state full_width_px = {original} to say so, or {captures.width_px} to deny it"
-    )
-    warn(text, "camera", file=captures.pairs[0].files[0], number=cropped)
-    return original
-
-
 def check_agreement(captures: Captures, radius_px: Sequence[float]) -> None:
-    """Compare the fitted blur with the camera's circle of confusion, and name the likely cause where they differ.
-
-    Args:
-        captures: with the right `width_px`.
-        radius_px: of the uniform disc with the fitted kernels' second moment, for each pair.
+    """Compare the fitted blur's radius at each distance with the camera's, and name the likely cause of a difference.
 
     Raises:
         FitError: of kind "camera" where they differ by more than a factor of 1.35; it warns from 1.15 on.
@@ -92,11 +66,7 @@ def check_agreement(captures: Captures, radius_px: Sequence[float]) -> None:
 
 
 def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask) -> list[tuple[float, str]]:
-    """What one mistake could each explain: a wrong scale, a wrong distance, two exchanged, another focus.
-
-    Returns:
-        How far the blur is then from what the numbers promise, and what the mistake is.
-    """
+    """Mistakes that could each explain it, and how far the blur is then from what the numbers promise."""
     distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
     readings = []
@@ -163,3 +133,69 @@ def _misfit(expected: Array, measured: Array, telling: Mask) -> float:
     apart = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
     factor = np.log1p(apart / np.maximum(np.minimum(measured, expected), 1e-9))
     return float(np.max(np.where(telling, factor, 0.0)))
+
+
+def check_reach(
+    table: BlurTable, camera: Camera, near_m: float, far_m: float, width_px: int = 1920
+) -> dict[str, float]:
+    """Whether a table measured at one focus and f-number says anything about another use of it.
+
+    A kernel is looked up by its signed circle of confusion, so a thin lens's table serves any focus and f-number. A
+    real lens's aberrations change with both: the farther from what was measured, the less a table knows.
+
+    Args:
+        table: with the provenance that `fit_table` and `trace_table` write.
+        camera: to render with.
+        near_m: nearest depth of the scene, m.
+        far_m: farthest depth of the scene, m; `inf` allowed.
+        width_px: of the image.
+
+    Returns:
+        Each over what was measured: "coc" (the largest circle of confusion of the scene over the largest measured on
+        its side), "f_number" and "focus_m" (1 where the table does not know).
+
+    Raises:
+        FitError: the depths are not 0 < near <= far.
+
+    Warns:
+        FitWarning: of kind "outside measured", for each of the three that lies outside what was measured.
+
+    Example:
+        >>> table = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="mm", sensor_width_mm=36.0)
+        >>> factors = check_reach(table, Camera(f_number=8.0), near_m=1.5, far_m=3.0)
+        >>> factors["coc"] < 1
+        True
+    """
+    for what, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
+        if not isinstance(value, kind):
+            raise FitError(f"{what} must be a torchdof.{kind.__name__}, got {show(value)}")
+    if any(isinstance(getattr(camera, name), torch.Tensor) for name in Camera.__dataclass_fields__):
+        raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
+    a_number("width_px", width_px, 0, unit="pixels")
+    plain = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
+    if not plain or not 0 < near_m <= far_m or near_m > 1e300:
+        raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
+    factors = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
+    if table.unit != "relative":
+        ends = [float(near_m), math.inf if far_m > 1e300 else float(far_m)]
+        depth = torch.tensor(ends, dtype=torch.float64)[None, None, None]
+        for coc in (camera.coc_px(depth, width=width_px) / table.px_per_unit(width_px)).flatten().tolist():
+            measured = max((abs(c) for c in table.coc.tolist() if c * coc > 0), default=0.0)
+            factors["coc"] = max(factors["coc"], abs(coc) / measured if measured else math.inf if coc else 0.0)
+    if factors["coc"] > 1.0001:
+        largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
+        text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
+        warn(text, "outside measured", number=factors["coc"])
+    for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
+        measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
+        known = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
+        if not known or not 0 < measured_at < math.inf or math.isinf(used_at):
+            continue
+        factors[name] = used_at / measured_at
+        if max(factors[name], 1 / factors[name]) > most:
+            text = (
+                f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}; the size of the blur is "
+                "right, its shape is that of the measured one"
+            )
+            warn(text, "outside measured", number=factors[name])
+    return factors

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,6 +14,7 @@ from torchdof.validation import show
 
 from ..problems import FitError
 from ..result import Array
+from ..validation import a_number
 
 __all__ = ["CAMERA", "RANGES", "Capture", "Captures", "check_distances"]
 
@@ -27,7 +27,6 @@ RANGES = {  # beyond any camera's
     "exposure_s": (1e-9, 1e7),
     "width_px": (1, 2**31),
     "full_width_px": (1, 2**31),
-    "original_width_px": (1, 2**31),
 }
 CAMERA = ("focal_length_mm", "f_number", "sensor_width_mm")
 
@@ -73,8 +72,6 @@ class Captures:
         sensor_width_mm: of the camera, or None.
         name: of the table to be.
         notes: more about the capture, for the table's provenance.
-        original_width_px: width at which EXIF says the pictures were taken, where it is another than theirs and nobody
-            said whether they are crops. None otherwise.
     """
 
     pairs: tuple[Capture, ...]
@@ -85,7 +82,6 @@ class Captures:
     sensor_width_mm: float | None = None
     name: str = ""
     notes: Mapping[str, Any] = field(default_factory=dict)
-    original_width_px: int | None = None
 
     def __post_init__(self) -> None:
         """Check what all later steps rely on.
@@ -99,11 +95,10 @@ class Captures:
         if not self.pairs:
             raise FitError("captures hold no pair of pictures; photograph the dot at one more distance at least")
         check_distances([p.distance_m for p in self.pairs], self.focus_m, None)
-        for what in ("width_px", "original_width_px", *CAMERA):
-            value = getattr(self, what)
-            plain, (low, high) = isinstance(value, int | float) and not isinstance(value, bool), RANGES[what]
-            if not (plain and low <= value <= high) and (value is not None or what == "width_px"):
-                raise FitError(f"{what} must be positive, got {show(value)}; a camera's is {low:g} to {high:g}")
+        for name in ("width_px", *CAMERA):
+            value = getattr(self, name)
+            if value is not None or name == "width_px":
+                a_number(name, value, *RANGES[name])
 
     def __iter__(self) -> Iterator[Capture]:
         """Iterate over the pairs."""
@@ -138,11 +133,10 @@ class Captures:
 
 def check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
     """Refuse distances that are not positive and increasing, or that equal the focus."""
-    for what, value in [("focus_m", focus), *(("distance_m", d) for d in distances)]:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e100:
-            raise FitError(f"{what} must be a positive number of metres, got {show(value)}", "distance", file=where)
+    for name, value in [("focus_m", focus), *(("distance_m", d) for d in distances)]:
+        a_number(name, value, -1e100, 1e100, "metres")
     for before, distance in zip([0.0, *distances], distances, strict=False):
-        if not before < distance:
+        if not before < distance or focus <= 0:
             listed = ", ".join(f"{d:g}" for d in distances)
             text = f"distances must be positive and increasing, got {listed} m"
             raise FitError(text, "distance", file=where, number=float(distance))

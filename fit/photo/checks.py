@@ -22,27 +22,16 @@ _OUTSIDE_REFUSED, _OUTSIDE_WARNED = 0.05, 0.005
 
 
 def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None, freest: BlurFit) -> None:
-    """Raise or warn about everything that makes a fit less than it looks.
+    """Raise or warn about everything that makes a fit of the picture `file` less than it looks.
 
-    Args:
-        pair: the pictures.
-        solution: what was found.
-        fit: the same, as it will be returned.
-        file: name of the defocused picture.
-        freest: the fit whose residual is held against the noise.
-
-    Raises:
-        FitError: the pictures have nothing in common, the blur is wider than the window, or more than 5 % of its light
-            falls outside.
+    The solution is judged as the `fit` that will be returned; its residual beside that of the `freest` fit.
     """
     if not fit.gain > 0:
         raise FitError("the blurred picture has nothing in common with the sharp one", file=file, number=fit.gain)
     outside = _outside(pair, solution)
     size = f"{pair.data.shape[1]}x{pair.data.shape[0]} px"
     if outside > _OUTSIDE_REFUSED:
-        text = (
-            f"the window cuts the blur: {100 * outside:.0f} % of its light falls outside {size}; cut a larger one"
-        )
+        text = f"the window cuts the blur: {100 * outside:.0f} % of its light falls outside {size}; cut a larger one"
         raise FitError(text, "window", file=file, number=outside)
     if outside > _OUTSIDE_WARNED:
         text = f"{100 * outside:.1f} % of the blur's light falls outside the window of {size}; cut a larger one"

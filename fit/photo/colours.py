@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,11 +17,10 @@ from torchdof.optics.aperture import Aperture
 from ..problems import unheard
 from ..result import Array, BlurFit
 from .captures import Captures
-from .distances import KNOTS
+from .distances import fit_one
 from .dot import find_dot
 from .forward import OPENINGS
 from .opening import turned
-from .pair import fit_pair
 from .source import soft_edge
 
 __all__ = ["NAMES", "Colour", "fit_colours"]
@@ -58,12 +57,7 @@ def fit_colours(
 
     In the sharp picture a colour that is not the one in focus is itself blurred a little. The sharpest colour's edge
     stands for all, so that each kernel holds all of its colour's blur.
-
-    Args:
-        captures: pairs with `colours`.
-        fits: of the mean of the colours.
-        family: of `fits`.
-        opening: as it shows behind the focus, for families that have one.
+    `opening` is as it shows behind the focus, for families that have one.
     """
     found: list[list[BlurFit]] = [[] for _ in NAMES]
     for pair, mean in zip(captures, fits, strict=True):
@@ -73,19 +67,16 @@ def fit_colours(
         softness = min(soft_edge(still, find_dot(still, file=pair.files[0])).softness for still in pair.colours[0])
         for colour, still, blurred in zip(found, *pair.colours, strict=True):
             with unheard():  # what is wrong with a capture its mean has said
-                fit = fit_pair(
-                    still,
-                    blurred,
+                fit = fit_one(
+                    replace(pair, sharp=still, blurred=blurred),
+                    captures.focus_m,
                     "image" if family in OPENINGS else family,
                     magnification=mean.magnification,
                     fit_magnification=False,
-                    white=pair.white,
                     start=None if family in OPENINGS else mean,
-                    knots=KNOTS if family == "radial" else None,
                     reach=float(mean.params["radius"]) if family == "radial" else None,
                     aperture=shown,
                     softness=softness,
-                    files=pair.files,
                 )
             colour.append(fit)
     shifts = [_focus_shift(captures.defocus, colour) for colour in found]

@@ -23,11 +23,7 @@ _WORSE = 3  # strengths of smoothing in a row that foretell worse, after which w
 
 
 def deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
-    """The kernel of a pair of pictures.
-
-    Args:
-        pair: the pictures.
-        shape: a solution to begin from, which gives the moves and how far the kernel may reach.
+    """The kernel of a pair of pictures, from a solution to begin with that gives the moves and the kernel's reach.
 
     Returns:
         The kernel `[k, k]`, k odd, not negative, summing to 1; and twice the log likelihood of pixels that were kept
@@ -41,7 +37,9 @@ def deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
     kept_back = np.random.default_rng(0).random(pair.values.size) < _KEPT_BACK
     judged = kept_back & pair.lit[pair.used]
     tried: list[tuple[float, float, Array]] = []
-    kernel = _fitted_to(pair.kernel(shape), 2 * half + 1)
+    kernel = pair.kernel(shape)
+    margin = half - kernel.shape[0] // 2
+    kernel = np.pad(kernel, margin) if margin >= 0 else np.ascontiguousarray(kernel[-margin:margin, -margin:margin])
     for smoothness in _SMOOTHNESS:
         kernel, model = _descend(pair, source, kernel, smoothness, ~kept_back)
         tried.append((float(np.sum((pair.values - model)[judged] ** 2)), float(smoothness), kernel))
@@ -59,10 +57,7 @@ def deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
 def _descend(
     pair: Forward, source: Array, start: Array, smoothness: float, fitted: Mask, lit: Mask | None = None
 ) -> tuple[Array, Array]:
-    """Accelerated projected gradients on the kernel's pixels that may be lit; the background is solved inside.
-
-    Returns:
-        The kernel, and the model of the pixels used.
+    """The kernel and the model of the pixels used, by accelerated projected gradients on those that may be lit.
 
     Reference:
         Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.
@@ -79,7 +74,9 @@ def _descend(
     for _ in range(_STEPS):
         error = pair.convolve(source, ahead[None])[0] - pair.values
         error = np.where(fitted, error - error[fitted].mean(), 0.0)
-        gradient = pair.correlate(source, error, size) + penalty * _laplacian(ahead)
+        wide = np.pad(ahead, 1)
+        rough = 4 * ahead - wide[2:, 1:-1] - wide[:-2, 1:-1] - wide[1:-1, 2:] - wide[1:-1, :-2]
+        gradient = pair.correlate(source, error, size) + penalty * rough
         after = np.maximum(ahead - step * gradient, 0.0) * (1.0 if lit is None else lit)
         faster = (1 + np.sqrt(1 + 4 * pace * pace)) / 2
         ahead = after + (pace - 1) / faster * (after - weights)
@@ -88,17 +85,3 @@ def _descend(
             break
     model = pair.convolve(source, weights[None])[0]
     return weights / float(weights.sum()), model + float((pair.values - model)[fitted].mean())
-
-
-def _laplacian(picture: Array) -> Array:
-    """Minus the second differences of a picture that is dark around."""
-    wide = np.pad(picture, 1)
-    return np.asarray(4 * picture - wide[2:, 1:-1] - wide[:-2, 1:-1] - wide[1:-1, 2:] - wide[1:-1, :-2])
-
-
-def _fitted_to(kernel: Array, size: int) -> Array:
-    """A kernel cut or padded to a size."""
-    margin = (size - kernel.shape[0]) // 2
-    if margin >= 0:
-        return np.pad(kernel, margin)
-    return np.ascontiguousarray(kernel[-margin:margin, -margin:margin])

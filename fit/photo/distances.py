@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,55 +18,22 @@ from .forward import OPENINGS
 from .opening import common_opening, turned
 from .pair import fit_pair
 
-__all__ = ["KNOTS", "counted", "fit_distances", "fit_one", "fit_openings"]
+__all__ = ["counted", "fit_distances", "fit_one", "fit_openings"]
 
-KNOTS = 33
-"""Values of a free profile, the same at all distances."""
-
+_KNOTS = 33  # values of a free profile, the same at all distances
 _SWEEPS = 2
 
 
-def fit_one(
-    pair: Capture,
-    focus_m: float,
-    family: str,
-    start: BlurFit | None = None,
-    accuracy_db: float = 45.0,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-    reach: float | None = None,
-    aperture: Aperture | None = None,
-) -> BlurFit:
-    """Fit one pair, its size expected from the distances."""
-    return fit_pair(
-        pair.sharp,
-        pair.blurred,
-        family,
-        accuracy_db=accuracy_db,
-        magnification=focus_m / pair.distance_m,
-        white=pair.white,
-        start=start,
-        prior=prior,
-        knots=KNOTS if family == "radial" else None,
-        reach=reach,
-        aperture=aperture,
-        files=pair.files,
-    )
+def fit_one(pair: Capture, focus_m: float, family: str, **known: Any) -> BlurFit:
+    """Fit one pair, its size expected from the distances; `known` as `fit_pair` takes it."""
+    expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
+    return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **{**expected, **known})
 
 
 def fit_distances(
     captures: Captures, family: str, smooth: bool, done: Callable[[Capture, BlurFit], None]
 ) -> list[BlurFit]:
-    """Fit all pairs with one family.
-
-    Args:
-        captures: pairs by increasing distance.
-        family: of the kernel.
-        smooth: whether neighbouring distances inform each other after the first fits.
-        done: called after each first fit.
-
-    Returns:
-        One fit a pair.
-    """
+    """Fit all pairs with one family; `smooth` lets neighbouring distances inform each other after the first fits."""
     place, pairs = captures.defocus, captures.pairs
     fits: dict[int, BlurFit] = {}
     near = [i for i in range(len(pairs)) if place[i] < 0]
@@ -78,7 +46,7 @@ def fit_distances(
                 nearer = abs(place[i]) / abs(place[before])
                 params = {n: v * nearer if n in LENGTHS else v for n, v in fits[before].params.items()}
                 start = replace(fits[before], params=params)
-            fits[i] = fit_one(pairs[i], captures.focus_m, family, start)
+            fits[i] = fit_one(pairs[i], captures.focus_m, family, start=start)
             done(pairs[i], fits[i])
             before = i
     if smooth:
@@ -103,7 +71,7 @@ def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit]) 
             if beside:
                 neighbours = [fits[k] for k in beside]
                 prior = {n: _expected(n, place[i], place[beside], fits[i], neighbours) for n in FAMILIES[family]}
-                fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, fits[i], prior=prior)
+                fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], prior=prior)
 
 
 def _expected(name: str, place: float, beside: Array, fit: BlurFit, neighbours: list[BlurFit]) -> tuple[float, float]:
@@ -136,7 +104,7 @@ def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -
         lift = max(float(np.max((ends - slope * x - start)[x > 0.25 * x.max()])), 0.0)
         for i, defocus, end in zip(side, x, ends, strict=True):
             reach = max(float(slope * defocus + start + lift), float(end), 1.0)
-            fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, fits[i], reach=reach)
+            fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], reach=reach)
 
 
 def _end(fit: BlurFit) -> float:
@@ -152,14 +120,7 @@ def fit_openings(
 ) -> tuple[list[BlurFit], Aperture]:
     """Fit all pairs with kernels that are not round, those of one opening in as many sizes.
 
-    Args:
-        captures: pairs by increasing distance.
-        family: "polygon" or "image".
-        firsts: a fit of each pair with any family; those of `family` tell the opening.
-        done: called after each fit.
-
-    Returns:
-        One fit a pair, and the opening as it shows behind the focus.
+    The first fits of `family` ("polygon" or "image") tell the opening, which is given as it shows behind the focus.
     """
     nearer = [pair.distance_m < captures.focus_m for pair in captures]
     telling = [i for i, fit in enumerate(firsts) if fit.family == family]
@@ -182,7 +143,12 @@ def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     with unheard():
         plain, *others = (
             fit_one(
-                replace(pair, sharp=sharp, blurred=blurred), focus_m, family, start, reach=reach, aperture=fit.aperture
+                replace(pair, sharp=sharp, blurred=blurred),
+                focus_m,
+                family,
+                start=start,
+                reach=reach,
+                aperture=fit.aperture,
             )
             for sharp, blurred in ((pair.sharp, pair.blurred), *pair.uncertain)
         )

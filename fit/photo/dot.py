@@ -8,6 +8,7 @@ import numpy as np
 
 from ..problems import FitError
 from ..result import Array, Mask
+from ..validation import a_picture
 from .noise import fine_variance, noise_of
 
 __all__ = ["Dot", "distance_from", "find_dot", "find_dots", "fine_share_inside", "inner_pixels", "radial_mean"]
@@ -19,25 +20,15 @@ _OTHER_DOT = 0.08  # light of a second dot, over the first's, that is not dirt
 
 @dataclass(frozen=True)
 class Dot:
-    """A bright spot on a dark ground.
+    """A bright spot on a dark ground; lengths in px."""
 
-    Attributes:
-        x: centre in px, pixel (0, 0) has its centre at 0.
-        y: the same, downwards.
-        radius: radius in px of a uniform disc with the same second moment.
-        reach: radius in px beyond which its light is lost in the noise.
-        background: level around it.
-        peak: highest level of the slightly smoothed picture above the background.
-        noise: standard deviation of a pixel on the background.
-    """
-
-    x: float
-    y: float
-    radius: float
-    reach: float
-    background: float
-    peak: float
-    noise: float
+    x: float  # of its centre; pixel (0, 0) has its centre at 0
+    y: float  # the same, downwards
+    radius: float  # of a uniform disc with the same second moment
+    reach: float  # radius beyond which its light is lost in the noise
+    background: float  # level around it
+    peak: float  # highest level of the slightly smoothed picture above the background
+    noise: float  # standard deviation of a pixel on the background
 
 
 def distance_from(dot: Dot, shape: tuple[int, ...]) -> Array:
@@ -55,56 +46,43 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
         where = ", ".join(f"({d.x:.0f}, {d.y:.0f})" for d in dots[:6])
-        raise FitError(
+        text = (
             f"{len(dots)} dots where one was expected, at {where}; cover the others, say crop = [left, top, width, "
-            "height] in capture.toml (cropping in an editor loses the scale), or read a grid with dots='centre'",
-            "several dots",
-            file=file,
-            number=float(len(dots)),
+            "height] in capture.toml (cropping in an editor loses the scale), or read a grid with dots='centre'"
         )
+        raise FitError(text, "several dots", file=file, number=float(len(dots)))
     return dots[0]
 
 
 def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTHER_DOT) -> list[Dot]:
-    """Every dot in a picture, the brightest (by its light) first.
-
-    Args:
-        picture: `[H, W]`, linear light.
-        file: named in errors.
-        smallest: least light of a dot over that of the first.
+    """Every dot in a picture `[H, W]` in linear light, the brightest (by its light) first, down to a `smallest` share.
 
     Raises:
         FitError: of kind "no dot" where nothing stands out from the noise; of kind "window" where the brightest dot
-            touches the edge of the picture, or that is too small.
+            touches the edge of the picture.
     """
     from scipy import ndimage
 
-    height, width = picture.shape
-    if min(height, width) < _SMALLEST_PX:
-        raise FitError(
-            f"a picture of {width}x{height} px is too small for a dot; {_SMALLEST_PX} px a side are the least",
-            "window",
-            file=file,
-            number=float(min(height, width)),
-        )
+    height, width = a_picture("a picture of a dot", picture, _SMALLEST_PX, file).shape
     noise = noise_of(picture)
     frame = max(1, min(height, width) // 20)
     edge = np.ones(picture.shape, dtype=bool)
     edge[frame:-frame, frame:-frame] = False
-    background = _level(picture[edge], noise)
+    # a mean without outliers: where blacks are cut off at 0, half the noise is gone and the median is not the mean
+    levels, background = picture[edge], float(np.median(picture[edge]))
+    if noise > 0 and (kept := np.abs(levels - background) <= 5 * noise).any():
+        background = float(levels[kept].mean())
     smooth = ndimage.gaussian_filter(picture - background, 1.0, mode="nearest")
     peak = float(smooth.max())
     # smoothing by sigma = 1 px leaves 0.28 of white noise; its largest of many pixels is about 4.5 of that
     floor = 0.28 * noise
     if not peak > max(8 * floor, 1e-9 * max(float(np.abs(picture).max()), 1e-300)):
         ratio = peak / floor if floor > 0 else 0.0
-        raise FitError(
+        text = (
             f"no dot found: the brightest spot is {ratio:.1f} times the noise, at least 8 are needed; is it a white "
-            "dot on black paper, well exposed?",
-            "no dot",
-            file=file,
-            number=ratio,
+            "dot on black paper, well exposed?"
         )
+        raise FitError(text, "no dot", file=file, number=ratio)
     labels, count = ndimage.label(smooth > max(_THRESHOLD * peak, 5 * floor), structure=np.ones((3, 3)))
     light = np.asarray(ndimage.sum_labels(smooth, labels, np.arange(1, count + 1)))
     boxes = ndimage.find_objects(labels)
@@ -115,13 +93,11 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
         rows, columns = boxes[i]
         if rows.start == 0 or columns.start == 0 or rows.stop == height or columns.stop == width:
             if rank == 0:
-                raise FitError(
+                text = (
                     f"the dot touches the picture's edge (rows {rows.start}-{rows.stop}, columns "
-                    f"{columns.start}-{columns.stop} of {height}x{width}); leave dark paper around the whole blur",
-                    "window",
-                    file=file,
-                    number=1.0,
+                    f"{columns.start}-{columns.stop} of {height}x{width}); leave dark paper around the whole blur"
                 )
+                raise FitError(text, "window", file=file, number=1.0)
             continue
         y, x = ndimage.center_of_mass(smooth, labels, i + 1)
         # a crop around the spot is enough, and much faster in a large frame
@@ -133,35 +109,24 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
     return dots
 
 
-def _level(values: Array, noise: float) -> float:
-    """Mean without outliers: where blacks are cut off at 0, half the noise is gone and the median is not the mean."""
-    middle = float(np.median(values))
-    kept = values[np.abs(values - middle) <= 5 * noise]
-    return float(kept.mean()) if noise > 0 and kept.size else middle
-
-
 def _measured(above: Array, x: float, y: float, noise: float, peak: float) -> tuple[float, float, float, float]:
-    """Centre, radius and reach of a dot around (x, y), by moments; three rounds, each within the reach found."""
+    """Centre, radius and reach of a dot around (x, y), by moments; three rounds, each within the reach found.
+
+    The reach is where the mean level over rings is no more above the noise, nor above what a moment would feel.
+    """
     rows, columns = np.indices(above.shape).astype(np.float64)
     for _ in range(3):
         distance = np.hypot(columns - x, rows - y)
-        reach = _reach(above, distance, noise, peak)
+        mean, count = radial_mean(above, distance)
+        dark = np.abs(mean) < np.maximum(2.5 * noise / np.sqrt(np.maximum(count, 1)), 5e-4 * peak)
+        bright = int(np.argmax(mean))
+        quiet = np.flatnonzero(dark[bright:-1] & dark[bright + 1 :])
+        reach = float(bright + quiet[0] + 1 if quiet.size else mean.size)
         inside = np.where(distance <= reach, above, 0.0)
         total = float(inside.sum())
         x, y = float((inside * columns).sum() / total), float((inside * rows).sum() / total)
     moment = float((inside * ((columns - x) ** 2 + (rows - y) ** 2)).sum() / total)
     return x, y, float(np.sqrt(max(2 * moment, 0.0))), reach
-
-
-def _reach(above: Array, distance: Array, noise: float, peak: float) -> float:
-    """Radius in px from which on the mean level over rings is not above the noise."""
-    mean, count = radial_mean(above, distance)
-    # light so faint that neither the noise nor a moment would feel it
-    dark = np.abs(mean) < np.maximum(2.5 * noise / np.sqrt(np.maximum(count, 1)), 5e-4 * peak)
-    quiet = dark[:-1] & dark[1:]
-    bright = int(np.argmax(mean))
-    first = np.flatnonzero(quiet[bright:])
-    return float(bright + first[0] + 1 if first.size else mean.size)
 
 
 def radial_mean(picture: Array, distance: Array) -> tuple[Array, Array]:

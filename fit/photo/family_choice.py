@@ -27,14 +27,8 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between a natural image blurred with one kernel and with another, in dB.
 
     Natural images have an amplitude spectrum of 1/f; with it, the mean squared difference is a sum over the kernels'
-    spectra and needs no image: a standard deviation of 0.22 of the peak, 256 px wide, is taken for all.
-
-    Args:
-        kernel: `[k, k]`, k odd, sums to 1.
-        other: `[l, l]`, l odd, sums to 1.
-
-    Returns:
-        Decibels, at most 200.
+    spectra and needs no image: a standard deviation of 0.22 of the peak, 256 px wide, is taken for all. The kernels are
+    `[k, k]`, k odd, and sum to 1; 200 dB is the most.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -68,14 +62,8 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between what a highlight looks like through one kernel and through another, in dB.
 
     A highlight shows the kernel itself, which a natural image hardly does. It is shown as a display shows it, encoded,
-    the other's peak at white, and compared where either is brighter than 2 % of that.
-
-    Args:
-        kernel: `[k, k]`, k odd, sums to 1.
-        other: `[l, l]`, l odd, sums to 1: the one to be like.
-
-    Returns:
-        Decibels, at most 200.
+    the other's peak at white, and compared where either is brighter than 2 % of that. Kernels are as for
+    :func:`natural_psnr`; the other one is that to be like.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -106,7 +94,7 @@ def _square(name: str, kernel: ArrayLike) -> Array:
 
 
 def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
-    """Whether a photograph through one kernel is within `accuracy_db` of that through another, a highlight 20 dB less."""
+    """Whether a photograph through a kernel is within `accuracy_db` of that through another, a highlight 20 dB less."""
     look = highlight_psnr(kernel, other)
     return natural_psnr(kernel, other) >= accuracy_db and look >= accuracy_db - _LOOK_BELOW
 
@@ -118,11 +106,6 @@ def choose(
 
     The simplest family within 2 of the lowest BIC stands for the truth. Another one will do if a photograph through it
     is `accuracy_db` from the truth's, and a highlight, where shapes show, at most 20 dB less.
-
-    Args:
-        kernels: fitted kernel of each family `[k, k]`; "radial" among them.
-        bic: their information criteria.
-        accuracy_db: wanted PSNR on a natural image.
 
     Returns:
         The family, one sentence saying why and what came second, and the PSNR of each family on a natural image

@@ -236,19 +236,33 @@ class Forward:
         neighbours as the residual does. The sharp picture's passes through the kernel and is then alike in neighbouring
         pixels too. Both make naive errors too small. An ideal dot brings the errors of its radius and softness instead.
         """
+        from scipy.ndimage import gaussian_filter
+
         known_before = 0.0 if prior is None else prior.T @ prior
         bread = inverse(jacobian.T @ jacobian + known_before)
         known = np.isfinite(np.diag(bread))
         bread = np.where(np.outer(known, known), bread, 0.0)
         n, p = jacobian.shape
+        # the noise is as large as the residual around each pixel
+        full = self.picture(residual, 0.0)
+        share = np.maximum(gaussian_filter(self.used.astype(np.float64), 2.0), 1e-6)
+        around = np.sqrt(n / max(n - p - 2, 1) * np.maximum(gaussian_filter(full**2, 2.0) / share, 0.0))
+        # few pixels show how far neighbours go together; the paper's many show more, where its noise is alike
+        near = self.used & (self.distance <= self.dot.reach + 2)
+        found = correlation_of(full / np.maximum(around, 1e-12 * self.unit), near)
+        correlation = self.noise_correlation if self.noise_correlation.sum() > found.sum() else found
+        deviation = around[self.used]
         through = (gain * self.source.noise) ** 2 / self.fine_share
-        deviation, correlation = self._residual_noise(residual, n / max(n - p - 2, 1))
         if through > 0:
             least = np.sqrt(0.1) * deviation
             deviation = np.sqrt(np.maximum(deviation**2 - through * float(np.sum(kernel**2)), least**2))
         meat = jacobian.T @ self.noise_times(jacobian, deviation, correlation) + known_before
-        if through > 0:
-            meat = meat + through * self._source_scores(jacobian, kernel)
+        if through > 0:  # by (K' J)' (K' J) over the pixels of the source that carry noise
+            pictures = self._transformed(self.picture(jacobian.T, 0.0))
+            carrying = (self.distance <= self.source.reach * self.magnification).ravel()
+            spread = np.where(carrying, self.convolve(pictures, kernel[None], whole=True), 0.0)
+            together = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
+            meat = meat + through * (spread @ together.reshape(spread.shape).T)
         covariance = bread @ meat @ bread
         if self.source.variants:
             plain = self.moved_source(moves)
@@ -258,27 +272,6 @@ class Forward:
             covariance = covariance + pulled @ self.source.covariance @ pulled.T
         covariance[~known, ~known] = np.inf
         return np.asarray(covariance)
-
-    def _source_scores(self, jacobian: Array, kernel: Array) -> Array:
-        """`(K' J)' (K' J)` over the pixels of the source that carry noise."""
-        pictures = self._transformed(self.picture(jacobian.T, 0.0))
-        near = self.distance <= self.source.reach * self.magnification
-        spread = np.where(near.ravel(), self.convolve(pictures, kernel[None], whole=True), 0.0)
-        together = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
-        return np.asarray(spread @ together.reshape(spread.shape).T)
-
-    def _residual_noise(self, residual: Array, factor: float) -> tuple[Array, Array]:
-        """Deviation of each used pixel's noise `[pixels used]`, and how neighbours' go together, from a residual."""
-        from scipy.ndimage import gaussian_filter
-
-        full = self.picture(residual, 0.0)
-        share = np.maximum(gaussian_filter(self.used.astype(np.float64), 2.0), 1e-6)
-        deviation = np.sqrt(factor * np.maximum(gaussian_filter(full**2, 2.0) / share, 0.0))
-        near = self.used & (self.distance <= self.dot.reach + 2)
-        # few pixels show how far neighbours go together; the paper's many show more, where its noise is alike
-        found = correlation_of(full / np.maximum(deviation, 1e-12 * self.unit), near)
-        correlation = self.noise_correlation if self.noise_correlation.sum() > found.sum() else found
-        return deviation[self.used], correlation
 
     def noise_times(self, columns: Array, deviation: Array, correlation: Array) -> Array:
         """Covariance of the pixels' noise times columns `[pixels used, p]`."""

@@ -23,6 +23,7 @@ EXPLAINED = 1.15
 _SENSOR_BLUR_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
 _MATTERS = 0.02  # share of the kernel's size
 _ENCODED = 0.7
+_STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 _TOGETHER = 1.9  # neighbouring second differences share pixels: their mean square is as uncertain as of so many fewer
 _MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
 _DRAWN = 1e-3  # of the level; less is left of pictures without noise, whose edges were drawn in another way
@@ -31,7 +32,6 @@ _STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same where the sharp dot's edge a
 _CURVED, _CURVED_CHI = 0.03, 11.0  # half of what a curve of 20 % leaves at the expected size; once in 2000 by chance
 _RESIZED = 0.015  # another magnification than that by so much is not a weak tone curve, which makes it 1.002 to 1.006
 _CLEARER = 4.0  # chi squared by which a curve explains more than another magnification of the dot
-_STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
 
 def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
@@ -44,7 +44,7 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> boo
         # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
         most = (1 + 4 / np.sqrt(int(inside.sum() / _TOGETHER))) * np.sqrt(bright + rounding)
         if dot.noise > max(most, 1e-4 * dot.peak):
-            number = dot.noise / max(np.sqrt(bright), 1e-9 * dot.peak)
+            number = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
             text = (
                 f"the dark paper has {number:.1f} times the noise of the white dot, as in a picture that is left sRGB "
                 "encoded; is the image linear? Decode it first"
@@ -65,7 +65,7 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> boo
                 "encoded (about 0.45); is the image linear? Decode it first"
             )
     if text:
-        warn(text, "not linear", file=file, number=float(number))
+        warn(text, "not linear", file=file, number=number)
     return not text
 
 
@@ -77,7 +77,6 @@ def check_noise(pair: Forward, solution: Solution, level: float, file: str | Non
     residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
     share = _light(solution, level)
     middling = (share > _MIDDLING[0]) & (share < _MIDDLING[1]) & pair.used
-    middling[[0, -1]] = middling[:, [0, -1]] = False
     count = int(middling.sum())
     if count < _FEWEST:
         return True
@@ -109,13 +108,7 @@ def check_levels(pair: Forward, solution: Solution, held: Solution, edge: Edge, 
     magnification takes up most of it: so what the dot leaves at its expected size is looked at, too. Where a curve
     explains more of that than another size does, it is said.
 
-    Args:
-        pair: the pictures.
-        solution: what was found.
-        held: the same with the magnification that was expected; `solution` again where that was not fitted, or fitted
-            because it was asked for.
-        edge: of the sharp dot.
-        file: named in the warning.
+    `held` is the solution with the magnification that was expected, `edge` that of the sharp dot.
     """
     curves = _curves(pair, solution, edge.level)
     found, spread = unexplained(pair, solution, curves)
@@ -169,11 +162,7 @@ def _light(solution: Solution, level: float) -> Array:
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
     """Warn where the sharp picture is softer than a camera in focus leaves it, and the kernel's size feels it.
 
-    Args:
-        edge: of the sharp dot.
-        radius_px: of the uniform disc with the fitted kernel's second moment.
-        deconvolved: whether the kernel was fitted to the dot as it would be in focus, see :func:`focused`.
-        file: named in the warning.
+    `deconvolved` is whether the kernel, of this radius, was fitted to the dot as it would be in focus.
     """
     if edge.softness <= _SENSOR_BLUR_PX or edge.radius <= 2 * edge.softness:
         return

@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from torchdof.io.transfer import Transfer
 from torchdof.validation import show
 
 from ..problems import FitError, warn
-from .captures import CAMERA, RANGES, Capture, Captures, check_distances
-from .crop import Dots, cut_pairs
-from .frame import PATTERNS, Frame, read_frame, size_of
+from ..validation import a_choice, a_number
+from .captures import CAMERA, RANGES, Captures, check_distances
+from .frame import PATTERNS, Dots, Frame, cut_pairs, read_frame, size_of
 
-__all__ = ["MANIFEST", "Capture", "Captures", "Colours", "inside", "read_captures", "read_pair"]
+__all__ = ["MANIFEST", "Captures", "Colours", "inside", "read_captures"]
 
 MANIFEST = "capture.toml"
 Colours = Literal["mean", "each"]
@@ -44,25 +43,20 @@ def read_captures(
     """Read a folder of photographs described by its `capture.toml`.
 
     ```toml
-    focus_m = 0.20              # the lens stays focused here
-    sharp = "0200mm.png"        # the dot at that distance
-    focal_length_mm = 50.0      # camera: what is left out is read from EXIF; all three make the table know its unit
+    focus_m = 0.20                # the lens stays focused here
+    sharp = "0200mm.png"          # the dot at that distance
+    focal_length_mm = 50.0        # what is left out of camera is read from EXIF; all three make the table know its unit
     f_number = 2.8
     sensor_width_mm = 36.0
-    full_width_px = 6000        # optional: width of the whole frame, if the pictures were cropped before
-    crop = [1200, 800, 900, 900]  # optional: left, top, width, height in px; what lies outside is not looked at
-    transfer = "srgb"           # "srgb" or "linear"; left out, floats are linear, and integers sRGB with a warning
-    dark = "dark.png"           # optional: lens cap on, same exposure
-    exposure_s = 0.02           # optional: of the sharp picture
-    dots = "one"                # or "centre", "each" for a grid of dots
-    colours = "mean"            # or "each": red, green and blue by themselves, a kernel a colour in the table
-    bayer = "RGGB"              # optional: the pictures are a sensor's mosaic, one colour a pixel, linear
-    name = "my lens at f/2.8"   # optional
+    transfer = "srgb"             # or "linear"; left out, floats are linear, and integers sRGB with a warning
 
-    [[shot]]                    # by increasing distance
+    [[shot]]                      # by increasing distance
     file = "0500mm.png"
     distance_m = 0.50
-    exposure_s = 0.02           # optional
+
+    # at will, before the shots: full_width_px = 6000 of the whole frame, if the pictures were cropped before;
+    # crop = [left, top, width, height] in px; dark = "dark.png", lens cap on; exposure_s, here and of each shot;
+    # dots = "centre", "each" or "field" of a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
     ```
 
     Args:
@@ -81,8 +75,7 @@ def read_captures(
         OSError: a picture is missing or damaged.
 
     Warns:
-        FitWarning: of kind "not linear" for integers whose transfer nobody stated: they are taken for sRGB; of kind
-            "camera" where the manifest contradicts EXIF.
+        FitWarning: of kind "not linear" for integers whose transfer nobody stated: they are taken for sRGB.
     """
     if not isinstance(folder, str | os.PathLike):
         raise FitError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}", "manifest")
@@ -118,14 +111,19 @@ def read_captures(
     columns, encoded = [], [sharp.name] if first.encoded else []
     for shot, distance, file in zip(shots, distances, files, strict=True):
         moved = read_frame(file, known["transfer"], dark, crop, known["bayer"])
-        _check_same_size(first, moved, where)
-        _check_same_camera(first, moved)
+        _check_alike(first, moved, where)
         encoded += [file.name] if moved.encoded else []
         exposed = _field(shot, "exposure_s", where)
         exposure = exposed / known["exposure_s"] if exposed and known["exposure_s"] else None
         columns.append(cut_pairs(first, moved, distance, focus / distance, known["dots"] or "one", exposure, each))
-    _check_stated(known["transfer"], encoded, where)
-    _check_exif(known, first.facts, where)
+    if known["transfer"] is None and encoded:
+        more = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
+        text = (
+            f"nobody said how {encoded[0]}{more} are encoded, and they are taken for sRGB. A camera's own tone curve "
+            "or sharpening makes the kernel up to 15 % too small and need not show: develop to linear light without "
+            "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
+        )
+        warn(text, "not linear", file=where, number=float(len(encoded)))
     full_width = known["full_width_px"]
     if full_width is not None and full_width < first.width_px:
         got = f"got {full_width:g} for pictures of {first.width_px}"
@@ -147,43 +145,9 @@ def read_captures(
             **camera,
             name=known["name"] or base.resolve().name,
             notes=notes | {"position_px": list(pairs[0].position_px)},
-            original_width_px=first.original_width_px if full_width is None else None,
         )
         for pairs in zip(*columns, strict=False)
     ]
-
-
-def read_pair(
-    sharp: str | os.PathLike[str],
-    blurred: str | os.PathLike[str],
-    *,
-    distance_m: float = 1.0,
-    magnification: float = 1.0,
-    transfer: Transfer | None = None,
-) -> Capture:
-    """Read two photographs of one dot and cut the windows that hold it.
-
-    Args:
-        sharp: file of the dot in focus.
-        blurred: file of the dot out of focus, the same size.
-        distance_m: of the dot in `blurred`.
-        magnification: expected size of the dot in `blurred` over that in `sharp`.
-        transfer: "linear" or "srgb"; None takes integers as sRGB and floats as linear.
-
-    Raises:
-        FitError: a picture's kind of trouble, with its file.
-        OSError: a picture is missing or damaged.
-
-    Warns:
-        FitWarning: of kind "not linear" for a picture of integers, and `transfer` is None.
-    """
-    for name, file in (("sharp", sharp), ("blurred", blurred)):
-        if not isinstance(file, str | os.PathLike):
-            raise FitError(f"{name} must be the path of a picture, got {show(file)}")
-    first, second = (read_frame(Path(file), transfer) for file in (sharp, blurred))
-    _check_same_size(first, second, str(blurred))
-    _check_stated(transfer, [frame.file.name for frame in (first, second) if frame.encoded], None)
-    return cut_pairs(first, second, distance_m, magnification)[0]
 
 
 def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
@@ -208,20 +172,19 @@ def _manifest(path: Path) -> dict[str, Any]:
 
 def _field(fields: Mapping[str, Any], name: str, where: str, needed: bool = False) -> Any:
     """A field of the manifest, None where it was left out; a refusal where it is not as it must be."""
-    value, more = fields.get(name), ""
+    value = fields.get(name)
     if value is None and not needed:
         return None
-    if name in _CHOICES:
-        fits, wanted = isinstance(value, str) and value in _CHOICES[name], f"one of {', '.join(_CHOICES[name])}"
-    elif name in RANGES:
-        low, high = RANGES[name]
-        fits = isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high
-        wanted, more = "a positive number", f"; a camera's is {low:g} to {high:g}"
-    else:
-        fits, wanted = isinstance(value, str) and value != "" and "\0" not in value, "a text"
-    if not fits:
-        raise FitError(f"{name} must be {wanted}, got {show(value)}{more}", "manifest", file=where)
-    return float(value) if name in RANGES else value
+    try:
+        if name in RANGES:
+            return a_number(name, value, *RANGES[name])
+        if name in _CHOICES:
+            a_choice(name, value, _CHOICES[name])
+        elif not isinstance(value, str) or not value or "\0" in value:
+            raise FitError(f"{name} must be a text, got {show(value)}")
+    except FitError as error:
+        raise FitError(str(error), "manifest", file=where) from None
+    return value
 
 
 def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | None:
@@ -235,26 +198,11 @@ def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | 
     return value[0], value[1], value[2], value[3]
 
 
-def _check_stated(transfer: str | None, encoded: Sequence[str], where: str | None) -> None:
-    """Warn of pictures that are decoded as sRGB because nobody said how they are encoded."""
-    if transfer is None and encoded:
-        more = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
-        text = (
-            f"nobody said how {encoded[0]}{more} are encoded, and they are taken for sRGB. A camera's own tone curve "
-            "or sharpening makes the kernel up to 15 % too small and need not show: develop to linear light without "
-            "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
-        )
-        warn(text, "not linear", file=where, number=float(len(encoded)))
-
-
-def _check_same_size(first: Frame, second: Frame, where: str) -> None:
+def _check_alike(first: Frame, second: Frame, where: str) -> None:
+    """Refuse pictures of unlike size, and those between which the lens was changed."""
     if first.light.shape != second.light.shape:
         text = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
         raise FitError(text, "manifest", file=where)
-
-
-def _check_same_camera(first: Frame, second: Frame) -> None:
-    """Refuse pictures of one capture between which the lens was changed."""
     for what, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
         if what in first.facts and what in second.facts:
             before, after = first.facts[what], second.facts[what]
@@ -264,12 +212,3 @@ def _check_same_camera(first: Frame, second: Frame) -> None:
                     "zoom must stay as they are"
                 )
                 raise FitError(text, "manifest", file=str(second.file), number=after)
-
-
-def _check_exif(stated: Mapping[str, Any], facts: Mapping[str, float], where: str) -> None:
-    """Warn where the manifest contradicts what EXIF says; the manifest's is taken."""
-    for name, most in (("focal_length_mm", 0.1), ("f_number", 0.1), ("sensor_width_mm", 0.15)):
-        value = stated[name]
-        if value is not None and name in facts and abs(math.log(value / facts[name])) > most:
-            text = f"{name} is stated as {value:g}, and EXIF says {facts[name]:.4g}; the stated one is taken"
-            warn(text, "camera", file=where, number=value / facts[name])

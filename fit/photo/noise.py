@@ -14,7 +14,6 @@ __all__ = [
     "LAGS",
     "correlate",
     "correlation_of",
-    "fine_share",
     "fine_variance",
     "independent_share",
     "noise_beside",
@@ -68,15 +67,10 @@ def rounding_of(levels: Array) -> float:
 
 
 def correlation_of(values: Array, used: Mask) -> Array:
-    """Correlation of a picture's pixels with their neighbours.
+    """Correlation of the pixels used of a picture, noise around 0, with their neighbours.
 
-    Args:
-        values: `[H, W]`, noise around 0; pixels that are not used may hold anything finite.
-        used: `[H, W]`, which pixels to look at.
-
-    Returns:
-        `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the middle; 0 at lags where chance would explain what there is. Its spectrum is
-        nowhere negative.
+    It is `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the middle; 0 at lags where chance would explain what there is. Its spectrum
+    is nowhere negative.
     """
     size = 2 * LAGS + 1
     white = np.zeros((size, size))
@@ -119,30 +113,20 @@ def correlate(pictures: Array, correlation: Array) -> Array:
     return np.stack([convolve(p, correlation[middle, middle], mode="constant") for p in pictures])
 
 
-def fine_share(correlation: Array) -> float:
-    """Share of the noise's variance that second differences see: 1 where neighbours are independent."""
-    second = np.convolve([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
-    middle = slice(LAGS - 2, LAGS + 3)
-    return float(max(np.sum(np.outer(second, second) * correlation[middle, middle]) / 36.0, _LEAST_FINE))
-
-
 def independent_share(correlation: Array) -> float:
     """How many independent pixels a pixel is worth, at most 1."""
     return float(min(1.0, 1.0 / max(correlation.sum(), 1e-3)))
 
 
 def noise_beside(picture: Array, background: float, dark: Mask) -> tuple[Array, float]:
-    """How the noise of the paper beside a dot goes together, and what share of it second differences see.
+    """How the noise of the paper beside a dot (its pixels are `dark`) goes together, and the share that is fine.
 
-    Args:
-        picture: `[H, W]`.
-        background: level of the paper.
-        dark: `[H, W]`, which pixels show nothing else.
+    That is what second differences see of its variance: 1 where neighbours are independent.
     """
     beside = picture - background
     correlation = correlation_of(beside, dark)
     if dark.sum() < _FEWEST:
-        return correlation, fine_share(correlation)
+        return correlation, 1.0
     # a correlation of which chance hides a part makes more of the noise fine than there is, and a mosaic's is not
     # even alike in all pixels: the paper's own spread is the measure
     spread = 1.4826 * float(np.median(np.abs(beside[dark] - np.median(beside[dark]))))

@@ -13,12 +13,10 @@ from torchdof.optics.aperture import Aperture
 
 from ..result import Array, BlurFit
 from .deconvolution import deconvolved
-from .description import bic_of
-from .diagnostics import CHANCE, UNEVEN, asymmetry_of, noise_near, rms_left, size_of_blur, unexplained
+from .diagnostics import CHANCE, UNEVEN, asymmetry_of, bic_of, noise_near, rms_left, size_of_blur, unexplained
 from .forward import Forward, Solution
-from .noise import independent_share
 
-__all__ = ["common_opening", "hides_a_polygon", "solve_image", "solve_opening", "solve_polygon", "turned"]
+__all__ = ["common_opening", "solve_image", "solve_opening", "solve_polygon", "turned"]
 
 _BLADES = range(3, 10)
 _SHOWN = 25.0  # chi squared of a polygon's harmonic, of two degrees of freedom, from which on it is tried
@@ -30,11 +28,7 @@ _MOST_SIDE = 64
 
 
 def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution, str] | None:
-    """The opening that explains what a round kernel leaves, or None where nothing is left that one explains.
-
-    Args:
-        pair: the pictures.
-        round_one: the free round profile.
+    """The opening that explains what the free round profile leaves, or None where nothing is left that one explains.
 
     Returns:
         The pair with its opening, the solution, of family "polygon" or "image", and how it was chosen.
@@ -57,16 +51,6 @@ def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
                 f"(log likelihood higher by {gained / 2:.0f})"
             )
     return (*known, why) if why else None
-
-
-def hides_a_polygon(pair: Forward, round_one: Solution) -> bool:
-    """Whether a hexagon in place of a round kernel of its size would have been lost in the noise."""
-    size = np.array([np.sqrt(2) * size_of_blur(pair, round_one)[0]])
-    hexagon = replace(pair, opening=Aperture(6)).kernels("image", {"radius": 1.095 * size})
-    disc, source = pair.kernels("disc", {"radius": size}), pair.moved_source(round_one.moves)
-    apart = round_one.gain * (pair.convolve(source, hexagon)[0] - pair.convolve(source, disc)[0])
-    noise = noise_near(pair, round_one) ** 2 / independent_share(pair.noise_correlation)
-    return bool(apart @ apart < 2 * _SHOWN * noise)  # twice: noise takes away as often as it adds
 
 
 def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution]:
@@ -153,10 +137,10 @@ def turned(opening: Aperture) -> Aperture:
 def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
     """One opening for all distances, as it shows behind the focus; the larger a blur, the more it shows.
 
-    Args:
-        fits: all "polygon", or all "image".
-        nearer: for each, whether it was nearer than the focus, where an opening shows turned by half.
+    The fits are all "polygon", or all "image"; nearer than the focus an opening shows turned by half.
     """
+    from scipy.ndimage import map_coordinates
+
     found = [f.aperture if not near else turned(f.aperture) for f, near in zip(fits, nearer, strict=True) if f.aperture]
     weight = np.array([f.radius**2 for f in fits])
     if found[0].mask is None:
@@ -169,17 +153,7 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
     halves = [float(f.params["radius"]) / f.radius for f in fits]
     place = ((np.arange(_MOST_SIDE) + 0.5) / _MOST_SIDE * 2 - 1) * max(halves)
     mean = np.zeros((_MOST_SIDE, _MOST_SIDE))
-    for opening, half, share in zip(found, halves, weight / weight.sum(), strict=True):
-        mean += share * _resampled(opening, place / half) / half**2
+    for mask, half, share in zip((a.mask.numpy() for a in found), halves, weight / weight.sum(), strict=True):
+        where = np.meshgrid(*[(place / half + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
+        mean += share * map_coordinates(mask / mask.mean(), where, order=1, mode="constant") / half**2
     return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))
-
-
-def _resampled(opening: Aperture, place: Array) -> Array:
-    """An opening's picture at places from -1 to 1 along both axes, summing to what its area is; dark outside."""
-    from scipy.ndimage import map_coordinates
-
-    if opening.mask is None:
-        raise AssertionError("a polygon is no picture")
-    mask = opening.mask.numpy()
-    where = np.meshgrid(*[(place + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
-    return np.asarray(map_coordinates(mask / mask.mean(), where, order=1, mode="constant"))

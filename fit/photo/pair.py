@@ -17,13 +17,13 @@ from ..result import Array, BlurFit
 from ..solve import one_thread
 from ..validation import a_choice, a_count, a_number, a_picture
 from .checks import FAR_ABOVE, check_fit
-from .description import bic_of, describe
+from .diagnostics import bic_of, describe
 from .dot import find_dot, fine_share_inside
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
 from .linearity import EXPLAINED, check_focus, check_levels, check_linearity, check_noise
 from .noise import independent_share
-from .opening import hides_a_polygon, solve_image, solve_opening, solve_polygon
+from .opening import solve_image, solve_opening, solve_polygon
 from .radial import solve_radial, solve_round
 from .ratio import fit_ratio
 from .saturation import check_blacks, used_pixels
@@ -102,10 +102,8 @@ def fit_pair(
         A `BlurFit` with lengths in pixels.
 
     Raises:
-        FitError: wrong shapes, family or model; or what is wrong with the capture, by its `kind`.
-
-    Warns:
-        FitWarning: the result is given, and what to doubt about it.
+        FitError: wrong arguments, or what is wrong with the capture, by its `kind`; what to doubt about a result is
+            warned about in the same way.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 2 (model="ratio").
@@ -168,15 +166,13 @@ def fit_pair(
                 if found is not None and not looks_alike(pair.kernel(solution), found[0].kernel(found[1]), accuracy_db):
                     pair, solution, why = found
                     freest = expected = solution
-                elif found is None and hides_a_polygon(pair, freest):
-                    why += "; a hexagon would not have been told from it in this noise"
             elif family != "radial":
                 pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
                 freest = expected = solution
         else:
             pair.opening = aperture
             solution = freest = expected = pair.solve(family)
-            if held is None and _improves(pair, solution, free := _with_magnification(pair).solve(family)):
+            if held is None and _improves(pair, solution, free := replace(pair, fit_moves=ALL_MOVES).solve(family)):
                 pair.fit_moves, solution, freest = ALL_MOVES, free, free
         fit = describe(pair, solution, why)
         # a family that was chosen for being cheap is not to blame for what the freest kernel explains
@@ -260,10 +256,6 @@ def _explained(edge: Edge, magnification: float) -> bool:
     return bool((close or (magnified and unexplained < _ALMOST)) and edge.radius > 2 * edge.softness)
 
 
-def _with_magnification(pair: Forward) -> Forward:
-    return replace(pair, fit_moves=ALL_MOVES)
-
-
 def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
     """Whether a fitted magnification explains the pictures significantly better than the expected one."""
     # the scale of chi squared: what remains, or the rounding of a spline where there is no noise
@@ -281,7 +273,8 @@ def _solve_radial(
     """
     expected = solution = solve_round(pair, knots, reach)
     if held is None:
-        free = solve_radial(_with_magnification(pair), solution.moves, float(solution.params["radius"]), knots)
+        radius = float(solution.params["radius"])
+        free = solve_radial(replace(pair, fit_moves=ALL_MOVES), solution.moves, radius, knots)
         if _improves(pair, solution, free):
             pair.fit_moves, solution = ALL_MOVES, free
     pair.held_magnification = solution.moves["magnification"]

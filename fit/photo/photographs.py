@@ -34,23 +34,14 @@ _FEWEST = 4  # photographs from which on they tell of a tone curve
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph with the target in it.
-
-    Attributes:
-        file: its name.
-        light: `[H, W]`, mean of the colours in linear light, the tone curve undone.
-        target: where the target is.
-        distance_m: of the target from the lens, by its size.
-        sharpness: steepest slope of the dot's edge over its height, 1/px.
-        clipped: whether the paper is at the top of the scale.
-    """
+    """One photograph with the target in it."""
 
     file: str
-    light: Array
+    light: Array  # [H, W], mean of the colours in linear light, the tone curve undone
     target: Target
-    distance_m: float
-    sharpness: float
-    clipped: bool
+    distance_m: float  # of the target from the lens, by its size
+    sharpness: float  # steepest slope of the dot's edge over its height, 1/px
+    clipped: bool  # whether the paper is at the top of the scale
 
 
 @dataclass(frozen=True)
@@ -156,10 +147,9 @@ def read_photographs(
         )
     sharp = max(pictures, key=lambda p: p.sharpness)
     focal_px = facts["focal_length_mm"] * width / facts["sensor_width_mm"]
-    image_px, focus_m = focal_px, 1.0
-    for _ in range(20):  # the image distance grows with the focus, which it tells
-        focus_m = image_px * square_mm / 1000 / sharp.target.side_px
-        image_px = focal_px / (1 - facts["focal_length_mm"] / 1000 / focus_m)
+    # by the size of the square in focus and the thin lens, 1 / focal length = 1 / focus + 1 / image distance
+    focus_m = (focal_px * square_mm / sharp.target.side_px + facts["focal_length_mm"]) / 1000
+    image_px = focal_px / (1 - facts["focal_length_mm"] / 1000 / focus_m)
     pictures = sorted(
         (replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures),
         key=lambda p: p.distance_m,

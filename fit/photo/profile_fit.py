@@ -1,4 +1,4 @@
-"""Eq. (1) of the paper, and the other families, fitted to samples of blur strength over radius."""
+"""Eq. (1) of the paper, and other smooth profiles, fitted to samples of blur strength over radius."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from torchdof.optics.psf import FAMILIES, LENGTHS, profile
+from torchdof.optics.psf import LENGTHS, profile
 from torchdof.validation import show
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
 from ..solve import best_of, information_criterion, inverse
-from ..validation import a_choice, a_count
+from ..validation import a_choice
 
 __all__ = ["evaluate", "fit_profile"]
 
@@ -41,9 +41,8 @@ def fit_profile(
     family: str = "ring",
     *,
     groups: ArrayLike | None = None,
-    knots: int | None = None,
 ) -> BlurFit:
-    """Fit `f(r) = N exp(-(r - r_c)^2 / (2 sigma^2))`, or another family times N, to samples of blur strength.
+    """Fit `f(r) = N exp(-(r - r_c)^2 / (2 sigma^2))`, or another profile times N, to samples of blur strength.
 
     Radii may be in any unit (the paper's are metres on the paper): they are normalised inside, and the lengths among
     the parameters come back in the caller's unit.
@@ -51,10 +50,9 @@ def fit_profile(
     Args:
         r: distance from the dot's centre `[n]`, >= 0.
         strength: blur strength `[n]`, in any positive unit.
-        family: "gaussian", "ring" (the paper's), "disc", "softm" or "radial" (a non-negative table over r).
+        family: "gaussian", "ring" (the paper's) or "softm".
         groups: which samples have errors in common `[n]` integers (the spoke a sample lies on); the standard errors
             then allow for it. None takes every sample as independent.
-        knots: number of radii of a "radial" table; None chooses from the number of samples.
 
     Returns:
         A `BlurFit` with the family's parameters and "N".
@@ -77,41 +75,29 @@ def fit_profile(
         >>> f"{fit.params['sigma']:.6f} {fit.params['r_c']:.6f} {fit.params['N']:.4f}"
         '0.002000 0.000400 0.5800'
     """
-    a_choice("family", family, tuple(FAMILIES))
-    radii, values = _checked(r, strength, len(_NAMES.get(family, ("N", "radius", "", ""))) + 2)
+    a_choice("family", family, tuple(_NAMES))
+    names = _NAMES[family]
+    radii, values = _checked(r, strength, len(names) + 2)
     labels = np.arange(radii.size) if groups is None else np.asarray(groups)
     if labels.shape != radii.shape or labels.dtype.kind not in "iuf":
         raise FitError(f"groups must be one integer a sample [{radii.size}], got {show(groups)}")
-    if knots is not None:
-        a_count("knots", knots, 2, radii.size - 1)
     order = np.argsort(radii, kind="stable")
     unit, peak = float(radii.max()), float(np.abs(values).max())
     x, y = radii[order] / unit, values[order] / peak
     # from differences of neighbours in r: what no smooth curve can explain
     noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
     _refuse_flat(x, y, noise)
-    if family == "radial":
-        fitted, covariance, curve = _fit_radial(x, y, knots)
-        names = tuple(f"values[{i}]" for i in range(fitted.size))
-    elif family == "disc":
-        fitted, covariance, curve = _fit_disc(x, y)
-        names = ("N", "radius")
-    else:
-        fitted, covariance, curve = _fit_smooth(x, y, family, None if groups is None else labels[order])
-        names = _NAMES[family]
+    fitted, covariance, curve = _fitted(x, y, family, None if groups is None else labels[order])
     squares = float(np.sum((y - curve) ** 2))
-    scale = np.array([unit if n in LENGTHS else peak if n == "N" or family == "radial" else 1.0 for n in names])
+    scale = np.array([unit if n in LENGTHS else peak if n == "N" else 1.0 for n in names])
     covariance = covariance * np.outer(scale, scale)
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     params: dict[str, float | Array] = dict(zip(names, (fitted * scale).tolist(), strict=True))
-    stderr: dict[str, float | Array] = dict(zip(names, spread.tolist(), strict=True))
-    if family == "radial":
-        params, stderr = {"values": fitted * scale, "radius": unit}, {"values": spread, "radius": 0.0}
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     line = np.linspace(0.0, unit, 257)
     fit = BlurFit(
         family=family,
         params=params,
-        stderr=stderr,
+        stderr=dict(zip(names, spread.tolist(), strict=True)),
         residual=float(np.sqrt(squares / np.sum(y**2))),
         noise=float(noise * np.sqrt(y.size / np.sum(y**2))),
         covariance=covariance,
@@ -122,8 +108,18 @@ def fit_profile(
         samples=np.stack([radii, values]),
         curve=np.stack([line, evaluate(family, line, params)]),
     )
-    if family in _NAMES:
-        _warn_if_undetermined(fit, unit)
+    for name in LENGTHS.intersection(names):
+        value, error, bound = float(fit.params[name]), float(fit.stderr[name]), _BOUNDS[name][1] * unit
+        # a ring whose peak is at the centre has an r_c of 0 +- something: judged against the width
+        whole = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
+        if not error < 0.25 * whole:
+            text = (
+                f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g} +- "
+                f"{error:.2g}; sample farther out, or try another family"
+            )
+            warn(text, "flat profile", number=error / whole if whole else np.inf)
+        if value >= 0.999 * bound:
+            warn(f"{name} ended on its bound {bound:.4g}; it is only a limit", "boundary", number=bound)
     return fit
 
 
@@ -179,11 +175,8 @@ def _refuse_flat(x: Array, y: Array, noise: float) -> None:
         raise FitError(text, "flat profile", number=variation / noise if noise > 0 else 0.0)
 
 
-def _fit_smooth(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Array, Array, Array]:
-    """Parameters, their covariance and the fitted curve of a family with a smooth profile.
-
-    With groups, errors may be correlated within each (sandwich estimator).
-    """
+def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Array, Array, Array]:
+    """Parameters, their covariance (errors may be correlated within groups: a sandwich) and the fitted curve."""
     names = _NAMES[family]
 
     def model(p: Array) -> Array:
@@ -208,53 +201,3 @@ def _fit_smooth(x: Array, y: Array, family: str, groups: Array | None) -> tuple[
     scores = np.zeros((count, len(names)))
     np.add.at(scores, label, jacobian * residual[:, None])
     return params, bread @ (scores.T @ scores) @ bread * count / max(count - 1, 1), curve
-
-
-def _fit_disc(x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """The radius that splits the samples best: the only family whose derivative vanishes, so it is searched."""
-    total = np.cumsum(y)
-    gain = total[:-1] ** 2 / np.arange(1, y.size)
-    gain[np.diff(x) == 0] = -np.inf  # a split between equal radii is none
-    k = int(np.argmax(gain))
-    radius, strength = 0.5 * (x[k] + x[k + 1]), total[k] / (k + 1)
-    curve = np.where(np.arange(y.size) <= k, strength, 0.0)
-    variance = float(np.sum((y - curve) ** 2)) / max(y.size - 2, 1)
-    # the edge lies anywhere between two samples, or farther where noise hides the step
-    slack = (x[k + 1] - x[k]) ** 2 / 12 + (variance / strength**2 * np.mean(np.diff(x)) * 2) ** 2
-    return np.array([strength, radius]), np.diag([variance / (k + 1), slack]), curve
-
-
-def _fit_radial(x: Array, y: Array, knots: int | None) -> tuple[Array, Array, Array]:
-    """Values, covariance and fitted curve of a free non-negative profile, linear between its knots."""
-    from scipy.optimize import nnls
-
-    count = knots if knots is not None else int(np.clip(np.unique(x).size // 3, 4, 32))
-    hats = np.clip(1 - np.abs(x[:, None] * (count - 1) - np.arange(count)), 0, None)
-    # knots without samples of their own follow their neighbours
-    rough = np.diff(np.eye(count), 2, axis=0) * 1e-4
-    values, _ = nnls(np.vstack([hats, rough]), np.concatenate([y, np.zeros(len(rough))]))
-    curve, free = hats @ values, values > 0
-    variance = float(np.sum((y - curve) ** 2)) / max(y.size - int(free.sum()), 1)
-    normal = hats[:, free].T @ hats[:, free] + rough[:, free].T @ rough[:, free]
-    covariance = np.zeros((count, count))
-    covariance[np.ix_(free, free)] = inverse(normal) * variance
-    return values, covariance, curve
-
-
-def _warn_if_undetermined(fit: BlurFit, unit: float) -> None:
-    """Warn about lengths with a large standard error, and about those that ended on their bound."""
-    for name in ("r_c", "sigma", "radius"):
-        if name not in fit.params:
-            continue
-        value, error = float(fit.params[name]), float(fit.stderr[name])
-        # a ring whose peak is at the centre has an r_c of 0 +- something: judged against the width
-        whole = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
-        if not error < 0.25 * whole:
-            text = (
-                f"the profile is too flat, or too different from the family, to fix {name} = {value:.4g} +- "
-                f"{error:.2g}; sample farther out, or try another family"
-            )
-            warn(text, "flat profile", number=error / whole if whole else np.inf)
-        bound = _BOUNDS[name][1] * unit
-        if value >= 0.999 * bound:
-            warn(f"{name} ended on its bound {bound:.4g}; it is only a limit", "boundary", number=bound)

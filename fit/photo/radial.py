@@ -32,22 +32,16 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
 
     The profile is linear in its values: each is the weight of one hat function, whose kernel is convolved with the
     sharp dot. A penalty on second differences, chosen by generalised cross-validation, ties the values to each other
-    where the data alone do not fix them (near the centre, where few pixels lie).
-
-    Args:
-        pair: the pictures.
-        moves: to start from.
-        radius: where the profile ends, px.
-        knots: number of values; None takes two a pixel, between 8 and 48.
-
-    Returns:
-        A solution with the params "values" [knots] (density per square pixel) and "radius".
+    where the data alone do not fix them (near the centre, where few pixels lie). The profile ends at `radius` px;
+    `knots` None takes two values a pixel, between 8 and 48. They are densities per square pixel.
     """
     count = knots if knots is not None else int(np.clip(np.ceil(2 * radius), 8, 48))
     half = min(int(np.ceil(radius)) + 1, pair.half)
     values = torch.eye(count, dtype=torch.float64)
     hats = pixel_kernels("radial", {"values": values, "radius": radius}, 2 * half + 1).numpy()
-    mass = _hat_mass(count, radius)
+    h = radius / (count - 1)
+    mass = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # of each hat, over the plane
+    mass[0], mass[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
     moves = dict(moves)
     for _ in range(10):
         columns = mass[:, None] * pair.convolve(pair.moved_source(moves), hats)  # [knots, pixels]
@@ -84,15 +78,6 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
         squares=float(residual @ residual),
         slopes=np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1),
     )
-
-
-def _hat_mass(count: int, radius: float) -> Array:
-    """Integral over the plane of each of `count` hat functions over [0, radius]."""
-    h = radius / (count - 1)
-    mass = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)
-    mass[0] = np.pi * h * h / 3
-    mass[-1] = 2 * np.pi * (radius * h / 2 - h * h / 6)
-    return mass
 
 
 def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:

@@ -7,13 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchdof.validation import show
-
 from ..problems import FitError
 from ..result import Array, BlurFit, Indices
 from ..validation import a_picture
 from .dot import find_dot
-from .forward import OPENINGS
 from .profile_fit import fit_profile
 
 __all__ = ["blur_strength", "fit_ratio"]
@@ -67,10 +64,7 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
 
 def fit_ratio(sharp: Array | None, blurred: Array, family: str) -> BlurFit:
     """The paper's procedure: a profile fitted to the blur strength, errors that a spoke has in common allowed for."""
-    if sharp is None or family in OPENINGS:
-        raise FitError(
-            f"model='ratio' divides by the sharp picture, got sharp={show(sharp)}, and fits a profile over r, which "
-            f"'polygon' and 'image' have not, got {family!r}; use model='forward'"
-        )
+    if sharp is None:
+        raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
     r, strength, spokes = blur_strength(sharp, blurred)
     return replace(fit_profile(r, strength, family, groups=spokes), model="ratio")

@@ -127,14 +127,10 @@ class Edge:
 
 
 def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_exponent: bool = False) -> Edge:
-    """Fit a soft disc to a dot.
+    """Fit a soft disc to a dot in a picture `[H, W]`; pixels at `white` or above may be brighter than they look.
 
-    Args:
-        picture: `[H, W]`.
-        dot: where the dot is.
-        white: pixels at this level or above are allowed to be brighter than they look.
-        fit_exponent: let the levels be a power of the light. A round white dot has as much light missing inside its
-            edge as there is outside; encoding (a power of about 0.45) breaks that balance and so shows itself.
+    With `fit_exponent` levels are a power of the light. A round white dot has as much light missing inside its edge as
+    there is outside; encoding (a power of about 0.45) breaks that balance and so shows itself.
     """
     grid = np.indices(picture.shape).astype(np.float64)
     near = distance_from(dot, picture.shape) <= dot.reach + 3
@@ -169,7 +165,8 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         slope[:, i] = (model(moved) - drawn) / h
     freedom = max(levels.size - len(solution), 1)
     variance = float(residual @ residual) / freedom
-    shot_noise = _shot_noise(picture, dot)
+    inside = inner_pixels(picture, dot)
+    shot_noise = 0.0 if inside is None else max(fine_variance(picture, inside) - dot.noise**2, 0.0)
     fine = noise_beside(picture, dot.background, ~near)[1]
     expected = float(np.sqrt(np.mean(dot.noise**2 + shot_noise * np.clip(levels, 0, 1)) / fine)) / dot.peak
     coverage = _coverage(rows, columns, dot.x + solution[0], dot.y + solution[1], solution[2], solution[3])
@@ -235,8 +232,3 @@ def _steepness(residual: Array, coverage: Array) -> tuple[float, float]:
         return 0.0, np.inf
     error = np.sqrt(sum(float(residual[side].var(ddof=1)) / side.sum() for side in (low, high)))
     return float(residual[high].mean() - residual[low].mean()), float(error)
-
-
-def _shot_noise(picture: Array, dot: Dot) -> float:
-    inside = inner_pixels(picture, dot)
-    return 0.0 if inside is None else max(fine_variance(picture, inside) - dot.noise**2, 0.0)

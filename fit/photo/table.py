@@ -5,12 +5,11 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from torchdof.optics.aperture import Aperture
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
@@ -18,7 +17,7 @@ from torchdof.validation import show
 from ..problems import FitError, unheard, warn
 from ..result import Array, BlurFit
 from ..validation import a_choice
-from .agreement import check_agreement, frame_width
+from .agreement import check_agreement
 from .captures import CAMERA, Capture, Captures
 from .colours import Colour, fit_colours
 from .distances import counted, fit_distances, fit_one, fit_openings
@@ -58,16 +57,8 @@ class TableFit:
 def fit_table(captures: Captures, family: str = "auto", **options: Any) -> BlurTable:
     """The blur table of a camera from photographs of a dot at one or more distances: `fit_captures(...).table`.
 
-    Args:
-        captures: from `read_captures`, or made of arrays.
-        family: "auto", or one of the families of `fit_pair`.
-        **options: see `fit_captures`.
-
-    Returns:
-        A table in mm of the sensor where its width is known, else in fractions of the frame's width.
-
-    Raises:
-        FitError: see `fit_captures`.
+    Arguments and errors are those of `fit_captures`. The table is in mm of the sensor where its width is known, else in
+    fractions of the frame's width.
 
     Example:
         >>> import torch
@@ -120,12 +111,8 @@ def fit_captures(
 
     Raises:
         FitError: a pair cannot be fitted; the message names its file. Of kind "camera" where the fitted blur is far
-            from what the camera's numbers promise.
-
-    Warns:
-        FitWarning: what `fit_pair` warns about; of kind "single distance" where there is one, which the thin lens
-            scales; of kind "camera" where the blur differs from what the camera's numbers promise; of kind "exposure"
-            where a fitted gain contradicts the stated exposures.
+            from what the camera's numbers promise. It warns where that differs less, where a fitted gain contradicts
+            the stated exposures, of a single distance, and of what `fit_pair` warns about.
     """
     if not isinstance(captures, Captures):
         raise FitError(
@@ -164,7 +151,6 @@ def fit_captures(
         fits = fit_distances(captures, family, smooth, kept)
     fits = [counted(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
     radius_px = np.array([f.radius for f in fits])
-    captures = replace(captures, width_px=frame_width(captures, radius_px))
     check_agreement(captures, radius_px)
     coc_px, scale = _keys(captures, radius_px, scale_of)
     params, colours = _params(fits, family), tuple[Colour, ...]()

@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -31,27 +31,13 @@ SQUARE_MM = 100.0
 DOT_MM = 5.0
 """Diameter of the white dot in its middle, mm."""
 
-_PAGE_MM = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
-_POINTS = 72 / 25.4  # PDF points a mm
 _SEARCHED_PX = 500  # width of the copy in which the square is looked for
 _LEVELS = np.linspace(0.1, 0.75, 14)  # of the way from dark to bright
 _SMALLEST, _LARGEST = 0.004, 0.6  # share of the frame that the square may take
-_INSTRUCTIONS = (
-    "torchdof: measure the blur of your camera (docs/phone.md)",
-    "1. Print at 100 %. The line above must measure 100 mm; if not, add --square-mm with what the square",
-    "    measures.",
-    "2. Fix it flat, evenly lit, without shadows or gloss. Photograph it square on, with a tripod if you have",
-    "    one.",
-    "3. Lock focus and exposure on the nearest distance at which the dot is sharp; on a phone press and hold",
-    "    on it.",
-    "4. Take one sharp picture, then five to nine more from farther away (and nearer), without refocusing, no",
-    "    zoom.",
-    "5. Put the pictures as they are into one folder:   torchdof fit FOLDER -o my-phone.json",
-)
 
 
 def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
-    """Write the target as a PDF of one page, to be printed at 100 %.
+    """Write the target, which lies beside this file, as a PDF of one page, to be printed at 100 %.
 
     Args:
         path: ends in .pdf.
@@ -71,68 +57,22 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
     target = Path(path)
     if target.suffix.lower() != ".pdf":
         raise FitError(f"the target is written as PDF: name it {target.with_suffix('.pdf')}", file=str(path))
-    a_choice("paper", paper, tuple(_PAGE_MM))
-    width, height = _PAGE_MM[paper]
-    left, bottom = (width - SQUARE_MM) / 2, height - 55.0 - SQUARE_MM
-    x, y = width / 2, bottom + SQUARE_MM / 2
-    drawn = [
-        f"{_POINTS:.6f} 0 0 {_POINTS:.6f} 0 0 cm 0 g",
-        f"{left} {bottom} {SQUARE_MM} {SQUARE_MM} re f",
-        f"1 g {_circle(x, y, DOT_MM / 2)} f 0 g 0.2 w",
-        f"{left} {bottom - 22} m {left + 100} {bottom - 22} l S",
-        *(f"{left + end} {bottom - 24} m {left + end} {bottom - 20} l S" for end in (0, 100)),
-        f"BT /F 3.6 Tf {left + 43} {bottom - 27} Td (100 mm) Tj ET",
-    ]
-    for i, line in enumerate(_INSTRUCTIONS):
-        escaped = line.replace("(", r"\(").replace(")", r"\)")
-        drawn.append(f"BT /F 3.2 Tf 18 {bottom - 38 - 7 * i} Td ({escaped}) Tj ET")
-    content = "\n".join(drawn).encode("ascii")
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width * _POINTS:.2f} {height * _POINTS:.2f}] "
-        "/Resources << /Font << /F 5 0 R >> >> /Contents 4 0 R >>".encode("ascii"),
-        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(content), content),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-    ]
-    written, places = b"%PDF-1.4\n", []
-    for number, body in enumerate(objects, start=1):
-        places.append(len(written))
-        written += b"%d 0 obj\n%s\nendobj\n" % (number, body)
-    table = b"".join(b"%010d 00000 n \n" % place for place in places)
-    end = b"xref\n0 %d\n0000000000 65535 f \n%strailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n"
+    a_choice("paper", paper, get_args(Paper))
+    page = Path(__file__).with_name(f"target-{paper}.pdf").read_bytes()
     with whole_file(target) as temporary:
-        Path(temporary).write_bytes(written + end % (len(objects) + 1, table, len(objects) + 1, len(written)))
-
-
-def _circle(x: float, y: float, radius: float) -> str:
-    """A circle as four Bezier curves."""
-    r, k = radius, 4 / 3 * (math.sqrt(2) - 1) * radius
-    return (
-        f"{x + r} {y} m {x + r} {y + k} {x + k} {y + r} {x} {y + r} c {x - k} {y + r} {x - r} {y + k} {x - r} {y} c "
-        f"{x - r} {y - k} {x - k} {y - r} {x} {y - r} c {x + k} {y - r} {x + r} {y - k} {x + r} {y} c"
-    )
+        Path(temporary).write_bytes(page)
 
 
 @dataclass(frozen=True)
 class Target:
-    """The target in a photograph.
+    """The target in a photograph."""
 
-    Attributes:
-        x: middle of the square, px.
-        y: the same, downwards.
-        side_px: the square's side.
-        elongation: longer over shorter side; above 1 the camera looked at an angle.
-        white: level of the paper around the square.
-        black: level of the square.
-    """
-
-    x: float
-    y: float
+    x: float  # middle of the square, px
+    y: float  # the same, downwards
     side_px: float
-    elongation: float
-    white: float
-    black: float
+    elongation: float  # longer over shorter side; above 1 the camera looked at an angle
+    white: float  # level of the paper around the square
+    black: float  # level of the square
 
 
 def find_target(light: Array, *, file: str | None = None) -> Target:

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from torchdof import Camera
-from torchdof.fit import Capture, Captures, fit_captures, fit_pair, fit_profile
-from torchdof.fit.problems import FitError
+from torchdof.fit import Capture, Captures, FitError, fit_captures, fit_pair, fit_profile
 from torchdof.optics.psf import LENGTHS, pixel_kernels
 
 FAMILIES = {
@@ -77,9 +76,9 @@ def measure(camera, family, draws, fitted=None):
                 pair = camera.pair(family, FAMILIES[family], seed)
                 fit = fit_pair(*pair, fitted or family, magnification=known)
             except FitError as error:
-                said[type(error).__name__] = said.get(type(error).__name__, 0) + 1
+                said[error.kind] = said.get(error.kind, 0) + 1
                 continue
-        for name in {type(w.message).__name__ for w in caught}:
+        for name in {w.message.kind for w in caught}:
             said[name] = said.get(name, 0) + 1
         found.append((fit.radius / true - 1, fit.radius_stderr / true, fit.residual_over_noise))
     return np.array(found).reshape(-1, 3), said
@@ -101,9 +100,9 @@ def measure_crop(family, draws, said_width):
             try:
                 result = fit_captures(Captures((pair,), 1.0, said_width, **numbers), family, smooth=False)
             except FitError as error:
-                said[type(error).__name__] = said.get(type(error).__name__, 0) + 1
+                said[error.kind] = said.get(error.kind, 0) + 1
                 continue
-        for name in {type(w.message).__name__ for w in caught} - {"SingleDistanceWarning"}:
+        for name in {w.message.kind for w in caught} - {"single distance"}:
             said[name] = said.get(name, 0) + 1
         fit = result.fits[0]
         # what the table draws for the circle of confusion that the whole frame has there
@@ -156,7 +155,7 @@ def main():
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             fits = {f: fit_pair(None, np.load(file, allow_pickle=False), f) for f in ("ring", "gaussian")}
-        said = {type(w.message).__name__ for w in caught}
+        said = {w.message.kind for w in caught}
         text = ", ".join(f"{f} residual {100 * fit.residual:.1f} %" for f, fit in fits.items())
         print(f"{file.name[:26]}: {text}, asymmetry {fits['ring'].asymmetry:.2f}  {', '.join(sorted(said))}")
 
