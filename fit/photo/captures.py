@@ -133,10 +133,10 @@ class Captures:
 
 def check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
     """Refuse distances that are not positive and increasing, or that equal the focus."""
-    for name, value in [("focus_m", focus), *(("distance_m", d) for d in distances)]:
-        a_number(name, value, -1e100, 1e100, "metres")
+    a_number("focus_m", focus, 0, 1e100, "metres")
     for before, distance in zip([0.0, *distances], distances, strict=False):
-        if not before < distance or focus <= 0:
+        a_number("distance_m", distance, -1e100, 1e100, "metres")
+        if not before < distance:
             listed = ", ".join(f"{d:g}" for d in distances)
             text = f"distances must be positive and increasing, got {listed} m"
             raise FitError(text, "distance", file=where, number=float(distance))

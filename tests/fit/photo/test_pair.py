@@ -162,6 +162,7 @@ def test_photographed_stars_are_rings_and_the_uneven_one_is_said_to_be(simulator
 
 
 JPEG = {"level": 0.8, "size": 91, "jpeg": 90, "black": 0.02}
+CUT_OFF = {"bits": 16, "snr_db": 45, "level": 0.8}
 TONE = {"tone": 0.5, "level": 0.8, "black": 0.03}
 HELD, CHEAP = {"fit_magnification": False}, {"family": "auto", "accuracy_db": 30}
 G3, G4, D6, R34 = (
@@ -179,7 +180,7 @@ WARNED = [
     ),
     ({"clip": 0.9}, G4, 0, {}, {"saturated"}, "pixels of the .* picture are", None),
     ({"clip": 0.9, "snr_db": None}, G4, 0, {"white": 0.9}, {"saturated"}, "clipped at 0.9", None),
-    ({"bits": 16, "snr_db": 45, "level": 0.8}, D6, 0, {}, {"saturated"}, "picture's paper lies on its lowest level, 0", 0.5),
+    (CUT_OFF, D6, 0, {}, {"saturated"}, "picture's paper lies on its lowest level, 0", 0.5),
     ({"misfocus": 1.4}, G4, 0, {}, {"not in focus"}, "1.4 px, as out of focus; the dot was fitted as", 1.4),
     (TONE, G3, 0, {}, {"not linear"}, "a tone curve", None),
     (TONE, G3, 1, {}, {"not linear"}, "a tone curve", None),
