@@ -2,13 +2,13 @@
 
 from .lens.trace import trace_table
 from .photo.across import table_of_dots
+from .photo.agreement import check_reach
+from .photo.captures import Capture, Captures
 from .photo.family_choice import highlight_psnr, natural_psnr
-from .photo.kernel_image import KernelImage, fit_kernel_image
-from .photo.manifest import Capture, Captures, read_captures, read_pair
+from .photo.manifest import read_captures
 from .photo.pair import fit_pair
 from .photo.profile_fit import fit_profile
-from .photo.ratio import blur_strength, polar_samples
-from .photo.scale import check_reach
+from .photo.ratio import blur_strength
 from .photo.table import TableFit, fit_captures, fit_table
 from .problems import FitError, FitWarning
 from .result import BlurFit
@@ -19,20 +19,16 @@ __all__ = [
     "Captures",
     "FitError",
     "FitWarning",
-    "KernelImage",
     "TableFit",
     "blur_strength",
     "check_reach",
     "fit_captures",
-    "fit_kernel_image",
     "fit_pair",
     "fit_profile",
     "fit_table",
     "highlight_psnr",
     "natural_psnr",
-    "polar_samples",
     "read_captures",
-    "read_pair",
     "table_of_dots",
     "trace_table",
 ]

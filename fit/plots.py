@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,23 +16,19 @@ from .problems import FitError
 from .result import Array, BlurFit
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["DATA", "MODEL", "new_figure", "picture_of_fit", "picture_of_quad", "picture_of_table", "picture_of_texture"]
+__all__ = ["picture_of_fit", "picture_of_quad", "picture_of_table", "picture_of_texture"]
 
 DATA, MODEL = "#7a7a7a", "#c2410c"
 
 
 def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
-    """Samples with the fitted curve: the paper's Fig. 2.
+    """Samples with the fitted curve: the paper's Fig. 2, its lengths in a unit.
 
     For a forward fit the samples are the blurred dot's pixels and the curve is the model of them, with the kernel's own
     profile beside it; for a profile fit they are the samples of blur strength.
-
-    Args:
-        fit: any fit.
-        unit: of its lengths, for the axis.
-        title: above the picture.
 
     Raises:
         FitError: the fit carries no samples.
@@ -40,18 +37,9 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
         raise FitError("this fit carries no samples to draw")
     figure, axes = new_figure(5.4, 3.6)
     forward = fit.model == "forward"
-    axes.plot(
-        *fit.samples,
-        ".",
-        color=DATA,
-        markersize=2.5 if forward else 4,
-        label="samples" if not forward else "pixels",
-        zorder=1,
-    )
+    axes.plot(*fit.samples, ".", color=DATA, markersize=2.5 if forward else 4, label="pixels" if forward else "samples")
     if forward:
-        bins = np.floor(fit.curve[0] * 2 + 0.5).astype(int)  # half a unit wide
-        count = np.bincount(bins)
-        r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
+        r, level = model_line(fit)
         axes.plot(r, level, color=MODEL, label="forward model", zorder=3)
         if fit.aperture is None:  # what is not round has no profile
             line = np.linspace(0, fit.samples[0].max(), 400)
@@ -67,15 +55,16 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
     return figure
 
 
-def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str = "") -> Figure:
-    """The blur texture at a circle of confusion: the paper's Fig. 3.
+def model_line(fit: BlurFit) -> tuple[Array, Array]:
+    """Radii, and the mean level of a forward fit's model around them, in steps of half a unit."""
+    bins = np.floor(fit.curve[0] * 2 + 0.5).astype(int)
+    count = np.bincount(bins)
+    r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
+    return r, level
 
-    Args:
-        table: blur table.
-        coc_px: signed circle of confusion in pixels.
-        width: width of the image in pixels.
-        title: above the picture.
-    """
+
+def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str = "") -> Figure:
+    """The blur texture at a signed circle of confusion of an image of a width in pixels: the paper's Fig. 3."""
     texture = table.blur_texture(coc_px, width).detach().numpy()
     figure, axes = new_figure(4.2, 3.6)
     half = texture.shape[-1] / 2
@@ -89,19 +78,11 @@ def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str =
 
 
 def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
-    """A quad in focus and out of focus side by side, with the row through their middle: the paper's Fig. 4.
-
-    Args:
-        sharp: `[H, W]` linear light.
-        blurred: `[H, W]` linear light.
-        title: above the picture.
-    """
+    """A quad in focus and out of focus `[H, W]`, linear light, and the row through the middle: the paper's Fig. 4."""
     figure, (left, right, below) = new_figure(9.6, 3.4, 3)
-    top = max(float(sharp.max()), 1e-12)
-    for axes, picture, name in ((left, sharp, "in focus"), (right, blurred, "out of focus")):
-        axes.imshow((np.clip(picture / top, 0, 1)) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
-        axes.set_title(name, fontsize=9)
-        axes.set_axis_off()
+    white = float(sharp.max())
+    show(left, sharp, "in focus", white=white)
+    show(right, blurred, "out of focus", white=white)
     row = sharp.shape[0] // 2
     below.plot(sharp[row], color=DATA, label="in focus")
     below.plot(blurred[row], color=MODEL, label="out of focus")
@@ -112,12 +93,7 @@ def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
 
 
 def picture_of_table(table: BlurTable, title: str = "") -> Figure:
-    """A table over depth: every parameter at its nodes, and the lines the table draws between them.
-
-    Args:
-        table: blur table.
-        title: above the picture.
-    """
+    """A table over depth: every parameter at its nodes, and the lines the table draws between them."""
     names = list(table.node_params)
     figure, axes = new_figure(3.2 * len(names), 3.2, len(names))
     reach = float(table.coc.abs().max())
@@ -145,6 +121,18 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
         ax.set(xlabel=f"signed coc [{unit}]")
     figure.suptitle(title or f"{table.name or 'table'} ({table.family})", fontsize=10)
     return figure
+
+
+def show(
+    axes: Axes, picture: Array, title: str, *, white: float | None = None, box: Sequence[tuple[float, float]] = ()
+) -> None:
+    """Draws a picture `[H, W]` in linear light as a display shows it, and a line through the corners of a box."""
+    white = max(float(picture.max()) if white is None else white, 1e-12)
+    axes.imshow(np.clip(picture / white, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+    if box:
+        axes.plot(*zip(*box, strict=True), color=MODEL, linewidth=1)
+    axes.set_title(title, fontsize=8)
+    axes.set_axis_off()
 
 
 def new_figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, Any]:

@@ -12,11 +12,10 @@ from torchdof.optics.blur_table import BlurTable
 
 from .photo.photographs import Photograph, Photographs
 from .photo.table import TableFit
-from .plots import DATA, MODEL, new_figure
+from .plots import DATA, MODEL, model_line, new_figure, show
 from .result import Array
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["sheet_of_photographs"]
@@ -43,46 +42,35 @@ def sheet_of_photographs(
     for i, (pair, fit, coc) in enumerate(zip(captures, result.fits, result.coc_px, strict=True)):
         found, window, profile, residual, kernel = axes[i]
         picture = by_distance[pair.distance_m]
-        _show(found, *_thumbnail(picture), f"{picture.file}, {pair.distance_m:.3f} m")
-        _show(window, pair.blurred, [], "")
+        small, corners = _thumbnail(picture)
+        show(found, small, f"{picture.file}, {pair.distance_m:.3f} m", box=corners)
+        show(window, pair.blurred, "")
         profile.plot(*fit.samples, ".", color=DATA, markersize=1.5)
-        bins = np.floor(fit.curve[0] * 2 + 0.5).astype(int)  # half a pixel wide
-        count = np.bincount(bins)
-        r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
-        profile.plot(r, level, color=MODEL)
+        profile.plot(*model_line(fit), color=MODEL)
         profile.set_title(f"{fit.family}, radius {fit.radius:.2f} ± {fit.radius_stderr:.2f} px", fontsize=8)
         residual.plot(fit.samples[0], fit.samples[1] - fit.curve[1], ".", color=DATA, markersize=1.5)
         residual.axhline(0, color=MODEL, linewidth=1)
         residual.set_title(f"residual {fit.residual_over_noise:.2f} x noise", fontsize=8)
         shape = result.table.kernels(torch.tensor([coc], dtype=torch.float64), captures.width_px)[0, 0]
-        _show(kernel, shape.detach().numpy(), [], f"kernel at coc {coc:+.2f} px")
+        show(kernel, shape.detach().numpy(), f"kernel at coc {coc:+.2f} px")
     for unused in axes[rows]:
         unused.remove()
     grid = axes[rows, 0].get_gridspec()
     (sharp,) = (p for p in photographs.pictures if p.file == captures.notes["sharp"])
-    window = _around_the_dot(sharp)
+    half = int(min(sharp.target.side_px / 4, 120))
+    x, y = round(sharp.target.x), round(sharp.target.y)
+    window = sharp.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
     most, blurrest = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
     ends = min(0.0, *result.coc_px), max(0.0, *result.coc_px)
-    lights = _rendered(render, _lights(), result.table, captures.width_px, *ends)
+    scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights over stripes
+    scene[44:46, 18::36] = 25.0
+    lights = _rendered(render, scene, result.table, captures.width_px, *ends)
     photograph = _rendered(render, window, result.table, captures.width_px, most, most)
-    _show(
-        figure.add_subplot(grid[rows, :3]),
-        lights,
-        [],
-        "lights and edges from one end of the measured distances through the focus to the other, with this table",
-    )
-    _show(figure.add_subplot(grid[rows, 3]), window, [], f"{sharp.file}, in focus")
-    _show(figure.add_subplot(grid[rows, 4]), photograph, [], f"with this table, as at {blurrest.distance_m:.3f} m")
+    text = "lights and edges from one end of the measured distances through the focus to the other, with this table"
+    show(figure.add_subplot(grid[rows, :3]), lights, text)
+    show(figure.add_subplot(grid[rows, 3]), window, f"{sharp.file}, in focus")
+    show(figure.add_subplot(grid[rows, 4]), photograph, f"with this table, as at {blurrest.distance_m:.3f} m")
     return figure
-
-
-def _show(axes: Axes, picture: Array, box: list[tuple[float, float]], title: str) -> None:
-    top = max(float(picture.max()), 1e-12)
-    axes.imshow(np.clip(picture / top, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
-    if box:
-        axes.plot(*zip(*box, strict=True), color=MODEL, linewidth=1)
-    axes.set_title(title, fontsize=8)
-    axes.set_axis_off()
 
 
 def _thumbnail(picture: Photograph) -> tuple[Array, list[tuple[float, float]]]:
@@ -95,20 +83,6 @@ def _thumbnail(picture: Photograph) -> tuple[Array, list[tuple[float, float]]]:
     return small, [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in corners]
 
 
-def _lights() -> Array:
-    """A row of small lights over stripes `[H, W]`."""
-    scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))
-    scene[44:46, 18::36] = 25.0
-    return scene
-
-
-def _around_the_dot(picture: Photograph) -> Array:
-    """The photograph's pixels `[H, W]` around the dot, half of the square wide and 240 at most."""
-    half = int(min(picture.target.side_px / 4, 120))
-    x, y = round(picture.target.x), round(picture.target.y)
-    return picture.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
-
-
 def _rendered(
     render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor],
     scene: Array,
@@ -119,13 +93,7 @@ def _rendered(
 ) -> Array:
     """A part `[H, W]` of a frame of `width_px`, its circle of confusion going from `left` to `right` px."""
     coc = torch.linspace(left, right, scene.shape[1], dtype=torch.float32).expand(1, 1, *scene.shape)
-    # a table in mm of the sensor: seen through a part of the frame as wide as this picture
-    shown = render(torch.from_numpy(scene).float()[None, None], coc, _through(table, scene.shape[1] / width_px))
+    if table.unit == "mm" and table.sensor_width_mm is not None:  # seen through a part of the frame as wide as this
+        table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / width_px)
+    shown = render(torch.from_numpy(scene).float()[None, None], coc, table)
     return np.clip(shown[0, 0].numpy().astype(np.float64), 0, 1)
-
-
-def _through(table: BlurTable, share: float) -> BlurTable:
-    """The same lens seen through a share of the frame's width."""
-    if table.unit != "mm" or table.sensor_width_mm is None:
-        return table
-    return table.replace(sensor_width_mm=table.sensor_width_mm * share)

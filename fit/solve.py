@@ -1,21 +1,21 @@
-"""Least squares by `scipy.optimize.curve_fit` from several starts; its silent failures become named errors."""
+"""Least squares by SciPy from several starts, and what is told of a solution; silent failures become named errors."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 
 import numpy as np
 
-from .problems import NotConvergedError
+from .problems import FitError
 from .result import Array
 
-__all__ = ["best_of", "information_criterion", "one_thread"]
+__all__ = ["best_of", "information_criterion", "inverse", "one_thread"]
 
 _ROUGH = 1e-3
 _LAST = 1e-5
 _TIGHT = 1e-13  # well-posed noise-free data should come back to ten digits
+_ATTEMPTS = 400
 
 
 def one_thread() -> AbstractContextManager[object]:
@@ -27,77 +27,72 @@ def one_thread() -> AbstractContextManager[object]:
 
 
 def best_of(
-    model: Callable[..., Array],
+    model: Callable[[Array], Array],
     data: Array,
     starts: Sequence[Sequence[float]],
     bounds: tuple[Sequence[float], Sequence[float]],
     *,
-    jacobian: Callable[..., Array] | None = None,
+    jacobian: Callable[[Array], Array] | None = None,
     tolerance: float = _TIGHT,
-    attempts: int = 400,
     loyalty: float = 0.0,
 ) -> Array:
     """Fit roughly from every start, finish from the best, and return the parameters.
 
     Args:
-        model: `model(x, *params) -> [n]`; `x` is the sample's index and may be ignored.
+        model: from parameters `[p]` to what is held against the data `[n]`.
         data: `[n]`, more samples than parameters, of order 1.
         starts: parameter vectors, of order 1; moved into the bounds.
-        bounds: lower and upper bounds, as for `curve_fit`.
-        jacobian: `jacobian(x, *params) -> [n, p]`; three-point differences when None.
+        bounds: lower and upper bounds.
+        jacobian: the model's derivatives `[n, p]`; three-point differences when None.
         tolerance: relative change of cost, parameters and gradient at which to stop.
-        attempts: the most evaluations for each start.
         loyalty: the first start is finished unless another one's sum of squares is smaller by more than this share.
 
-    Returns:
-        The parameters `[p]`.
-
     Raises:
-        NotConvergedError: when no start converged.
+        FitError: of kind "not converged" when no start did.
     """
-    from scipy.optimize import OptimizeWarning, curve_fit
+    from scipy.optimize import least_squares
 
     low, high = (np.asarray(side, dtype=np.float64) for side in bounds)
     # keep starts off the bounds, where the trust region cannot move
     margin = np.where(np.isfinite(high - low), 1e-6 * (high - low), 1e-9)
-    index = np.arange(data.size, dtype=np.float64)
 
-    def descend(start: Array, tolerance: float) -> tuple[float, Array] | None:
-        try:
-            with warnings.catch_warnings():
-                # it warns where its own covariance has no inverse; the caller computes one, and reports it
-                warnings.simplefilter("ignore", OptimizeWarning)
-                params, _ = curve_fit(
-                    model,
-                    index,
-                    data,
-                    p0=np.clip(start, low + margin, high - margin),
-                    bounds=(low, high),
-                    jac=jacobian if jacobian is not None else "3-point",
-                    method="trf",
-                    x_scale="jac",
-                    ftol=tolerance,
-                    xtol=tolerance,
-                    gtol=tolerance,
-                    max_nfev=attempts,
-                )
-        except RuntimeError:  # out of evaluations
-            return None
-        squares = float(np.sum((model(index, *params) - data) ** 2))
-        return (squares, np.asarray(params, dtype=np.float64)) if np.isfinite(squares) else None
+    def descend(start: Sequence[float] | Array, tolerance: float) -> tuple[float, Array] | None:
+        found = least_squares(
+            lambda p: model(p) - data,
+            np.clip(np.asarray(start, dtype=np.float64), low + margin, high - margin),
+            jac=jacobian or "3-point",
+            bounds=(low, high),
+            x_scale="jac",
+            ftol=tolerance,
+            xtol=tolerance,
+            gtol=tolerance,
+            max_nfev=_ATTEMPTS,
+        )
+        return (found.cost, found.x) if found.success and np.isfinite(found.cost) else None
 
-    rough = [descend(np.asarray(start, dtype=np.float64), max(tolerance, _ROUGH)) for start in starts]
+    rough = [descend(start, max(tolerance, _ROUGH)) for start in starts]
     reached = [r for r in rough if r is not None]
     if not reached:
-        raise NotConvergedError(
-            f"none of {len(starts)} starts converged; is this a picture of a blurred dot?", number=float(len(starts))
-        )
+        text = f"none of {len(starts)} starts converged; is this a picture of a blurred dot?"
+        raise FitError(text, "not converged", number=float(len(starts)))
     best = min(reached, key=lambda r: r[0])
     if rough[0] is not None and rough[0][0] <= best[0] * (1 + loyalty):
         best = rough[0]
     # a long narrow valley may take too many steps for the last digits; its floor is a solution all the same
     finished = descend(best[1], tolerance) or descend(best[1], max(tolerance, _LAST)) or best
-    return min(finished, best, key=lambda r: r[0])[1]
+    return np.asarray(min(finished, best, key=lambda r: r[0])[1])
+
+
+def inverse(information: Array) -> Array:
+    """Inverse of an information matrix; a direction without information gets an infinite variance, not an error."""
+    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    lost = values <= 1e-13 * max(values.max(), 1e-300)
+    kept = np.where(lost, 0.0, 1.0 / np.where(lost, 1.0, values))
+    result = (vectors * kept) @ vectors.T / np.outer(scale, scale)
+    touched = (np.abs(vectors[:, lost]) > 1e-3).any(axis=1)
+    result[touched, touched] = np.inf
+    return np.asarray(result, dtype=np.float64)
 
 
 def information_criterion(squares: float, count: int, parameters: int) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,52 +10,42 @@ from numpy.typing import ArrayLike
 
 from torchdof.validation import number, show, whole
 
-from .problems import FitError, NonFiniteError
+from .problems import FitError
 from .result import Array
 
-__all__ = ["a_count", "a_number", "a_picture"]
+__all__ = ["a_choice", "a_count", "a_number", "a_picture"]
 
 _BRIGHTEST, _DARKEST = 1e30, 1e-30  # squares of levels, and their squares, are summed
 
 
-def a_number(name: str, value: Any, low: float, high: float = np.inf, unit: str = "", infinite: bool = False) -> float:
-    """A number in the open interval (low, high).
-
-    Raises:
-        FitError: it is none, or outside.
-    """
-    value = value.item() if isinstance(value, np.generic) else value
+def a_number(name: str, value: Any, low: float, high: float = np.inf, unit: str = "") -> float:
+    """A number in the open interval (low, high), or a `FitError`."""
     try:
-        return number(name, value, low, high, unit, infinite)
+        return number(name, _plain(value), low, high, unit)
     except ValueError as error:
         raise FitError(str(error), number=value if isinstance(value, float) else None) from None
 
 
 def a_count(name: str, value: Any, low: int, high: int) -> int:
-    """A whole number from low to high.
-
-    Raises:
-        FitError: it is none, or outside.
-    """
-    value = value.item() if isinstance(value, np.generic) else value
+    """A whole number from low to high, or a `FitError`."""
     try:
-        return whole(name, value, low, high)
+        return whole(name, _plain(value), low, high)
     except ValueError as error:
         raise FitError(str(error)) from None
 
 
-def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = None) -> Array:
-    """A picture `[H, W]` of finite numbers.
+def a_choice(name: str, value: Any, choices: Sequence[str]) -> None:
+    """Refuse what is none of some texts with a `FitError`."""
+    if not isinstance(value, str) or value not in choices:
+        raise FitError(f"{name} must be one of {', '.join(choices)}, got {show(value)}")
 
-    Args:
-        name: of the argument.
-        picture: what came.
-        smallest: least pixels on a side.
-        file: named in errors.
+
+def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = None) -> Array:
+    """A picture `[H, W]` of finite numbers with a least number of pixels on a side.
 
     Raises:
-        FitError: it is not an array of real numbers, too small, or so bright or dark that squares overflow.
-        NonFiniteError: NaN or infinity among its pixels.
+        FitError: it is not an array of real numbers, too small, or so bright or dark that squares overflow; of kind
+            "not finite" for NaN or infinity among its pixels.
     """
     try:
         array = np.asarray(picture)
@@ -72,9 +63,13 @@ def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = N
         )
     bad = int(np.sum(~np.isfinite(array)))
     if bad:
-        raise NonFiniteError(f"{bad} pixels of {name} are NaN or infinite", file=file, number=float(bad))
+        raise FitError(f"{bad} pixels of {name} are NaN or infinite", "not finite", file=file, number=float(bad))
     largest = float(np.abs(array).max())
     if largest > _BRIGHTEST or 0 < largest < _DARKEST:
         text = f"levels of {name} must lie within {_DARKEST:g} and {_BRIGHTEST:g}, got up to {largest:g}; scale them"
         raise FitError(text, file=file, number=largest)
     return array
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

@@ -14,7 +14,7 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.field import Field
 
 from ..problems import FitError
-from .manifest import Captures
+from .captures import Captures
 from .table import TableFit
 
 __all__ = ["field_of_dots", "table_of_dots"]
@@ -35,42 +35,35 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     Args:
         dots: What was photographed and fitted of each, the most central first, all with the scale of its fit.
 
-    Returns:
-        The first dot's table with a field.
-
     Raises:
         FitError: There are no two dots at different distances from the middle, or they were not fitted alike.
     """
     if len(dots) < 2:
         raise FitError(f"dots must be those of a grid, two at least, got {len(dots)}")
-    first = dots[0][1].table
-    per_px = float(first.coc[-1]) / dots[0][1].coc_px[-1]
-    for captures, fitted in dots:
-        same = fitted.table.coc.shape == first.coc.shape and torch.allclose(fitted.table.coc, first.coc, rtol=1e-6)
-        if not same or fitted.table.channels != first.channels:
-            where = captures.notes.get("position_px")
+    captures, fitted = dots[0]
+    first = fitted.table
+    for other, its_fit in dots:
+        same = its_fit.table.coc.shape == first.coc.shape and torch.allclose(its_fit.table.coc, first.coc, rtol=1e-6)
+        if not same or its_fit.table.channels != first.channels:
+            where = other.notes.get("position_px")
             raise FitError(f"the dot at {where} px must be fitted at the distances and colours of the first one")
-    centres = [captures.pairs[0].position_px for captures, _ in dots]
+    centres = [other.pairs[0].position_px for other, _ in dots]
+    per_px = float(first.coc[-1]) / fitted.coc_px[-1]
     places = [(x * per_px, y * per_px) for x, y in centres]
-    shrunk = [dots[0][0].focus_m / pair.distance_m for pair in dots[0][0]]
-    field = field_of_dots([fitted.table for _, fitted in dots], places, shrunk)
+    field = field_of_dots([its_fit.table for _, its_fit in dots], places, captures.focus_m / captures.distances_m)
     found = {"dots_px": [list(place) for place in centres]}
     return first.replace(aperture=None, field=field, provenance=first.provenance | found)
 
 
 def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], shrunk: Sequence[float]) -> Field:
-    """Spots over blur and distance from the middle, of tables of single places.
+    """Spots over blur and distance from the middle, of tables with the same nodes of single places (x, y).
 
-    Args:
-        tables: With the same nodes.
-        places: Of each in the sharp picture, (x, y) from the middle of the frame, in the tables' unit.
-        shrunk: By how much pictures shrink towards the middle at each node: the focus over the distance.
-
-    Raises:
-        FitError: There are no two distances from the middle.
+    Places are those in the sharp picture, from the middle of the frame, in the tables' unit; pictures shrink towards
+    the middle by the focus over the distance at each node.
     """
     away = np.hypot(*np.array(places, dtype=np.float64).T)
-    groups = _groups(away)
+    order = np.argsort(away)
+    groups = np.split(order, np.flatnonzero(np.diff(away[order]) > _SAME * away.max()) + 1)  # at like distances
     rings = groups if away[groups[0]].mean() > _SAME * away.max() else groups[1:]
     if not rings or away.max() == 0:
         raise FitError(f"dots must lie at two distances from the middle of the frame at least, got {len(groups)}")
@@ -78,64 +71,47 @@ def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, flo
     # where dots lie in the picture in which they lie nearest to the middle, and in that where they lie farthest
     both = np.sort(np.concatenate([rising * min(shrunk), rising[1:] * max(shrunk)]))
     radius = both[np.concatenate([[True], np.diff(both) > 1e-3 * both[-1]])]
-    coc = tables[0].coc
     boxes, light = [], []
-    for k in range(len(coc)):
-        middle = _spot(tables, places, groups[0], k, everywhere=True)
-        spots = [middle, *(_spot(tables, places, ring, k) for ring in rings)]
-        low, share = _between(rising * shrunk[k], radius)
+    for k in range(len(tables[0].coc)):
+        spots = [_spot(tables, places, groups[0], k, azimuths=32), *(_spot(tables, places, ring, k) for ring in rings)]
+        nodes = rising * shrunk[k]
+        low = np.clip(np.searchsorted(nodes, radius, side="right") - 1, 0, len(nodes) - 2)
+        part = torch.from_numpy(np.clip((radius - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0))
         reach, seen = torch.tensor([spot[0] for spot in spots]).double(), torch.stack([spot[1] for spot in spots])
-        part = torch.from_numpy(share)
         boxes.append(torch.lerp(reach[low], reach[low + 1], part))
         light.append(torch.lerp(seen[low], seen[low + 1], part[:, None, None, None]))
     sizes, cells = torch.stack(boxes), torch.stack(light)  # [K, F], [K, F, C, U, V]
-    coc, sizes, cells = _both_sides(coc, sizes, cells)
+    coc, sizes, cells = _both_sides(tables[0].coc, sizes, cells)
     box = torch.stack([torch.zeros_like(sizes), sizes, sizes], -1)
     return Field(coc, torch.from_numpy(radius), box, cells.permute(2, 0, 1, 3, 4))
 
 
-def _groups(away: np.ndarray) -> list[np.ndarray]:
-    """Dots at like distances from the middle, by growing distance."""
-    order = np.argsort(away)
-    ends = np.flatnonzero(np.diff(away[order]) > _SAME * away.max()) + 1
-    return np.split(order, ends)
-
-
 def _spot(
-    tables: Sequence[BlurTable],
-    places: Sequence[tuple[float, float]],
-    group: np.ndarray,
-    node: int,
-    everywhere: bool = False,
+    tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], group: np.ndarray, node: int, azimuths: int = 0
 ) -> tuple[float, Tensor]:
     """Half the side of the box and the light ``[C, U, V]`` of dots as far from the middle as each other, at a node.
 
-    That of ``everywhere`` is the mean over all azimuths, as in the middle of the frame.
+    As seen towards each dot, or, in the middle of the frame, as the mean over a number of azimuths.
     """
-    coc = float(tables[0].coc[node])
-    reach = max(tables[i].reach_px(coc * tables[i].px_per_unit(1.0), 1.0) / tables[i].px_per_unit(1.0) for i in group)
+    unit = tables[0].px_per_unit(1.0)
+    coc = float(tables[0].coc[node]) * unit
+    reach = max(tables[i].reach_px(coc, 1.0) for i in group) / unit
     along, across = (torch.arange(n, dtype=torch.float64) + 0.5 for n in _CELLS)
     u, v = (along * (2.0 / _CELLS[0]) - 1.0)[:, None], across / _CELLS[1]
     total = torch.zeros(tables[0].channels, *_CELLS, dtype=torch.float64)
+    width = _FINE / reach / unit
     for i in group:
-        width = _FINE / reach / tables[i].px_per_unit(1.0)
-        kernel = tables[i].kernels(torch.tensor([coc * tables[i].px_per_unit(width)], dtype=torch.float64), width)
+        kernel = tables[i].kernels(torch.tensor([coc * width], dtype=torch.float64), width)
         x, y = places[i]
-        azimuths = np.linspace(0.0, 2.0 * math.pi, 32, endpoint=False) if everywhere else [math.atan2(y, x)]
-        for azimuth in azimuths:
-            sine, cosine = math.sin(azimuth), math.cos(azimuth)
+        angles = np.linspace(0.0, 2.0 * math.pi, azimuths, endpoint=False) if azimuths else [math.atan2(y, x)]
+        for angle in angles:
+            sine, cosine = math.sin(angle), math.cos(angle)
             for side in (1.0, -1.0):
                 place = torch.stack([u * cosine - side * v * sine, u * sine + side * v * cosine], -1)
                 grid = place * (2.0 * _FINE / kernel.shape[-1])
                 taken = functional.grid_sample(kernel, grid[None], align_corners=False)[0]
-                total += taken / (len(azimuths) * taken.sum((-2, -1), keepdim=True))
+                total += taken / (len(angles) * taken.sum((-2, -1), keepdim=True))
     return reach, total / (2 * len(group))
-
-
-def _between(nodes: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Node before each place and how far on the way to the next one it lies, 0 to 1."""
-    low = np.clip(np.searchsorted(nodes, place, side="right") - 1, 0, len(nodes) - 2)
-    return low, np.clip((place - nodes[low]) / (nodes[low + 1] - nodes[low]), 0.0, 1.0)
 
 
 def _both_sides(coc: Tensor, sizes: Tensor, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:

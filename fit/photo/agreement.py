@@ -2,25 +2,28 @@
 
 A circle of confusion computed from a focal length, an f-number, a sensor's width and a distance stands beside a radius
 that was measured. Any number that was misread makes the two differ, and how they differ over the distances tells which.
+And a table that was measured at one focus and f-number reaches only so far.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+import torch
 
+from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.camera import Camera
+from torchdof.validation import show
 
-from ..problems import CameraError, CameraWarning, warn
+from ..problems import FitError, warn
 from ..result import Array, Mask
-from .manifest import Captures
-from .scale import signed_coc
+from ..validation import a_number
+from .captures import CAMERA, Captures
 
-__all__ = ["check_agreement", "frame_width", "promised_px"]
+__all__ = ["check_agreement", "check_reach"]
 
 _TELLING_PX = 2.0  # smaller blurs are the lens's aberrations as much as its defocus
 _WARNED, _REFUSED = math.log(1.15), math.log(1.35)  # a thick lens close by differs by a tenth; one stop is 1.41
@@ -28,141 +31,87 @@ _EXPLAINED = math.log(1.12)
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
 
 
-@dataclass(frozen=True)
-class _Reading:
-    """One way to read the numbers: what it says, and how far the blur is from what it promises."""
-
-    text: str
-    misfit: float
-
-
-def promised_px(captures: Captures) -> list[float] | None:
-    """Signed circle of confusion in px of the frame at each distance, or None where the camera is not known."""
-    camera = _camera(captures)
-    return None if camera is None else [signed_coc(camera, p.distance_m, captures.width_px) for p in captures]
-
-
-def frame_width(captures: Captures, radius_px: Sequence[float]) -> int:
-    """Width of the frame that the sensor's width belongs to.
-
-    A picture smaller than EXIF says it was taken was either cropped, and its pixels are those of the sensor, or scaled
-    down, and its frame is the sensor's. The blur tells.
-
-    Args:
-        captures: with or without an `original_width_px`.
-        radius_px: of the uniform disc with the fitted kernels' second moment, for each pair.
-
-    Returns:
-        The original's width for a crop, else that of the pictures.
-
-    Warns:
-        CameraWarning: the pictures were taken for a crop.
-    """
-    promised, original = promised_px(captures), captures.original_width_px
-    if promised is None or original is None or original == captures.width_px:
-        return captures.width_px
-    scaled = _common_factor(np.abs(promised), np.asarray(radius_px))
-    cropped = scaled * captures.width_px / original
-    if abs(math.log(cropped)) >= min(abs(math.log(scaled)), _REFUSED):
-        return captures.width_px
-    text = (
-        f"the pictures are {captures.width_px} px wide and EXIF says they were taken {original} px wide: they are "
-        f"taken for a crop, as which their blur is {cropped:.2f} times what the camera promises (scaled down, "
-        f"{scaled:.2f} times); state full_width_px = {original} to say so, or {captures.width_px} to deny it"
-    )
-    warn(CameraWarning(text, file=captures.pairs[0].files[0], number=cropped))
-    return original
-
-
 def check_agreement(captures: Captures, radius_px: Sequence[float]) -> None:
-    """Compare the fitted blur with the camera's circle of confusion, and name the likely cause where they differ.
-
-    Args:
-        captures: with the right `width_px`.
-        radius_px: of the uniform disc with the fitted kernels' second moment, for each pair.
+    """Compare the fitted blur's radius at each distance with the camera's, and name the likely cause of a difference.
 
     Raises:
-        CameraError: they differ by more than a factor of 1.35.
-
-    Warns:
-        CameraWarning: they differ by more than a factor of 1.15.
+        FitError: of kind "camera" where they differ by more than a factor of 1.35; it warns from 1.15 on.
     """
-    distance = np.array([p.distance_m for p in captures])
-    defocus = 1 / captures.focus_m - 1 / distance
-    measured, promised = np.asarray(radius_px, dtype=np.float64), promised_px(captures)
-    known = promised is not None
-    expected = np.abs(defocus) * _common_factor(np.abs(defocus), measured) if promised is None else np.abs(promised)
+    measured, promised = np.asarray(radius_px, dtype=np.float64), captures.promised_px
+    defocus = np.abs(captures.defocus)
+    expected = defocus * _common_factor(defocus, measured) if promised is None else np.abs(promised)
     telling = np.maximum(expected, measured) > _TELLING_PX
     # without a camera the first distances set the scale
-    if int(telling.sum()) < (1 if known else 3):
+    if int(telling.sum()) < (3 if promised is None else 1):
         return
     off = _misfit(expected, measured, telling)
     if off < _WARNED:
         return
-    readings = _readings(captures, expected, measured, telling, known)
-    likely = [r for r in sorted(readings, key=lambda r: r.misfit) if r.misfit < min(_EXPLAINED, 0.5 * off)]
+    readings = _readings(captures, expected, measured, telling)
+    likely = [text for misfit, text in sorted(readings, key=lambda r: r[0]) if misfit < min(_EXPLAINED, 0.5 * off)]
     worst = int(np.argmax(np.where(telling, np.abs(np.log(measured / expected)), 0.0)))
-    what = "the camera's numbers promise" if known else "the other distances promise"
+    who = "the other distances" if promised is None else "the camera's numbers"
     text = (
-        f"at {distance[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, and {what} "
+        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, and {who} promise "
         f"{expected[worst]:.3g} px; "
     )
-    cause = "; or ".join(r.text for r in likely[:2])
+    cause = "; or ".join(likely[:2])
     text += f"likely {cause}" if cause else "no single number explains it: check them all, and the picture of the fit"
-    if known and off > _REFUSED:
-        text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
-    factor = float(measured[worst] / expected[worst])
+    file, factor = captures.pairs[worst].files[1], float(measured[worst] / expected[worst])
     if off > _REFUSED:
-        raise CameraError(text, file=captures.pairs[worst].files[1], number=factor)
-    warn(CameraWarning(text, file=captures.pairs[worst].files[1], number=factor))
+        if promised is not None:
+            text += ". Leave out focal_length_mm, f_number and sensor_width_mm to have the scale measured instead"
+        raise FitError(text, "camera", file=file, number=factor)
+    warn(text, "camera", file=file, number=factor)
 
 
-def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask, known: bool) -> list[_Reading]:
-    """What one mistake could each explain: a wrong scale, a wrong distance, two exchanged, another focus."""
-    distance = np.array([p.distance_m for p in captures])
-    defocus = 1 / captures.focus_m - 1 / distance
+def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask) -> list[tuple[float, str]]:
+    """Mistakes that could each explain it, and how far the blur is then from what the numbers promise."""
+    distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
     readings = []
-    if known:
+    if captures.promised_px is not None:
         factor = _common_factor(expected, measured)
-        readings.append(_Reading(_scale_causes(captures, factor), _misfit(factor * expected, measured, telling)))
-    count = int(telling.sum())
+        readings.append((_misfit(factor * expected, measured, telling), _scale_causes(captures, factor)))
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
         text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
-        readings.append(_Reading(text, _misfit(exchanged, measured, telling)))
-    if count >= 3:
-        for i in map(int, np.flatnonzero(telling)):
-            others = telling.copy()
-            others[i] = False
-            vergence = 1 / captures.focus_m - math.copysign(measured[i] / per_dioptre, defocus[i])
-            stands = f"{1 / vergence:.3g} m" if vergence > 0 else "beyond infinity"
-            text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands}"
-            readings.append(_Reading(text, _misfit(expected, measured, others)))
-    if count >= 3 and (defocus[telling] > 0).any() and (defocus[telling] < 0).any():
+        readings.append((_misfit(exchanged, measured, telling), text))
+    if telling.sum() < 3:
+        return readings
+    for i in map(int, np.flatnonzero(telling)):
+        others = telling.copy()
+        others[i] = False
+        stands = _stands(captures, math.copysign(measured[i] / per_dioptre, defocus[i]))
+        text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands or 'beyond infinity'}"
+        readings.append((_misfit(expected, measured, others), text))
+    if (defocus[telling] > 0).any() and (defocus[telling] < 0).any():
         moved = np.linspace(-1, 1, 401) * float(np.abs(defocus).max())
         misfits = [_misfit(per_dioptre * np.abs(defocus - m), measured, telling) for m in moved]
         best = int(np.argmin(misfits))
-        vergence = 1 / captures.focus_m - moved[best]
-        if vergence > 0:
-            text = f"the lens was focused at {1 / vergence:.3g} m, not at {captures.focus_m:g} m"
-            readings.append(_Reading(text, misfits[best]))
+        stands = _stands(captures, moved[best])
+        if stands:
+            text = f"the lens was focused at {stands}, not at {captures.focus_m:g} m"
+            readings.append((misfits[best], text))
     return readings
+
+
+def _stands(captures: Captures, defocus: float) -> str:
+    """The distance of a defocus [1/m], empty where there is none."""
+    vergence = 1 / captures.focus_m - defocus
+    return f"{1 / vergence:.3g} m" if vergence > 0 else ""
 
 
 def _scale_causes(captures: Captures, factor: float) -> str:
     """Every number that could be wrong by itself if all blurs are `factor` times what is promised."""
-    focal, stops, sensor = captures.focal_length_mm, captures.f_number, captures.sensor_width_mm
-    if focal is None or stops is None or sensor is None:
-        raise AssertionError("a scale is wrong only where the camera is known")
+    focal, stops, sensor = (float(getattr(captures, name)) for name in CAMERA)
     units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED]
     causes = [f"the distances are in {name}, not in metres" for name in units]
     if factor > 1:
-        width = round(captures.width_px * factor)
         causes.append(
-            f"the pictures are a crop of frames about {width} px wide (state full_width_px, or cut them by "
-            "crop = [left, top, width, height] instead of in an editor)"
+            f"the pictures are a crop of frames about {round(captures.width_px * factor)} px wide (state "
+            "full_width_px, or cut them by crop = [left, top, width, height] instead of in an editor)"
         )
     causes += [
         f"the f-number is {stops / factor:.2g}, not {stops:g}",
@@ -170,17 +119,6 @@ def _scale_causes(captures: Captures, factor: float) -> str:
         f"the focal length is {focal * math.sqrt(factor):.3g} mm, not {focal:g}",
     ]
     return ", or ".join(causes)
-
-
-def _camera(captures: Captures) -> Camera | None:
-    if captures.focal_length_mm is None or captures.f_number is None or captures.sensor_width_mm is None:
-        return None
-    return Camera(
-        focal_length_mm=captures.focal_length_mm,
-        f_number=captures.f_number,
-        focus_m=captures.focus_m,
-        sensor_width_mm=captures.sensor_width_mm,
-    )
 
 
 def _common_factor(expected: Array, measured: Array) -> float:
@@ -195,3 +133,69 @@ def _misfit(expected: Array, measured: Array, telling: Mask) -> float:
     apart = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
     factor = np.log1p(apart / np.maximum(np.minimum(measured, expected), 1e-9))
     return float(np.max(np.where(telling, factor, 0.0)))
+
+
+def check_reach(
+    table: BlurTable, camera: Camera, near_m: float, far_m: float, width_px: int = 1920
+) -> dict[str, float]:
+    """Whether a table measured at one focus and f-number says anything about another use of it.
+
+    A kernel is looked up by its signed circle of confusion, so a thin lens's table serves any focus and f-number. A
+    real lens's aberrations change with both: the farther from what was measured, the less a table knows.
+
+    Args:
+        table: with the provenance that `fit_table` and `trace_table` write.
+        camera: to render with.
+        near_m: nearest depth of the scene, m.
+        far_m: farthest depth of the scene, m; `inf` allowed.
+        width_px: of the image.
+
+    Returns:
+        Each over what was measured: "coc" (the largest circle of confusion of the scene over the largest measured on
+        its side), "f_number" and "focus_m" (1 where the table does not know).
+
+    Raises:
+        FitError: the depths are not 0 < near <= far.
+
+    Warns:
+        FitWarning: of kind "outside measured", for each of the three that lies outside what was measured.
+
+    Example:
+        >>> table = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="mm", sensor_width_mm=36.0)
+        >>> factors = check_reach(table, Camera(f_number=8.0), near_m=1.5, far_m=3.0)
+        >>> factors["coc"] < 1
+        True
+    """
+    for what, value, kind in (("table", table, BlurTable), ("camera", camera, Camera)):
+        if not isinstance(value, kind):
+            raise FitError(f"{what} must be a torchdof.{kind.__name__}, got {show(value)}")
+    if any(isinstance(getattr(camera, name), torch.Tensor) for name in Camera.__dataclass_fields__):
+        raise FitError("camera must hold plain numbers, got tensors; check one item of a batch at a time")
+    a_number("width_px", width_px, 0, unit="pixels")
+    plain = all(isinstance(z, int | float) and not isinstance(z, bool) for z in (near_m, far_m))
+    if not plain or not 0 < near_m <= far_m or near_m > 1e300:
+        raise FitError(f"depths must be 0 < near_m <= far_m, got {show(near_m)} and {show(far_m)}")
+    factors = {"coc": 0.0, "f_number": 1.0, "focus_m": 1.0}
+    if table.unit != "relative":
+        ends = [float(near_m), math.inf if far_m > 1e300 else float(far_m)]
+        depth = torch.tensor(ends, dtype=torch.float64)[None, None, None]
+        for coc in (camera.coc_px(depth, width=width_px) / table.px_per_unit(width_px)).flatten().tolist():
+            measured = max((abs(c) for c in table.coc.tolist() if c * coc > 0), default=0.0)
+            factors["coc"] = max(factors["coc"], abs(coc) / measured if measured else math.inf if coc else 0.0)
+    if factors["coc"] > 1.0001:
+        largest = "the other side of focus" if math.isinf(factors["coc"]) else f"{factors['coc']:.2g} times the largest"
+        text = f"the scene's blur is {largest} that was measured; beyond it kernels are scaled as a thin lens would"
+        warn(text, "outside measured", number=factors["coc"])
+    for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
+        measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
+        known = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
+        if not known or not 0 < measured_at < math.inf or math.isinf(used_at):
+            continue
+        factors[name] = used_at / measured_at
+        if max(factors[name], 1 / factors[name]) > most:
+            text = (
+                f"the table was measured at {name} {measured_at:g} and is used at {used_at:g}; the size of the blur is "
+                "right, its shape is that of the measured one"
+            )
+            warn(text, "outside measured", number=factors[name])
+    return factors

@@ -7,23 +7,21 @@ size (lateral colour), which displaces the dot of a colour and belongs into no k
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from torchdof.optics.aperture import Aperture
 
-from ..problems import FitWarning
+from ..problems import unheard
 from ..result import Array, BlurFit
-from .crop import Capture
-from .distances import KNOTS
+from .captures import Captures
+from .distances import fit_one
 from .dot import find_dot
-from .dot_model import soft_edge
 from .forward import OPENINGS
 from .opening import turned
-from .pair import fit_pair
+from .source import soft_edge
 
 __all__ = ["NAMES", "Colour", "fit_colours"]
 
@@ -53,56 +51,43 @@ class Colour:
 
 
 def fit_colours(
-    pairs: Sequence[Capture], fits: Sequence[BlurFit], focus_m: float, family: str, opening: Aperture | None
+    captures: Captures, fits: Sequence[BlurFit], family: str, opening: Aperture | None
 ) -> tuple[Colour, ...]:
     """Fit red, green and blue of every pair with the family that their mean was fitted with.
 
     In the sharp picture a colour that is not the one in focus is itself blurred a little. The sharpest colour's edge
     stands for all, so that each kernel holds all of its colour's blur.
-
-    Args:
-        pairs: with `colours`.
-        fits: of the mean of the colours.
-        focus_m: distance of the focus.
-        family: of `fits`.
-        opening: as it shows behind the focus, for families that have one.
+    `opening` is as it shows behind the focus, for families that have one.
     """
     found: list[list[BlurFit]] = [[] for _ in NAMES]
-    for pair, mean in zip(pairs, fits, strict=True):
+    for pair, mean in zip(captures, fits, strict=True):
         if pair.colours is None:
             raise AssertionError("only captures with colours are fitted by colour")
-        shown = opening if opening is None or pair.distance_m > focus_m else turned(opening)
-        stills, moved = pair.colours
-        softness = min(soft_edge(still, find_dot(still, file=pair.files[0])).softness for still in stills)
-        for colour, still, blurred in zip(found, stills, moved, strict=True):
-            with warnings.catch_warnings():
-                # what is wrong with a capture its mean has said
-                warnings.simplefilter("ignore", FitWarning)
-                fit = fit_pair(
-                    still,
-                    blurred,
+        shown = opening if opening is None or pair.distance_m > captures.focus_m else turned(opening)
+        softness = min(soft_edge(still, find_dot(still, file=pair.files[0])).softness for still in pair.colours[0])
+        for colour, still, blurred in zip(found, *pair.colours, strict=True):
+            with unheard():  # what is wrong with a capture its mean has said
+                fit = fit_one(
+                    replace(pair, sharp=still, blurred=blurred),
+                    captures.focus_m,
                     "image" if family in OPENINGS else family,
                     magnification=mean.magnification,
                     fit_magnification=False,
-                    white=pair.white,
                     start=None if family in OPENINGS else mean,
-                    knots=KNOTS if family == "radial" else None,
                     reach=float(mean.params["radius"]) if family == "radial" else None,
                     aperture=shown,
                     softness=softness,
-                    files=pair.files,
                 )
             colour.append(fit)
-    shifts = [_focus_shift(pairs, colour, focus_m) for colour in found]
+    shifts = [_focus_shift(captures.defocus, colour) for colour in found]
     return tuple(
         Colour(name, tuple(colour), shift - shifts[_GREEN], _beside(colour, found[_GREEN]))
         for name, colour, shift in zip(NAMES, found, shifts, strict=True)
     )
 
 
-def _focus_shift(pairs: Sequence[Capture], fits: Sequence[BlurFit], focus_m: float) -> float:
+def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
     """1/distance of a colour's focus less the capture's, 1/m: where the line through its signed radii crosses 0."""
-    defocus = np.array([1 / focus_m - 1 / p.distance_m for p in pairs])
     radius: Array = np.array([f.radius for f in fits]) * np.sign(defocus)
     error = np.hypot([f.radius_stderr for f in fits], _KNOWN * radius)
     telling = np.abs(radius) > _DEFOCUSED_PX
@@ -115,10 +100,6 @@ def _focus_shift(pairs: Sequence[Capture], fits: Sequence[BlurFit], focus_m: flo
 
 def _beside(fits: Sequence[BlurFit], green: Sequence[BlurFit]) -> tuple[tuple[float, float], ...]:
     """(x, y) by which dots lie beside green's: of the sharp picture, then of each distance."""
-
-    def still(fit: BlurFit) -> Array:
-        return np.subtract(fit.centre, fit.shift)
-
-    apart = [np.mean([still(f) - still(g) for f, g in zip(fits, green, strict=True)], axis=0)]
-    apart += [np.subtract(f.centre, g.centre) for f, g in zip(fits, green, strict=True)]
-    return tuple((float(x), float(y)) for x, y in apart)
+    moved = np.array([np.subtract(f.centre, g.centre) for f, g in zip(fits, green, strict=True)])
+    shifted = np.array([np.subtract(f.shift, g.shift) for f, g in zip(fits, green, strict=True)])
+    return tuple((float(x), float(y)) for x, y in [(moved - shifted).mean(axis=0), *moved])

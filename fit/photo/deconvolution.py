@@ -7,17 +7,13 @@ could not be negative). The smoothing is the one under which pixels that were ke
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..result import Array, Mask
-from .description import kernel_lists
-from .diagnostics import noise_near, signal_pixels
 from .forward import Forward, Solution
 from .noise import independent_share
 
-__all__ = ["Estimate", "estimate"]
+__all__ = ["deconvolved"]
 
 _SMOOTHNESS = 10.0 ** np.arange(0.0, -6.5, -0.5)
 _STEPS, _STILL = 150, 1e-4  # the most, and the change over the peak that ends them
@@ -26,70 +22,42 @@ _LIT = 0.06  # of the peak of a first estimate, smoothed by a pixel, below which
 _WORSE = 3  # strengths of smoothing in a row that foretell worse, after which weaker ones are not tried
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A free kernel, and how much better it is than a shape.
+def deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
+    """The kernel of a pair of pictures, from a solution to begin with that gives the moves and the kernel's reach.
 
-    Attributes:
-        kernel: `[k, k]`, k odd, not negative, sums to 1.
-        gain: exposure ratio of the pictures.
-        background: level under the blurred dot.
-        model: of the pixels used.
-        noise: deviation of a pixel's noise where the light is.
-        gained: twice the log likelihood of pixels that were kept back, over that of the shape it began from.
-    """
-
-    kernel: Array
-    gain: float
-    background: float
-    model: Array
-    noise: float
-    gained: float
-
-
-def estimate(pair: Forward, shape: Solution) -> Estimate:
-    """Deconvolve a pair of pictures.
-
-    Args:
-        pair: the pictures.
-        shape: a solution to begin from, which gives the moves and how far the kernel may reach.
+    Returns:
+        The kernel `[k, k]`, k odd, not negative, summing to 1; and twice the log likelihood of pixels that were kept
+        back, over that of the solution it began from.
     """
     from scipy.ndimage import binary_dilation, gaussian_filter
 
-    near = signal_pixels(pair)
     source = pair.moved_source(shape.moves)
     half = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1)
-    start = _fitted_to(pair.kernels(shape.family, kernel_lists(shape))[0], 2 * half + 1)
     # a fifth of the pixels is kept back; the smoothing under which they are foretold best is taken
     kept_back = np.random.default_rng(0).random(pair.values.size) < _KEPT_BACK
-    judged = kept_back & near.ravel()[pair.flat]
+    judged = kept_back & pair.lit[pair.used]
     tried: list[tuple[float, float, Array]] = []
-    kernel = start
+    kernel = pair.kernel(shape)
+    margin = half - kernel.shape[0] // 2
+    kernel = np.pad(kernel, margin) if margin >= 0 else np.ascontiguousarray(kernel[-margin:margin, -margin:margin])
     for smoothness in _SMOOTHNESS:
-        kernel, gain, background = _descend(pair, source, kernel, smoothness, ~kept_back)
-        model = gain * pair.convolve(source, kernel[None])[0] + background
+        kernel, model = _descend(pair, source, kernel, smoothness, ~kept_back)
         tried.append((float(np.sum((pair.values - model)[judged] ** 2)), float(smoothness), kernel))
         if min(t[0] for t in tried) < min(t[0] for t in tried[-_WORSE:]):
             break
     squares, smoothness, kernel = min(tried, key=lambda t: t[0])
     smooth = gaussian_filter(kernel, 1.0)
     lit = binary_dilation(smooth > _LIT * smooth.max())
-    before = float(np.sum((pair.values - shape.model.ravel()[pair.flat])[judged] ** 2))
-    kernel, gain, background = _descend(pair, source, kernel * lit, smoothness, np.ones_like(kept_back), lit)
-    return Estimate(
-        kernel=kernel,
-        gain=gain,
-        background=background,
-        model=gain * pair.convolve(source, kernel[None])[0] + background,
-        noise=noise_near(pair, shape, near),
-        gained=float(judged.sum() * independent_share(pair.noise_correlation) * np.log(before / squares)),
-    )
+    before = float(np.sum((pair.values - shape.model[pair.used])[judged] ** 2))
+    kernel, _ = _descend(pair, source, kernel * lit, smoothness, np.ones_like(kept_back), lit)
+    count = judged.sum() * independent_share(pair.noise_correlation)
+    return kernel, float(count * np.log(before / squares))
 
 
 def _descend(
     pair: Forward, source: Array, start: Array, smoothness: float, fitted: Mask, lit: Mask | None = None
-) -> tuple[Array, float, float]:
-    """Accelerated projected gradients on the kernel's pixels that may be lit; the background is solved inside.
+) -> tuple[Array, Array]:
+    """The kernel and the model of the pixels used, by accelerated projected gradients on those that may be lit.
 
     Reference:
         Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.
@@ -106,27 +74,14 @@ def _descend(
     for _ in range(_STEPS):
         error = pair.convolve(source, ahead[None])[0] - pair.values
         error = np.where(fitted, error - error[fitted].mean(), 0.0)
-        gradient = pair.correlate(source, error, size) + penalty * _laplacian(ahead)
+        wide = np.pad(ahead, 1)
+        rough = 4 * ahead - wide[2:, 1:-1] - wide[:-2, 1:-1] - wide[1:-1, 2:] - wide[1:-1, :-2]
+        gradient = pair.correlate(source, error, size) + penalty * rough
         after = np.maximum(ahead - step * gradient, 0.0) * (1.0 if lit is None else lit)
         faster = (1 + np.sqrt(1 + 4 * pace * pace)) / 2
         ahead = after + (pace - 1) / faster * (after - weights)
         moved, weights, pace = float(np.abs(after - weights).max()), after, faster
         if moved < _STILL * float(after.max()):
             break
-    gain = float(weights.sum())
-    background = float((pair.values - pair.convolve(source, weights[None])[0])[fitted].mean())
-    return weights / gain, gain, background
-
-
-def _laplacian(picture: Array) -> Array:
-    """Minus the second differences of a picture that is dark around."""
-    wide = np.pad(picture, 1)
-    return np.asarray(4 * picture - wide[2:, 1:-1] - wide[:-2, 1:-1] - wide[1:-1, 2:] - wide[1:-1, :-2])
-
-
-def _fitted_to(kernel: Array, size: int) -> Array:
-    """A kernel cut or padded to a size."""
-    margin = (size - kernel.shape[0]) // 2
-    if margin >= 0:
-        return np.pad(kernel, margin)
-    return np.ascontiguousarray(kernel[-margin : margin or None, -margin : margin or None])
+    model = pair.convolve(source, weights[None])[0]
+    return weights / float(weights.sum()), model + float((pair.values - model)[fitted].mean())

@@ -27,14 +27,8 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between a natural image blurred with one kernel and with another, in dB.
 
     Natural images have an amplitude spectrum of 1/f; with it, the mean squared difference is a sum over the kernels'
-    spectra and needs no image: a standard deviation of 0.22 of the peak, 256 px wide, is taken for all.
-
-    Args:
-        kernel: `[k, k]`, k odd, sums to 1.
-        other: `[l, l]`, l odd, sums to 1.
-
-    Returns:
-        Decibels, at most 200.
+    spectra and needs no image: a standard deviation of 0.22 of the peak, 256 px wide, is taken for all. The kernels are
+    `[k, k]`, k odd, and sum to 1; 200 dB is the most.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -57,23 +51,19 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     # the half plane of a real transform stands for both halves
     twice = np.where((np.arange(power.shape[1]) == 0) | (2 * np.arange(power.shape[1]) == width), 1.0, 2.0)
     power *= twice / float((power * twice).sum())
-    difference = _spectrum(first, width) - _spectrum(second, width)
-    error = _CONTRAST**2 * float((power * np.abs(difference) ** 2).sum())
-    return 200.0 if error <= 1e-20 else float(-10 * np.log10(error))
+    difference = np.zeros((width, width))
+    for sign, k in ((1, first), (-1, second)):
+        around = np.arange(k.shape[0]) - k.shape[0] // 2
+        difference[np.ix_(around, around)] += sign * k
+    return _decibels(_CONTRAST**2 * float((power * np.abs(np.fft.rfft2(difference)) ** 2).sum()))
 
 
 def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between what a highlight looks like through one kernel and through another, in dB.
 
     A highlight shows the kernel itself, which a natural image hardly does. It is shown as a display shows it, encoded,
-    the other's peak at white, and compared where either is brighter than 2 % of that.
-
-    Args:
-        kernel: `[k, k]`, k odd, sums to 1.
-        other: `[l, l]`, l odd, sums to 1: the one to be like.
-
-    Returns:
-        Decibels, at most 200.
+    the other's peak at white, and compared where either is brighter than 2 % of that. Kernels are as for
+    :func:`natural_psnr`; the other one is that to be like.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -89,8 +79,24 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     shown = [np.pad(k, half - k.shape[0] // 2) / float(second.max()) for k in (first, second)]
     seen = np.maximum(*shown) > _DARK
     encoded = [np.clip(k[seen], 0, 1) ** _DISPLAY for k in shown]
-    error = float(np.mean((encoded[0] - encoded[1]) ** 2))
+    return _decibels(float(np.mean((encoded[0] - encoded[1]) ** 2)))
+
+
+def _decibels(error: float) -> float:
     return 200.0 if error <= 1e-20 else float(-10 * np.log10(error))
+
+
+def _square(name: str, kernel: ArrayLike) -> Array:
+    array = a_picture(name, kernel, 1)
+    if array.shape[0] != array.shape[1] or array.shape[0] % 2 == 0:
+        raise FitError(f"{name} must be [k, k] with an odd k, got {list(array.shape)}")
+    return array
+
+
+def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
+    """Whether a photograph through a kernel is within `accuracy_db` of that through another, a highlight 20 dB less."""
+    look = highlight_psnr(kernel, other)
+    return natural_psnr(kernel, other) >= accuracy_db and look >= accuracy_db - _LOOK_BELOW
 
 
 def choose(
@@ -100,11 +106,6 @@ def choose(
 
     The simplest family within 2 of the lowest BIC stands for the truth. Another one will do if a photograph through it
     is `accuracy_db` from the truth's, and a highlight, where shapes show, at most 20 dB less.
-
-    Args:
-        kernels: fitted kernel of each family `[k, k]`; "radial" among them.
-        bic: their information criteria.
-        accuracy_db: wanted PSNR on a natural image.
 
     Returns:
         The family, one sentence saying why and what came second, and the PSNR of each family on a natural image
@@ -116,7 +117,7 @@ def choose(
     second = next(f for f in by_likelihood if f != likeliest)
     natural = {f: natural_psnr(kernels[f], kernels[likeliest]) for f in kernels}
     look = {f: highlight_psnr(kernels[f], kernels[likeliest]) for f in kernels}
-    wanted_look = accuracy_db - _LOOK_BELOW
+    wanted = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _LOOK_BELOW:g} dB on a highlight"
     enough = [f for f in kernels if looks_alike(kernels[f], kernels[likeliest], accuracy_db)]
     family = min([*enough, likeliest], key=COST.index)
     others = ", ".join(
@@ -126,39 +127,9 @@ def choose(
     )
     if family == likeliest:
         head = "the lowest BIC" if bic[family] == lowest else f"the simplest within {_EVIDENCE:g} of the lowest BIC"
-        why = (
-            f"{head} ({second} second by {bic[second] - bic[likeliest]:.0f}), and no cheaper family has "
-            f"{accuracy_db:g} dB on a natural image and {wanted_look:g} dB on a highlight"
-        )
+        margin = bic[second] - bic[likeliest]
+        why = f"{head} ({second} second by {margin:.0f}), and no cheaper family has {wanted}"
     else:
-        why = (
-            f"the cheapest with {accuracy_db:g} dB on a natural image and {wanted_look:g} dB on a highlight "
-            f"({natural[family]:.1f} and {look[family]:.1f} dB) against {likeliest}, the likeliest"
-        )
+        reached = f"{natural[family]:.1f} and {look[family]:.1f} dB"
+        why = f"the cheapest with {wanted} ({reached}) against {likeliest}, the likeliest"
     return family, f"{why} ({others})", {f: natural_psnr(kernels[f], kernels["radial"]) for f in kernels}
-
-
-def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
-    """Whether a photograph through one kernel is within `accuracy_db` of that through another, a highlight 20 dB less.
-
-    Args:
-        kernel: `[k, k]`, k odd, sums to 1.
-        other: `[l, l]`, l odd, sums to 1: the one to be like.
-        accuracy_db: wanted PSNR on a natural image.
-    """
-    look = highlight_psnr(kernel, other)
-    return natural_psnr(kernel, other) >= accuracy_db and look >= accuracy_db - _LOOK_BELOW
-
-
-def _square(name: str, kernel: ArrayLike) -> Array:
-    array = a_picture(name, kernel, 1)
-    if array.shape[0] != array.shape[1] or array.shape[0] % 2 == 0:
-        raise FitError(f"{name} must be [k, k] with an odd k, got {list(array.shape)}")
-    return array
-
-
-def _spectrum(kernel: Array, width: int) -> Array:
-    padded = np.zeros((width, width))
-    padded[: kernel.shape[-2], : kernel.shape[-1]] = kernel
-    half = kernel.shape[-1] // 2
-    return np.asarray(np.fft.rfft2(np.roll(padded, (-half, -half), (0, 1))))

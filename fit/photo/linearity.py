@@ -1,4 +1,4 @@
-"""Whether a sharp picture of a dot is in linear light, and in focus: its noise and its edge tell."""
+"""Whether pictures of a dot are in linear light, and the sharp one in focus: noise, edge and residual tell."""
 
 from __future__ import annotations
 
@@ -7,34 +7,24 @@ import torch
 
 from torchdof.io.transfer import decode, encode
 
-from ..problems import NotInFocusWarning, NotLinearWarning, warn
+from ..problems import warn
 from ..result import Array
-from .description import kernel_lists
 from .diagnostics import left_open, unexplained
-from .dot import Dot, mixed_differences, noise_inside, noise_of, rounding_of
-from .dot_model import Edge, soft_edge, with_softness
+from .dot import Dot, inner_pixels
 from .forward import Forward, Solution
+from .noise import fine_variance, noise_of, rounding_of
+from .source import UNFOCUSED_PX, Edge, soft_edge
 
-__all__ = [
-    "EXPLAINED",
-    "SENSOR_BLUR_PX",
-    "check_focus",
-    "check_levels",
-    "check_linearity",
-    "check_noise",
-    "focused",
-]
+__all__ = ["EXPLAINED", "check_focus", "check_levels", "check_linearity", "check_noise"]
 
 EXPLAINED = 1.15
 """Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
 
-SENSOR_BLUR_PX = 0.7
-"""Sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus, in both pictures."""
-
-_ENCODED = 0.7
-_UNFOCUSED_PX = 1.0  # no camera leaves an edge softer than this in focus
-_FOCUSED_PX = 0.5  # what it leaves on average: between a perfect lens and a demosaiced picture
+_SENSOR_BLUR_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
 _MATTERS = 0.02  # share of the kernel's size
+_ENCODED = 0.7
+_STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
+_TOGETHER = 1.9  # neighbouring second differences share pixels: their mean square is as uncertain as of so many fewer
 _MIDDLING, _FEWEST, _LOUDER = (0.3, 0.7), 60, 1.3
 _DRAWN = 1e-3  # of the level; less is left of pictures without noise, whose edges were drawn in another way
 _BENT, _BENT_CHI = 0.075, 30.0  # of a curve of 20 %, what the fit does not take up; chi squared of two parameters
@@ -42,83 +32,75 @@ _STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same where the sharp dot's edge a
 _CURVED, _CURVED_CHI = 0.03, 11.0  # half of what a curve of 20 % leaves at the expected size; once in 2000 by chance
 _RESIZED = 0.015  # another magnification than that by so much is not a weak tone curve, which makes it 1.002 to 1.006
 _CLEARER = 4.0  # chi squared by which a curve explains more than another magnification of the dot
-_STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
 
 
-def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None, stacklevel: int = 5) -> bool:
+def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
     """Whether a sharp picture seems to be in linear light, by its noise and its dot's edge; warns where it does not."""
-    inside = noise_inside(still, dot)
-    rounding = rounding_of(still[still > dot.background + 0.5 * dot.peak])
-    # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
-    most = (1 + 4 / np.sqrt(inside[1])) * np.sqrt(inside[0] ** 2 + rounding) if inside else np.inf
-    if inside and dot.noise > max(most, 1e-4 * dot.peak):
-        ratio = dot.noise / max(inside[0], 1e-9 * dot.peak)
+    text, number = "", 0.0
+    inside = inner_pixels(still, dot)
+    if inside is not None:
+        bright = fine_variance(still, inside)
+        rounding = rounding_of(still[still > dot.background + 0.5 * dot.peak])
+        # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
+        most = (1 + 4 / np.sqrt(int(inside.sum() / _TOGETHER))) * np.sqrt(bright + rounding)
+        if dot.noise > max(most, 1e-4 * dot.peak):
+            number = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
+            text = (
+                f"the dark paper has {number:.1f} times the noise of the white dot, as in a picture that is left sRGB "
+                "encoded; is the image linear? Decode it first"
+            )
+    if not text and edge.steepness > max(_STEEP, _CERTAIN * edge.steepness_error):
+        number = edge.steepness
         text = (
-            f"the dark paper has {ratio:.1f} times the noise of the white dot, as in a picture that is left sRGB "
-            "encoded; is the image linear? Decode it first"
-        )
-        warn(NotLinearWarning(text, file=file, number=ratio), stacklevel)
-        return False
-    if edge.steepness > max(_STEEP, _CERTAIN * edge.steepness_error):
-        text = (
-            f"the dot's edge is steeper than pixels can be, by {100 * edge.steepness:.0f} % of its level: a tone curve "
+            f"the dot's edge is steeper than pixels can be, by {100 * number:.0f} % of its level: a tone curve "
             "(an S-curve, a picture style) or sharpening was applied. The kernel comes out too small; develop without "
             "them"
         )
-        warn(NotLinearWarning(text, file=file, number=edge.steepness), stacklevel)
-        return False
-    if edge.misfit < EXPLAINED:
-        return True
-    bent = soft_edge(still, dot, fit_exponent=True)
-    if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
-        text = (
-            f"the dot's edge is that of light to the power {bent.exponent:.2f}, as in a picture that is left sRGB "
-            "encoded (about 0.45); is the image linear? Decode it first"
-        )
-        warn(NotLinearWarning(text, file=file, number=bent.exponent), stacklevel)
-        return False
-    return True
+    if not text and edge.misfit >= EXPLAINED:
+        bent = soft_edge(still, dot, fit_exponent=True)
+        if bent.exponent < _ENCODED and bent.rms < 0.75 * edge.rms:
+            number = bent.exponent
+            text = (
+                f"the dot's edge is that of light to the power {number:.2f}, as in a picture that is left sRGB "
+                "encoded (about 0.45); is the image linear? Decode it first"
+            )
+    if text:
+        warn(text, "not linear", file=file, number=number)
+    return not text
 
 
-def check_noise(pair: Forward, solution: Solution, level: float, file: str | None, stacklevel: int = 4) -> bool:
+def check_noise(pair: Forward, solution: Solution, level: float, file: str | None) -> bool:
     """Whether the noise is not largest at middling levels; warns where it is, as light's grows along a straight line.
 
-    Args:
-        pair: the pictures.
-        solution: what was found.
-        level: of the sharp dot.
-        file: named in the warning.
-        stacklevel: where the warning points.
+    `level` is that of the sharp dot.
     """
     residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
-    share = _light(solution, level)[1:-1, 1:-1]
-    middling = (share > _MIDDLING[0]) & (share < _MIDDLING[1]) & pair.used[1:-1, 1:-1]
+    share = _light(solution, level)
+    middling = (share > _MIDDLING[0]) & (share < _MIDDLING[1]) & pair.used
     count = int(middling.sum())
     if count < _FEWEST:
         return True
-    found = float(np.mean(mixed_differences(residual)[middling] ** 2))
-    light = solution.gain * level * float(share[middling].mean())
-    expected = noise_of(pair.data) ** 2 + pair.shot_noise * light
+    found = fine_variance(residual, middling)
+    expected = noise_of(pair.data) ** 2 + pair.shot_noise * solution.gain * level * float(share[middling].mean())
     if not expected > 0:  # a file of few levels, which hide the paper's noise
         return True
-    expected += rounding_of(pair.data[1:-1, 1:-1][middling])
+    expected += rounding_of(pair.data[middling])
     # second differences of neighbours go together: a third of them is independent
     most = _LOUDER * (1 + 4 * np.sqrt(2 * 3 / count))
     if found > most * expected and found > (_DRAWN * level) ** 2:
+        louder = float(np.sqrt(found / expected))
         text = (
-            f"the noise at middling levels is {np.sqrt(found / expected):.1f} times what paper and dot have: "
+            f"the noise at middling levels is {louder:.1f} times what paper and dot have: "
             "a tone curve (an S-curve, a picture style), or compression. The kernel's size may be off by 15 %; develop "
             "without them"
         )
-        warn(NotLinearWarning(text, file=file, number=float(np.sqrt(found / expected))), stacklevel)
+        warn(text, "not linear", file=file, number=louder)
         return False
     return True
 
 
-def check_levels(
-    pair: Forward, solution: Solution, held: Solution, edge: Edge, file: str | None, stacklevel: int = 4
-) -> bool:
-    """Whether what a fit leaves has nothing to do with the level; warns where a tone curve would explain it.
+def check_levels(pair: Forward, solution: Solution, held: Solution, edge: Edge, file: str | None) -> None:
+    """Warn where a tone curve would explain what a fit leaves.
 
     No kernel makes all places of one level brighter, and all of another darker. A tone curve does, also one so weak
     that the residual hardly grows. What the fit's own parameters could have taken up is left out. In a JPEG less shows
@@ -126,14 +108,7 @@ def check_levels(
     magnification takes up most of it: so what the dot leaves at its expected size is looked at, too. Where a curve
     explains more of that than another size does, it is said.
 
-    Args:
-        pair: the pictures.
-        solution: what was found.
-        held: the same with the magnification that was expected; `solution` again where that was not fitted, or fitted
-            because it was asked for.
-        edge: of the sharp dot.
-        file: named in the warning.
-        stacklevel: where the warning points.
+    `held` is the solution with the magnification that was expected, `edge` that of the sharp dot.
     """
     curves = _curves(pair, solution, edge.level)
     found, spread = unexplained(pair, solution, curves)
@@ -144,17 +119,15 @@ def check_levels(
     agrees = edge.steepness > _STEEP_TOO and steep > 1 and chi_squared + steep**2 > _BENT_CHI_TOO
     resized = abs(solution.moves["magnification"] / held.moves["magnification"] - 1) > _RESIZED
     bent = float(np.linalg.norm(bend)) > _BENT and (chi_squared > _BENT_CHI or agrees)
-    if not bent and (resized or not _curved(pair, held, edge.level, steep)):
-        return True
-    text = (
-        "what the fit leaves goes with the level, "
-        + ("" if bent else "were the dot as large as expected, ")
-        + "as under a tone curve (an S-curve, a picture style): then the kernel is 5 % too small and more; develop "
-        "without it. Colours that are blurred unlike each other leave as much (colours = 'each'), and a blur that is "
-        f"not of family {solution.family!r}"
-    )
-    warn(NotLinearWarning(text, file=file, number=float(bend[1])), stacklevel)
-    return False
+    if bent or (not resized and _curved(pair, held, edge.level, steep)):
+        text = (
+            "what the fit leaves goes with the level, "
+            + ("" if bent else "were the dot as large as expected, ")
+            + "as under a tone curve (an S-curve, a picture style): then the kernel is 5 % too small and more; develop "
+            "without it. Colours that are blurred unlike each other leave as much (colours = 'each'), and a blur that "
+            f"is not of family {solution.family!r}"
+        )
+        warn(text, "not linear", file=file, number=float(bend[1]))
 
 
 def _curved(pair: Forward, held: Solution, level: float, steep: float) -> bool:
@@ -162,8 +135,7 @@ def _curved(pair: Forward, held: Solution, level: float, steep: float) -> bool:
 
     The sharp dot's edge, so many standard errors steeper than pixels can be, speaks for the curve, too.
     """
-    kernel = pair.kernels(held.family, kernel_lists(held))
-    larger = held.gain * pair.move_columns(held.moves, ("magnification",), kernel)[0]
+    larger = held.gain * pair.move_columns(held.moves, ("magnification",), pair.kernel(held))[0]
     basis = np.stack([_curves(pair, held, level)[:, 1], larger], axis=1)
     found, spread = unexplained(pair, held, basis)
     contrast, size = np.sign(found) * found**2 / np.maximum(np.diag(spread), np.finfo(float).tiny)
@@ -174,7 +146,7 @@ def _curved(pair: Forward, held: Solution, level: float, steep: float) -> bool:
 
 def _curves(pair: Forward, solution: Solution, level: float) -> Array:
     """What a weak tone curve adds to a fit's pixels `[pixels used, 2]`: brighter all over, an S-curve's contrast."""
-    light = np.clip(_light(solution, level).ravel()[pair.flat], 0.0, 1.0)
+    light = np.clip(_light(solution, level)[pair.used], 0.0, 1.0)
     encoded = encode(torch.from_numpy(light)[None, None, None], "srgb", False, False)
     step = 1e-3  # of the encoded level
     steeper = (decode(encoded + step, "srgb", False, False) - decode(encoded - step, "srgb", False, False)) / (2 * step)
@@ -187,36 +159,26 @@ def _light(solution: Solution, level: float) -> Array:
     return np.asarray((np.nan_to_num(solution.model) - solution.background) / (solution.gain * level))
 
 
-def focused(edge: Edge) -> Edge:
-    """The edge as it would be in focus: softer than any camera in focus leaves it, it is deconvolved to the usual."""
-    return with_softness(edge, _FOCUSED_PX) if edge.softness > _UNFOCUSED_PX else edge
-
-
-def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None, stacklevel: int = 4) -> None:
+def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
     """Warn where the sharp picture is softer than a camera in focus leaves it, and the kernel's size feels it.
 
-    Args:
-        edge: of the sharp dot.
-        radius_px: of the uniform disc with the fitted kernel's second moment.
-        deconvolved: whether the kernel was fitted to the dot as it would be in focus, see :func:`focused`.
-        file: named in the warning.
-        stacklevel: where the warning points.
+    `deconvolved` is whether the kernel, of this radius, was fitted to the dot as it would be in focus.
     """
-    if edge.softness <= SENSOR_BLUR_PX or edge.radius <= 2 * edge.softness:
+    if edge.softness <= _SENSOR_BLUR_PX or edge.radius <= 2 * edge.softness:
         return
     # along an axis a disc of radius R has a variance of R^2 / 4
-    excess = edge.softness**2 - SENSOR_BLUR_PX**2
+    excess = edge.softness**2 - _SENSOR_BLUR_PX**2
     share = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
     if share < _MATTERS:
         return
     text = f"the sharp picture is soft: its dot's edge has a width of {edge.softness:.1f} px"
-    if edge.softness > _UNFOCUSED_PX and deconvolved:
+    if edge.softness > UNFOCUSED_PX and deconvolved:
         text += (
             ", as out of focus; the dot was fitted as it would be in focus. If its printed edge is that soft, the "
             f"kernel is too large by {100 * share:.0f} %. Better focus again"
         )
-    elif edge.softness > _UNFOCUSED_PX:
+    elif edge.softness > UNFOCUSED_PX:
         text += f", as out of focus; the kernel is too small by {100 * share:.0f} %: focus again"
     else:
         text += f"; if the printed dot's edge is sharp, the kernel is too small by {100 * share:.0f} %"
-    warn(NotInFocusWarning(text, file=file, number=edge.softness), stacklevel)
+    warn(text, "not in focus", file=file, number=edge.softness)

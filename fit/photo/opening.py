@@ -12,17 +12,14 @@ import torch
 from torchdof.optics.aperture import Aperture
 
 from ..result import Array, BlurFit
-from .deconvolution import estimate
-from .description import bic_of
-from .diagnostics import CHANCE, UNEVEN, asymmetry_of, noise_near, signal_pixels, size_of_blur, unexplained
+from .deconvolution import deconvolved
+from .diagnostics import CHANCE, UNEVEN, asymmetry_of, bic_of, noise_near, rms_left, size_of_blur, unexplained
 from .forward import Forward, Solution
-from .noise import independent_share
 
-__all__ = ["common_opening", "hides_a_polygon", "solve_image", "solve_opening", "solve_polygon", "turned"]
+__all__ = ["common_opening", "solve_image", "solve_opening", "solve_polygon", "turned"]
 
 _BLADES = range(3, 10)
 _SHOWN = 25.0  # chi squared of a polygon's harmonic, of two degrees of freedom, from which on it is tried
-_TURNED = ("rotation_deg", "curvature")
 _BETTER = 10.0  # by which a polygon's BIC must be lower: seven numbers of blades were looked at
 _FORETOLD = 24.0  # by how much the log likelihood of pixels that were kept back must grow, doubled
 _UNEXPLAINED = 2.0  # residual over noise
@@ -31,11 +28,7 @@ _MOST_SIDE = 64
 
 
 def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution, str] | None:
-    """The opening that explains what a round kernel leaves, or None where nothing is left that one explains.
-
-    Args:
-        pair: the pictures.
-        round_one: the free round profile.
+    """The opening that explains what the free round profile leaves, or None where nothing is left that one explains.
 
     Returns:
         The pair with its opening, the solution, of family "polygon" or "image", and how it was chosen.
@@ -49,31 +42,15 @@ def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
             known, what = polygon, f"round, nor a polygon of {blades} blades"
             why = f"a polygon of {blades} blades, its BIC lower by {gained:.0f} than that of any round profile"
     share, chance = asymmetry_of(*known)
-    near = signal_pixels(pair)
-    residual = float(np.sqrt(np.mean((pair.data[near] - known[1].model[near]) ** 2)))
-    if (share > UNEVEN and chance < CHANCE) or residual > _UNEXPLAINED * noise_near(*known, near):
-        found = estimate(*known)
-        if found.gained > _FORETOLD:
-            known = _with_picture(*known, found.kernel)
+    if (share > UNEVEN and chance < CHANCE) or rms_left(*known) > _UNEXPLAINED * noise_near(*known):
+        kernel, gained = deconvolved(*known)
+        if gained > _FORETOLD:
+            known = _with_picture(*known, kernel)
             why = (
                 f"the blur is not {what}: pixels that were kept back are foretold better by a picture of it "
-                f"(log likelihood higher by {found.gained / 2:.0f})"
+                f"(log likelihood higher by {gained / 2:.0f})"
             )
     return (*known, why) if why else None
-
-
-def hides_a_polygon(pair: Forward, round_one: Solution) -> bool:
-    """Whether a hexagon in place of a round kernel of its size would have been lost in the noise."""
-    size = np.sqrt(2) * size_of_blur(pair, round_one)[0]
-    hexagon = replace(pair, opening=Aperture(6))
-    kernels = [
-        hexagon.kernels("polygon", {"radius": np.array([1.095 * size]), **{n: np.zeros(1) for n in _TURNED}})[0],
-        pair.kernels("disc", {"radius": np.array([size])})[0],
-    ]
-    source = pair.moved_source(round_one.moves)
-    apart = round_one.gain * np.subtract(*(pair.convolve(source, k[None])[0] for k in kernels))
-    noise = noise_near(pair, round_one, signal_pixels(pair)) ** 2 / independent_share(pair.noise_correlation)
-    return bool(apart @ apart < 2 * _SHOWN * noise)  # twice: noise takes away as often as it adds
 
 
 def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution]:
@@ -85,87 +62,27 @@ def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
         "rotation_deg": (-90.0 - corner) % (360.0 / blades),
         "curvature": 0.1,
     }
-    shaped = replace(pair, opening=Aperture(blades), start={"polygon": start}, prior={})
-    shaped.held_magnification = round_one.moves["magnification"]
-    return shaped, shaped.solve("polygon")
+    return _solved(pair, round_one, Aperture(blades), "polygon", start)
 
 
 def solve_image(pair: Forward, round_one: Solution) -> tuple[Forward, Solution]:
     """The opening as a picture."""
-    return _with_picture(pair, round_one, estimate(pair, round_one).kernel)
-
-
-def turned(opening: Aperture) -> Aperture:
-    """The same opening turned by half: as it shows on the other side of the focus plane."""
-    if opening.mask is not None:
-        return replace(opening, mask=opening.mask.flip(0, 1))
-    return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
-
-
-def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
-    """One opening for all distances, as it shows behind the focus; the larger a blur, the more it shows.
-
-    Args:
-        fits: all "polygon", or all "image".
-        nearer: for each, whether it was nearer than the focus, where an opening shows turned by half.
-    """
-    found = [f.aperture if not near else turned(f.aperture) for f, near in zip(fits, nearer, strict=True) if f.aperture]
-    weight = np.array([f.radius**2 for f in fits])
-    if found[0].mask is None:
-        votes = {a.blades: float(weight[[b.blades == a.blades for b in found]].sum()) for a in found}
-        blades = max(votes, key=votes.__getitem__)
-        weight = weight * [a.blades == blades for a in found]
-        turns = np.exp(1j * np.deg2rad(blades * np.array([float(a.rotation_deg) for a in found])))
-        rotation = math.degrees(float(np.angle(weight @ turns))) / blades
-        return Aperture(blades, rotation, float(weight @ [a.curvature for a in found] / weight.sum()))
-    halves = [float(f.params["radius"]) / f.radius for f in fits]
-    place = ((np.arange(_MOST_SIDE) + 0.5) / _MOST_SIDE * 2 - 1) * max(halves)
-    mean = np.zeros((_MOST_SIDE, _MOST_SIDE))
-    for opening, half, share in zip(found, halves, weight / weight.sum(), strict=True):
-        mean += share * _resampled(opening, place / half) / half**2
-    return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))
-
-
-def _resampled(opening: Aperture, place: Array) -> Array:
-    """An opening's picture at places from -1 to 1 along both axes, summing to what its area is; dark outside."""
-    from scipy.ndimage import map_coordinates
-
-    if opening.mask is None:
-        raise AssertionError("a polygon is no picture")
-    mask = opening.mask.numpy()
-    where = (place + 1) / 2 * mask.shape[0] - 0.5
-    rows, columns = np.meshgrid(where, where, indexing="ij")
-    return np.asarray(map_coordinates(mask / mask.mean(), [rows, columns], order=1, mode="constant"))
-
-
-def _opening_of_kernel(kernel: Array) -> tuple[Aperture, float]:
-    """A kernel's picture as an opening, its centre of mass in the middle.
-
-    Args:
-        kernel: `[k, k]`, k odd, not negative.
-
-    Returns:
-        The opening, smooth between the kernel's pixels, and half the side of its square in px.
-    """
-    from scipy.ndimage import map_coordinates
-
-    size = kernel.shape[0]
-    axis = np.arange(size) - size // 2
-    x, y = float(kernel.sum(0) @ axis / kernel.sum()), float(kernel.sum(1) @ axis / kernel.sum())
-    lit = np.hypot(axis[:, None] - y, axis - x)[kernel > 0.01 * kernel.max()]
-    half = float(np.ceil(lit.max())) + 1.0
-    side = int(min(_MOST_SIDE, round(2 * half * _FINEST)))
-    places = ((np.arange(side) + 0.5) / side * 2 - 1) * half + size // 2
-    rows, columns = np.meshgrid(places + y, places + x, indexing="ij")
-    fine = map_coordinates(kernel, [rows, columns], order=3, mode="constant")
-    return Aperture(mask=torch.from_numpy(np.maximum(fine, 0.0))), half
+    return _with_picture(pair, round_one, deconvolved(pair, round_one)[0])
 
 
 def _with_picture(pair: Forward, before: Solution, kernel: Array) -> tuple[Forward, Solution]:
     opening, half = _opening_of_kernel(kernel)
-    shaped = replace(pair, opening=opening, start={"image": {"radius": half}}, prior={})
-    shaped.held_magnification = before.moves["magnification"]
-    return shaped, shaped.solve("image")
+    return _solved(pair, before, opening, "image", {"radius": half})
+
+
+def _solved(
+    pair: Forward, before: Solution, opening: Aperture, family: str, start: dict[str, float]
+) -> tuple[Forward, Solution]:
+    """The pair with an opening, and its solution; the magnification starts from that of a solution before."""
+    shaped = replace(
+        pair, opening=opening, start={family: start}, prior={}, held_magnification=before.moves["magnification"]
+    )
+    return shaped, shaped.solve(family)
 
 
 def _harmonic(pair: Forward, round_one: Solution) -> tuple[int, float, float]:
@@ -194,3 +111,49 @@ def _harmonic(pair: Forward, round_one: Solution) -> tuple[int, float, float]:
         angles.append(math.degrees(math.atan2(amplitudes[1], amplitudes[0])) / n)
     best = int(np.argmax(scores))
     return _BLADES[best], scores[best], angles[best]
+
+
+def _opening_of_kernel(kernel: Array) -> tuple[Aperture, float]:
+    """A kernel `[k, k]` as an opening, its centre of mass in the middle, and half the side of its square in px."""
+    from scipy.ndimage import center_of_mass, map_coordinates
+
+    y, x = center_of_mass(kernel)
+    rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
+    half = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0
+    side = int(min(_MOST_SIDE, round(2 * half * _FINEST)))
+    places = ((np.arange(side) + 0.5) / side * 2 - 1) * half
+    where = np.meshgrid(places + y, places + x, indexing="ij")
+    fine = map_coordinates(kernel, where, order=3, mode="constant")
+    return Aperture(mask=torch.from_numpy(np.maximum(fine, 0.0))), half
+
+
+def turned(opening: Aperture) -> Aperture:
+    """The same opening turned by half: as it shows on the other side of the focus plane."""
+    if opening.mask is not None:
+        return replace(opening, mask=opening.mask.flip(0, 1))
+    return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
+
+
+def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
+    """One opening for all distances, as it shows behind the focus; the larger a blur, the more it shows.
+
+    The fits are all "polygon", or all "image"; nearer than the focus an opening shows turned by half.
+    """
+    from scipy.ndimage import map_coordinates
+
+    found = [f.aperture if not near else turned(f.aperture) for f, near in zip(fits, nearer, strict=True) if f.aperture]
+    weight = np.array([f.radius**2 for f in fits])
+    if found[0].mask is None:
+        votes = {a.blades: float(weight[[b.blades == a.blades for b in found]].sum()) for a in found}
+        blades = max(votes, key=votes.__getitem__)
+        weight = weight * [a.blades == blades for a in found]
+        turns = np.exp(1j * np.deg2rad(blades * np.array([float(a.rotation_deg) for a in found])))
+        rotation = math.degrees(float(np.angle(weight @ turns))) / blades
+        return Aperture(blades, rotation, float(weight @ [a.curvature for a in found] / weight.sum()))
+    halves = [float(f.params["radius"]) / f.radius for f in fits]
+    place = ((np.arange(_MOST_SIDE) + 0.5) / _MOST_SIDE * 2 - 1) * max(halves)
+    mean = np.zeros((_MOST_SIDE, _MOST_SIDE))
+    for mask, half, share in zip((a.mask.numpy() for a in found), halves, weight / weight.sum(), strict=True):
+        where = np.meshgrid(*[(place / half + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
+        mean += share * map_coordinates(mask / mask.mean(), where, order=1, mode="constant") / half**2
+    return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,24 +12,22 @@ from numpy.typing import ArrayLike
 from torchdof.optics.aperture import Aperture
 from torchdof.validation import show
 
-from ..problems import DistanceError, FitError, SaturatedWarning, warn
+from ..problems import FitError, warn
 from ..result import Array, BlurFit
 from ..solve import one_thread
-from ..validation import a_count, a_number, a_picture
-from .description import bic_of, describe, kernel_lists
-from .diagnostics import FAR_ABOVE, check_fit
-from .dot import find_dot, fine_share_inside, noise_inside
-from .dot_model import Edge, soft_edge, with_softness
+from ..validation import a_choice, a_count, a_number, a_picture
+from .checks import FAR_ABOVE, check_fit
+from .diagnostics import bic_of, describe
+from .dot import find_dot, fine_share_inside
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
-from .linearity import EXPLAINED, check_focus, check_levels, check_linearity, check_noise, focused
+from .linearity import EXPLAINED, check_focus, check_levels, check_linearity, check_noise
 from .noise import independent_share
-from .opening import hides_a_polygon, solve_image, solve_opening, solve_polygon
-from .profile_fit import fit_profile
+from .opening import solve_image, solve_opening, solve_polygon
 from .radial import solve_radial, solve_round
-from .ratio import blur_strength
+from .ratio import fit_ratio
 from .saturation import check_blacks, used_pixels
-from .source import IdealDot, PictureOfDot, point_source
+from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
 
 __all__ = ["fit_pair", "prepared_pair"]
 
@@ -104,10 +102,8 @@ def fit_pair(
         A `BlurFit` with lengths in pixels.
 
     Raises:
-        FitError: wrong shapes, family or model; or one of its kinds, named after what is wrong with the capture.
-
-    Warns:
-        FitWarning: one of its kinds; the result is given, and what to doubt about it.
+        FitError: wrong arguments, or what is wrong with the capture, by its `kind`; what to doubt about a result is
+            warned about in the same way.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 2 (model="ratio").
@@ -121,11 +117,28 @@ def fit_pair(
         >>> fit.family, round(fit.params["radius"], 3)
         ('disc', 8.0)
     """
-    _check_options(family, model, source, magnification, accuracy_db, fit_magnification, white, start, prior, aperture)
+    a_choice("family", family, ("auto", *SHAPES))
+    a_choice("model", model, get_args(Model))
+    a_choice("source", source, get_args(SourceKind))
+    a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
+    a_number("magnification", magnification, 1e-3, 1e3)  # beyond this the dot of one picture is not seen in the other
+    for name, value, least in (("white", white, -1e100), ("reach", reach, 0), ("softness", softness, -1e-9)):
+        if value is not None:
+            a_number(name, value, least, 1e100)
     if knots is not None:
         a_count("knots", knots, 2, 1000)
-    if reach is not None:
-        a_number("reach", reach, 0, unit="pixels")
+    if fit_magnification is not None and not isinstance(fit_magnification, bool):
+        raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
+    if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
+        raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
+    if start is not None and not isinstance(start, BlurFit):
+        raise FitError(f"start must be a BlurFit of a similar pair, got {show(start)}")
+    pairs = prior is None or isinstance(prior, Mapping) and all(isinstance(v, tuple) for v in prior.values())
+    if not pairs or any(len(v) != 2 for v in (prior or {}).values()):
+        raise FitError(f"prior must map names of parameters to (expected value, deviation), got {show(prior)}")
+    for name, (mean, deviation) in (prior or {}).items():
+        a_number(f"the expected {name}", mean, -1e100, 1e100)
+        a_number(f"the deviation of {name}", deviation, 0)
     data = a_picture("blurred", blurred, _SMALLEST_WINDOW, files[1])
     still = None if sharp is None else a_picture("sharp", sharp, _SMALLEST_WINDOW, files[0])
     if still is not None and still.shape != data.shape:
@@ -134,18 +147,12 @@ def fit_pair(
             "cut the same window from both"
         )
     if model == "ratio":
-        if still is None:
-            raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
-        r, strength, spokes = blur_strength(still, data)
-        fit = fit_profile(r, strength, "ring" if family == "auto" else family, groups=spokes)
-        return replace(fit, model="ratio")
-    if softness is not None:
-        a_number("softness", softness, -1e-9, unit="pixels")
+        return fit_ratio(still, data, "ring" if family == "auto" else family)
     with one_thread():
         pair, edge, linear = prepared_pair(still, data, source, magnification, white, files, softness)
-        if start is not None and start.family in SHAPES:
+        if start is not None:
             pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
-        pair.prior = dict(prior or {})
+        pair.prior = prior or {}
         # whether the magnification is settled before the fit: a point has none
         held = True if sharp is None else None if fit_magnification is None else not fit_magnification
         pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
@@ -156,88 +163,42 @@ def fit_pair(
             if family == "auto":
                 solution, why, psnr = _choose(pair, freest, accuracy_db)
                 found = solve_opening(pair, freest)
-                if found is not None and not _alike((pair, solution), found[:2], accuracy_db):
+                if found is not None and not looks_alike(pair.kernel(solution), found[0].kernel(found[1]), accuracy_db):
                     pair, solution, why = found
                     freest = expected = solution
-                elif found is None and hides_a_polygon(pair, freest):
-                    why += "; a hexagon would not have been told from it in this noise"
             elif family != "radial":
                 pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
                 freest = expected = solution
         else:
             pair.opening = aperture
             solution = freest = expected = pair.solve(family)
-            if held is None and _improves(pair, solution, free := _with_magnification(pair).solve(family)):
+            if held is None and _improves(pair, solution, free := replace(pair, fit_moves=ALL_MOVES).solve(family)):
                 pair.fit_moves, solution, freest = ALL_MOVES, free, free
         fit = describe(pair, solution, why)
         # a family that was chosen for being cheap is not to blame for what the freest kernel explains
         judged = fit if freest is solution else describe(pair, freest, "")
-        check_fit(pair, solution, fit, files, judged)
-        # what demosaicing leaves at an edge is louder than what it leaves of the noise
-        if edge is not None and linear and pair.fine_share > _FINE:
-            linear = check_noise(pair, solution, edge.level, files[1])
-        # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed, and
-        # what that leaves goes with the level, too
-        most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
-        large = edge is not None and min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
-        if edge is not None and linear and large and judged.residual_over_noise < most:
-            check_levels(pair, freest, expected, edge, files[1])
+        check_fit(pair, solution, fit, files[1], judged)
         if edge is not None:
-            check_focus(edge, fit.radius, isinstance(pair.source, IdealDot), files[0])
+            # what demosaicing leaves at an edge is louder than what it leaves of the noise
+            if linear and pair.fine_share > _FINE:
+                linear = check_noise(pair, solution, edge.level, files[1])
+            # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed,
+            # and what that leaves goes with the level, too
+            most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
+            large = min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
+            if linear and large and judged.residual_over_noise < most:
+                check_levels(pair, freest, expected, edge, files[1])
+            check_focus(edge, fit.radius, bool(pair.source.variants), files[0])
     return replace(fit, psnr=psnr)
-
-
-def _check_options(
-    family: Any,
-    model: Any,
-    source: Any,
-    magnification: Any,
-    accuracy_db: Any,
-    fit_magnification: Any,
-    white: Any,
-    start: Any,
-    prior: Any,
-    aperture: Any,
-) -> None:
-    """Refuse options of :func:`fit_pair` that make no sense, by name."""
-    if not isinstance(family, str) or family not in (*SHAPES, "auto"):
-        raise FitError(f"family must be 'auto' or one of {', '.join(SHAPES)}, got {show(family)}")
-    if aperture is not None and (not isinstance(aperture, Aperture) or family != "image"):
-        raise FitError(f"aperture must be an Aperture, and goes with family='image', got {show(aperture)}")
-    texts = isinstance(model, str) and isinstance(source, str)
-    if not texts or model not in get_args(Model) or source not in get_args(SourceKind):
-        got = f"got {show(model)}, {show(source)}"
-        raise FitError(f"model must be 'forward' or 'ratio', source 'auto', 'image' or 'dot'; {got}")
-    if model == "ratio" and family in OPENINGS:
-        raise FitError(f"model='ratio' fits a profile over r, which {family!r} has not; use model='forward'")
-    try:
-        # beyond this the dot of one picture is not seen in the other
-        a_number("magnification", magnification, 1e-3, 1e3)
-    except FitError:
-        got = f"got {show(magnification)}"
-        raise FitError(f"magnification must be positive (0.001 to 1000), {got}") from None
-    a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
-    if white is not None:
-        a_number("white", white, -1e100, 1e100)
-    if fit_magnification is not None and not isinstance(fit_magnification, bool):
-        raise FitError(f"fit_magnification must be True, False or None, got {show(fit_magnification)}")
-    if start is not None and not isinstance(start, BlurFit):
-        raise FitError(f"start must be a BlurFit of a similar pair, got {show(start)}")
-    pairs = isinstance(prior, Mapping) and all(isinstance(v, tuple) and len(v) == 2 for v in prior.values())
-    if prior is not None and not pairs:
-        raise FitError(f"prior must map names of parameters to (expected value, deviation), got {show(prior)}")
-    for name, (mean, deviation) in (prior or {}).items():
-        a_number(f"the expected {name}", mean, -1e100, 1e100)
-        a_number(f"the deviation of {name}", deviation, 0)
 
 
 def prepared_pair(
     still: Array | None,
     data: Array,
-    source: SourceKind,
-    magnification: float,
-    white: float | None,
-    files: tuple[str | None, str | None],
+    source: SourceKind = "auto",
+    magnification: float = 1.0,
+    white: float | None = None,
+    files: tuple[str | None, str | None] = (None, None),
     softness: float | None = None,
 ) -> tuple[Forward, Edge | None, bool]:
     """Find the dots, leave out what is clipped, and decide what stands for the sharp dot.
@@ -255,51 +216,44 @@ def prepared_pair(
     clipped = int(np.sum(~whole))
     edge = soft_edge(still, dot, white=float(still[~whole].min()) if clipped else None)
     if softness is not None and softness < edge.softness:
-        source, edge = "dot", with_softness(edge, softness)
+        source, edge = "dot", edge.with_softness(softness)
     linear = clipped > 0 or softness is not None or check_linearity(still, dot, edge, files[0])
     if edge.radius * magnification < _SMALLEST_DOT_PX:
-        raise DistanceError(
+        text = (
             f"by the distances the dot, {edge.radius:.1f} px in focus, would have a radius of "
             f"{edge.radius * magnification:.2g} px here, and nothing of it be seen; is the distance misread, or in "
-            "another unit?",
-            file=files[1],
-            number=magnification,
+            "another unit?"
         )
-    bright = noise_inside(still, dot)
-    shot_noise = 0.0 if bright is None else max(bright[0] ** 2 - dot.noise**2, 0.0) / edge.level
+        raise FitError(text, "distance", file=files[1], number=magnification)
     if clipped:
-        warn(
-            SaturatedWarning(
-                f"{clipped} pixels of the sharp picture are clipped; an ideal dot of radius {edge.radius:.2f} px "
-                "stands in for it",
-                file=files[0],
-                number=float(clipped),
-            ),
-            stacklevel=4,
+        text = (
+            f"{clipped} pixels of the sharp picture are clipped; an ideal dot of radius {edge.radius:.2f} px stands in "
+            "for it"
         )
-    # a spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified, and so is the
-    # sensor's softness, which does not grow with the dot
-    unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
-    magnified = edge.softness**2 * abs(1 - magnification**2) > _GROWN
-    close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
-    close = close or (magnified and unexplained < _ALMOST)
-    explained = close and edge.radius > 2 * edge.softness
-    ideal = clipped or source == "dot" or (source == "auto" and explained)
-    stand_in = IdealDot.of(dot, focused(edge)) if ideal else PictureOfDot.of(still, dot)
+        warn(text, "saturated", file=files[0], number=float(clipped))
+    ideal = clipped or source == "dot" or (source == "auto" and _explained(edge, magnification))
     pair = Forward(
-        stand_in,
+        ideal_dot(edge) if ideal else picture_of_dot(still, dot),
         data,
         used,
         data_dot,
         magnification,
-        shot_noise=shot_noise,
+        shot_noise=edge.shot_noise / edge.level,
         fine_share_of_light=fine_share_inside(still, dot),
     )
     return pair, edge, linear
 
 
-def _with_magnification(pair: Forward) -> Forward:
-    return replace(pair, fit_moves=ALL_MOVES)
+def _explained(edge: Edge, magnification: float) -> bool:
+    """Whether an ideal dot explains a sharp picture as well as its own pixels would.
+
+    A spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified, and so is the
+    sensor's softness, which does not grow with the dot.
+    """
+    unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
+    magnified = edge.softness**2 * abs(1 - magnification**2) > _GROWN
+    close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
+    return bool((close or (magnified and unexplained < _ALMOST)) and edge.radius > 2 * edge.softness)
 
 
 def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
@@ -319,7 +273,8 @@ def _solve_radial(
     """
     expected = solution = solve_round(pair, knots, reach)
     if held is None:
-        free = solve_radial(_with_magnification(pair), solution, float(solution.params["radius"]), knots)
+        radius = float(solution.params["radius"])
+        free = solve_radial(replace(pair, fit_moves=ALL_MOVES), solution.moves, radius, knots)
         if _improves(pair, solution, free):
             pair.fit_moves, solution = ALL_MOVES, free
     pair.held_magnification = solution.moves["magnification"]
@@ -330,19 +285,10 @@ def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Soluti
     """Fit every family at the free profile's magnification and choose; the chosen one's is then fitted with it."""
     fit_moves, pair.fit_moves = pair.fit_moves, ("dx", "dy")
     solutions = {"radial": radial} | {f: pair.solve(f) for f in COST[:-1]}
-    kernels = {f: _kernel(pair, s) for f, s in solutions.items()}
+    kernels = {f: pair.kernel(s) for f, s in solutions.items()}
     family, why, psnr = choose(kernels, {f: bic_of(pair, s) for f, s in solutions.items()}, accuracy_db)
     pair.fit_moves = fit_moves
     if family != "radial" and fit_moves == ALL_MOVES:
         pair.start[family] = {k: float(v) for k, v in solutions[family].params.items()}
         solutions[family] = pair.solve(family)
     return solutions[family], why, psnr
-
-
-def _alike(one: tuple[Forward, Solution], other: tuple[Forward, Solution], accuracy_db: float) -> bool:
-    """Whether nobody could tell a picture through one solution's kernel from that through the other's."""
-    return looks_alike(_kernel(*one), _kernel(*other), accuracy_db)
-
-
-def _kernel(pair: Forward, solution: Solution) -> Array:
-    return np.asarray(pair.kernels(solution.family, kernel_lists(solution))[0])

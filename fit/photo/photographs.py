@@ -18,10 +18,10 @@ from torchdof.io.images import read_image
 from torchdof.io.metadata import camera_facts
 from torchdof.validation import number
 
-from ..problems import DotNotFoundError, FitError, ManifestError, NotLinearWarning, warn
+from ..problems import FitError, warn
 from ..result import Array
-from .crop import Capture
-from .manifest import Captures, Colours, inside
+from .captures import CAMERA, Capture, Captures
+from .manifest import MANIFEST, Colours, inside
 from .target import DOT_MM, SQUARE_MM, Target, find_target
 from .tone import WINDOW, Tone, tone_curve, untoned
 
@@ -34,23 +34,14 @@ _FEWEST = 4  # photographs from which on they tell of a tone curve
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph with the target in it.
-
-    Attributes:
-        file: its name.
-        light: `[H, W]`, mean of the colours in linear light, the tone curve undone.
-        target: where the target is.
-        distance_m: of the target from the lens, by its size.
-        sharpness: steepest slope of the dot's edge over its height, 1/px.
-        clipped: whether the paper is at the top of the scale.
-    """
+    """One photograph with the target in it."""
 
     file: str
-    light: Array
+    light: Array  # [H, W], mean of the colours in linear light, the tone curve undone
     target: Target
-    distance_m: float
-    sharpness: float
-    clipped: bool
+    distance_m: float  # of the target from the lens, by its size
+    sharpness: float  # steepest slope of the dot's edge over its height, 1/px
+    clipped: bool  # whether the paper is at the top of the scale
 
 
 @dataclass(frozen=True)
@@ -93,23 +84,24 @@ def read_photographs(
         OSError: a picture is damaged.
 
     Warns:
-        NotLinearWarning: photographs of integers, too few of them to tell a tone curve.
+        FitWarning: of kind "not linear" for integers, where photographs are too few to tell a tone curve.
     """
     number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
+    where = str(folder)
     files = sorted(p for p in Path(folder).iterdir() if p.suffix.lower() in (*_READ, *foreign.SUFFIXES))
     for path in files:
         if root is not None:
-            inside(path, root, str(folder))
+            inside(path, root, where)
         unread = foreign.refusal(path)
         if unread is not None:
             raise FitError(unread, file=str(path))
     if len(files) < 2:
-        raise ManifestError(
-            "there is neither a capture.toml nor two photographs (.jpg .png .tif .exr) of the target that "
-            "torchdof fit --target target.pdf makes",
-            file=str(folder),
+        text = (
+            f"there is neither a {MANIFEST} nor two photographs (.jpg .png .tif .exr) of the target that "
+            "torchdof fit --target target.pdf makes"
         )
-    pictures, advice, facts, width, integers = [], [], dict[str, float](), 0, True
+        raise FitError(text, "manifest", file=where)
+    pictures, advice, facts, integers = [], [], dict[str, float](), True
     for path in files:
         picture = read_image(path)
         if colours == "each" and len(picture.channels) < 3:
@@ -117,24 +109,24 @@ def read_photographs(
         light = picture.pixels[0, : 3 if len(picture.channels) >= 3 else 1].mean(0).double().numpy()
         try:
             target = find_target(light, file=str(path))
-        except DotNotFoundError as error:
+        except FitError as error:
             advice.append(f"{path.name}: left out, {str(error).split(': ', 1)[1]}")
             continue
-        if width and light.shape[1] != width:
-            raise FitError(f"is {light.shape[1]} px wide, the others {width}: all from one camera", file=str(path))
-        if not facts:
-            facts, width = camera_facts(picture.metadata, light.shape[1]), light.shape[1]
-        integers = integers and picture.sample in ("8", "16")
-        clipped = picture.sample in ("8", "16") and target.white > 0.98
+        width = light.shape[1]
+        if pictures and width != pictures[0].light.shape[1]:
+            text = f"is {width} px wide, the others {pictures[0].light.shape[1]}: all from one camera"
+            raise FitError(text, file=str(path))
+        facts = facts or camera_facts(picture.metadata, width)
+        whole = picture.sample in ("8", "16")
+        integers = integers and whole
+        clipped = whole and target.white > 0.98
         pictures.append(Photograph(path.name, light, target, 0.0, _sharpness(light, target), clipped))
     if len(pictures) < 2:
-        raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=str(folder))
-    missing = [n for n in ("focal_length_mm", "f_number", "sensor_width_mm") if n not in facts]
+        raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=where)
+    missing = [name for name in CAMERA if name not in facts]
     if missing:
-        raise ManifestError(
-            f"EXIF does not tell {', '.join(missing)}: share the originals, or describe them in a capture.toml",
-            file=str(folder),
-        )
+        text = f"EXIF does not tell {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
+        raise FitError(text, "manifest", file=where)
     tone, taken = None, {p.file: p.light for p in pictures}
     if integers and len(pictures) >= _FEWEST:
         tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
@@ -143,7 +135,7 @@ def read_photographs(
             f"{len(pictures)} photographs do not tell whether they have a tone curve, which makes the kernel up to "
             f"15 % too small: take {_FEWEST} or more"
         )
-        warn(NotLinearWarning(text, file=str(folder), number=float(len(pictures))))
+        warn(text, "not linear", file=where, number=float(len(pictures)))
     bend = (0.0, 0.0, 0.0) if tone is None else tone.bend
     if any(bend):
         pictures = [replace(p, light=untoned(p.light, bend)) for p in pictures]
@@ -155,39 +147,36 @@ def read_photographs(
         )
     sharp = max(pictures, key=lambda p: p.sharpness)
     focal_px = facts["focal_length_mm"] * width / facts["sensor_width_mm"]
-    image_px, focus_m = focal_px, 1.0
-    for _ in range(20):  # the image distance grows with the focus, which it tells
-        focus_m = image_px * square_mm / 1000 / sharp.target.side_px
-        image_px = focal_px / (1 - facts["focal_length_mm"] / 1000 / focus_m)
+    # by the size of the square in focus and the thin lens, 1 / focal length = 1 / focus + 1 / image distance
+    focus_m = (focal_px * square_mm / sharp.target.side_px + facts["focal_length_mm"]) / 1000
+    image_px = focal_px / (1 - facts["focal_length_mm"] / 1000 / focus_m)
     pictures = sorted(
         (replace(p, distance_m=image_px * square_mm / 1000 / p.target.side_px) for p in pictures),
         key=lambda p: p.distance_m,
     )
-    advice += _advice(pictures, sharp.file, focus_m)
     moved = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _SAME_PLACE]
+    advice += _advice(pictures, moved, sharp, focus_m)
     if not moved:
-        raise FitError("all photographs were taken at one distance: step back, without refocusing", file=str(folder))
+        raise FitError("all photographs were taken at one distance: step back, without refocusing", file=where)
     captures = Captures(
-        pairs=tuple(_pair(sharp, p, str(Path(folder)), taken, tone, colours) for p in moved),
+        pairs=tuple(_pair(Path(folder), sharp, p, taken, tone, colours == "each") for p in moved),
         focus_m=focus_m,
         width_px=width,
-        focal_length_mm=facts["focal_length_mm"],
-        f_number=facts["f_number"],
-        sensor_width_mm=facts["sensor_width_mm"],
+        **{name: facts[name] for name in CAMERA},
         name=Path(folder).resolve().name,
         notes={
             "target_square_mm": square_mm,
             "pictures": [p.file for p in pictures],
             "sharp": sharp.file,
             "tone_curve": list(bend),
-            "from_exif": ["focal_length_mm", "f_number", "sensor_width_mm"],
+            "from_exif": list(CAMERA),
         },
     )
     return Photographs(captures, tuple(pictures), bend, tuple(advice))
 
 
 def _pair(
-    sharp: Photograph, blurred: Photograph, folder: str, taken: Mapping[str, Array], tone: Tone | None, colours: Colours
+    folder: Path, sharp: Photograph, blurred: Photograph, taken: Mapping[str, Array], tone: Tone | None, each: bool
 ) -> Capture:
     """The windows of the dot in two photographs; and, of what was `taken`, with the tone curve a standard error off."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
@@ -197,20 +186,18 @@ def _pair(
         return light[..., y - half : y + half + 1, x - half : x + half + 1]
 
     def colours_of(picture: Photograph) -> Array:
-        seen = read_image(Path(folder, picture.file)).pixels[0, :3].double().numpy()
+        seen = read_image(folder / picture.file).pixels[0, :3].double().numpy()
         return np.stack([c if tone is None else untoned(c, tone.bend) for c in cut(seen, picture.target)])
 
-    still, moved = (cut(p.light, p.target) for p in (sharp, blurred))
-    raw = [cut(taken[p.file], p.target) for p in (sharp, blurred)]
-    files = (os.path.join(folder, sharp.file), os.path.join(folder, blurred.file))
+    raw = [cut(taken[picture.file], picture.target) for picture in (sharp, blurred)]
     others = [] if tone is None else [np.add(tone.bend, step) for step in tone.errors]
     return Capture(
-        still,
-        moved,
+        cut(sharp.light, sharp.target),
+        cut(blurred.light, blurred.target),
         blurred.distance_m,
-        files=files,
+        files=(str(folder / sharp.file), str(folder / blurred.file)),
         white=1.0 if sharp.clipped else None,
-        colours=(colours_of(sharp), colours_of(blurred)) if colours == "each" else None,
+        colours=(colours_of(sharp), colours_of(blurred)) if each else None,
         uncertain=tuple((untoned(raw[0], bend), untoned(raw[1], bend)) for bend in others),
     )
 
@@ -223,16 +210,17 @@ def _sharpness(light: Array, target: Target) -> float:
     return float(gaussian_gradient_magnitude(around, 0.7).max() / (target.white - target.black))
 
 
-def _advice(pictures: Sequence[Photograph], sharp: str, focus_m: float) -> list[str]:
+def _advice(
+    pictures: Sequence[Photograph], moved: Sequence[Photograph], sharp: Photograph, focus_m: float
+) -> list[str]:
     """What to do better, a sentence each."""
     advice = []
-    dot_px = next(p.target.side_px for p in pictures if p.file == sharp) * DOT_MM / SQUARE_MM / 2
+    dot_px = sharp.target.side_px * DOT_MM / SQUARE_MM / 2
     if dot_px < 6:
         advice.append(f"the sharp dot has a radius of {dot_px:.1f} px, 8 to 20 are best: go nearer")
-    away = [p for p in pictures if abs(p.distance_m / focus_m - 1) > _SAME_PLACE]
-    if len(away) < 4:
-        advice.append(f"{len(away)} distances out of focus: five to nine make a better table")
-    if all(p.distance_m > focus_m for p in away):
+    if len(moved) < 4:
+        advice.append(f"{len(moved)} distances out of focus: five to nine make a better table")
+    if all(p.distance_m > focus_m for p in moved):
         advice.append("no picture is nearer than the focus: there the table will be the mirror image of the far side")
     for p in pictures:
         if p.clipped:

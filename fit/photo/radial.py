@@ -2,81 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import torch
 
 from torchdof.optics.psf import pixel_kernels
 
-from ..result import Array, Mask
+from ..result import Array
+from ..solve import inverse
 from .forward import Forward, Solution, without_level
-from .profile_fit import inverse
 
-__all__ = ["solve_radial", "solve_round"]
+__all__ = ["size_of_profile", "solve_radial", "solve_round"]
 
 # plain cross-validation (1) follows the noise now and then; 3 costs nothing without noise and up to 12 dB less with it
 _CAUTION = 3.0
 _SMOOTHNESS = 10.0 ** np.arange(-8.0, 0.0)
-
-
-def solve_radial(pair: Forward, seed: Solution, radius: float, knots: int | None = None) -> Solution:
-    """Values of the profile at equal steps of r, the moves refined beside them.
-
-    The profile is linear in its values: each is the weight of one hat function, whose kernel is convolved with the
-    sharp dot. A penalty on second differences, chosen by generalised cross-validation, ties the values to each other
-    where the data alone do not fix them (near the centre, where few pixels lie).
-
-    Args:
-        pair: the pictures.
-        seed: a parametric solution, which gives the moves to start from.
-        radius: where the profile ends, px.
-        knots: number of values; None takes two a pixel, between 8 and 48.
-
-    Returns:
-        A solution with the params "values" [knots] (density per square pixel) and "radius".
-    """
-    count = knots if knots is not None else int(np.clip(np.ceil(2 * radius), 8, 48))
-    half = min(int(np.ceil(radius)) + 1, pair.half)
-    hats = pixel_kernels(
-        "radial", {"values": torch.eye(count, dtype=torch.float64), "radius": radius}, 2 * half + 1
-    ).numpy()
-    mass = hat_mass(count, radius)
-    moves = dict(seed.moves)
-    for _ in range(10):
-        columns = mass[:, None] * pair.convolve(pair.moved_source(moves), hats)  # [knots, pixels]
-        weights, smooth, free = _non_negative(columns, pair.values)
-        gain = float(mass @ weights)
-        kernel = np.tensordot(mass * weights / gain, hats, 1)
-        shaped = columns.T @ weights / gain
-        fitted, gain, background = pair._project(shaped)
-        residual = pair.values - fitted
-        if not pair.fit_moves:
-            break
-        # one Gauss-Newton step of the moves with the kernel held
-        slopes = gain * np.stack(pair.move_columns(moves, pair.fit_moves, kernel[None]), axis=1)
-        step = np.linalg.lstsq(without_level(slopes, shaped), residual, rcond=None)[0]
-        limit = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}
-        for name, change in zip(pair.fit_moves, step, strict=True):
-            moves[name] += float(np.clip(change, -limit[name], limit[name]))
-        if np.all(np.abs(step) < 3e-4):
-            break
-    full = np.full(pair.flat.shape, np.nan)
-    full[pair.flat] = fitted
-    covariance = _covariance(pair, columns, residual, kernel, gain, moves, free, smooth)
-    return replace(
-        seed,
-        family="radial",
-        params={"values": weights / float(mass @ weights), "radius": radius},
-        moves=moves,
-        gain=gain,
-        background=background,
-        model=full.reshape(pair.data.shape),
-        names=tuple(f"values[{i}]" for i in range(count)),
-        covariance=covariance / gain**2,
-        squares=float(residual @ residual),
-        slopes=np.stack(pair.move_columns(moves, ("dx", "dy"), kernel[None]), axis=1),
-    )
+_LIMIT = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # of a step
 
 
 def solve_round(pair: Forward, knots: int | None = None, reach: float | None = None) -> Solution:
@@ -84,20 +24,64 @@ def solve_round(pair: Forward, knots: int | None = None, reach: float | None = N
     soft = pair.solve("softm")
     if reach is None:
         reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
-    return solve_radial(pair, soft, min(reach, pair.half - 1.0), knots)
+    return solve_radial(pair, soft.moves, min(reach, pair.half - 1.0), knots)
 
 
-def hat_mass(count: int, radius: float) -> Array:
-    """Integral over the plane of each of `count` hat functions over [0, radius]."""
+def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: int | None = None) -> Solution:
+    """Values of the profile at equal steps of r, the moves refined beside them.
+
+    The profile is linear in its values: each is the weight of one hat function, whose kernel is convolved with the
+    sharp dot. A penalty on second differences, chosen by generalised cross-validation, ties the values to each other
+    where the data alone do not fix them (near the centre, where few pixels lie). The profile ends at `radius` px;
+    `knots` None takes two values a pixel, between 8 and 48. They are densities per square pixel.
+    """
+    count = knots if knots is not None else int(np.clip(np.ceil(2 * radius), 8, 48))
+    half = min(int(np.ceil(radius)) + 1, pair.half)
+    values = torch.eye(count, dtype=torch.float64)
+    hats = pixel_kernels("radial", {"values": values, "radius": radius}, 2 * half + 1).numpy()
     h = radius / (count - 1)
-    mass = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)
-    mass[0] = np.pi * h * h / 3
-    mass[-1] = 2 * np.pi * (radius * h / 2 - h * h / 6)
-    return mass
+    mass = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # of each hat, over the plane
+    mass[0], mass[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
+    moves = dict(moves)
+    for _ in range(10):
+        columns = mass[:, None] * pair.convolve(pair.moved_source(moves), hats)  # [knots, pixels]
+        weights, smooth = _non_negative(columns, pair.values)
+        gain = float(mass @ weights)
+        kernel = np.tensordot(mass * weights / gain, hats, 1)
+        shaped = columns.T @ weights / gain
+        fitted, gain, background = pair.project(shaped)
+        residual = pair.values - fitted
+        # one Gauss-Newton step of the moves with the kernel held
+        slopes = gain * np.stack(pair.move_columns(moves, pair.fit_moves, kernel), axis=1)
+        step = np.linalg.lstsq(without_level(slopes, shaped), residual, rcond=None)[0]
+        for name, change in zip(pair.fit_moves, step, strict=True):
+            moves[name] += float(np.clip(change, -_LIMIT[name], _LIMIT[name]))
+        if np.all(np.abs(step) < 3e-4):
+            break
+    free = weights > 0
+    tall = (columns - columns.mean(axis=1, keepdims=True))[free].T
+    normal = tall.T @ tall
+    # the penalty shrinks the response to noise
+    shrink = inverse(normal + smooth[np.ix_(free, free)]) @ normal
+    plain = pair.covariance(tall, residual, kernel, gain, moves)
+    covariance = np.zeros((count, count))
+    covariance[np.ix_(free, free)] = shrink @ np.where(np.isfinite(plain), plain, 0.0) @ shrink.T
+    return Solution(
+        family="radial",
+        params={"values": weights / float(mass @ weights), "radius": radius},
+        moves=moves,
+        gain=gain,
+        background=background,
+        model=pair.picture(fitted, np.nan),
+        names=tuple(f"values[{i}]" for i in range(count)),
+        covariance=covariance / gain**2,
+        squares=float(residual @ residual),
+        slopes=np.stack(pair.move_columns(moves, ("dx", "dy"), kernel), axis=1),
+    )
 
 
-def _non_negative(columns: Array, data: Array) -> tuple[Array, Array, Mask]:
-    """Weights `[knots]`, the penalty's matrix, and which weights are free (not held at 0)."""
+def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
+    """Weights `[knots]`, and the matrix of the penalty under which they were found."""
     from scipy.optimize import nnls
 
     centred = columns - columns.mean(axis=1, keepdims=True)
@@ -105,7 +89,7 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array, Mask]:
     normal, right, total = centred @ centred.T, centred @ level, float(level @ level)
     rough = np.diff(np.eye(columns.shape[0]), 2, axis=0)
     penalty = rough.T @ rough * float(np.trace(normal)) / columns.shape[0]
-    best: tuple[float, Array, Array] | None = None
+    tried = []
     for strength in _SMOOTHNESS:
         smooth = strength * penalty
         # the normal equations' Cholesky factor has the same minimum as the tall matrix
@@ -114,30 +98,18 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array, Mask]:
         free = weights > 0
         used = np.trace(np.linalg.solve((normal + smooth)[np.ix_(free, free)], normal[np.ix_(free, free)]))
         squares = max(total - 2 * float(right @ weights) + float(weights @ normal @ weights), 1e-14 * total)
-        score = squares / (data.size - min(_CAUTION * float(used), 0.9 * data.size)) ** 2
-        if best is None or score < best[0]:
-            best = score, weights, smooth
-    if best is None:
-        raise AssertionError("there is always a first strength of smoothing")
-    return best[1], best[2], best[1] > 0
+        tried.append((squares / (data.size - min(_CAUTION * float(used), 0.9 * data.size)) ** 2, weights, smooth))
+    return min(tried, key=lambda t: t[0])[1:]
 
 
-def _covariance(
-    pair: Forward,
-    columns: Array,
-    residual: Array,
-    kernel: Array,
-    gain: float,
-    moves: dict[str, float],
-    free: Mask,
-    smooth: Array,
-) -> Array:
-    """Covariance of the profile's values `[knots, knots]`; 0 where a value is held at 0."""
-    tall = (columns - columns.mean(axis=1, keepdims=True))[free].T
-    plain = pair.covariance(tall, residual, kernel, gain, moves)
-    bread, normal = inverse(tall.T @ tall + smooth[np.ix_(free, free)]), tall.T @ tall
-    # the penalty shrinks the response to noise: bread_smooth normal [cov] normal bread_smooth
-    shrink = bread @ normal
-    covariance = np.zeros((free.size, free.size))
-    covariance[np.ix_(free, free)] = shrink @ np.where(np.isfinite(plain), plain, 0.0) @ shrink.T
-    return covariance
+def size_of_profile(solution: Solution) -> tuple[float, float]:
+    """Rms radius of a free profile and its standard error, px: its second moment is linear in its values."""
+    values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
+    r = np.linspace(0, radius, 64 * values.size + 1)
+    place = r / radius * (values.size - 1)
+    hats = np.clip(1 - np.abs(place[None, :] - np.arange(values.size)[:, None]), 0, None)
+    light, moment = hats @ r, hats @ r**3
+    rms = float(np.sqrt(moment @ values / (light @ values)))
+    # of a quotient: the total light is part of both
+    slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
+    return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))

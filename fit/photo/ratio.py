@@ -2,72 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchdof.validation import show
-
 from ..problems import FitError
-from ..result import Array, Indices
-from ..validation import a_number, a_picture
+from ..result import Array, BlurFit, Indices
+from ..validation import a_picture
 from .dot import find_dot
+from .profile_fit import fit_profile
 
-__all__ = ["blur_strength", "polar_samples"]
+__all__ = ["blur_strength", "fit_ratio"]
 
 _SMALLEST = 5  # px: noise is taken from second differences of second differences
+_STEP_DEG = 10
 
 
-def polar_samples(
-    picture: ArrayLike, centre: tuple[float, float], radius: float, *, step_deg: float = 10.0, spacing: float = 1.0
-) -> tuple[Array, Array, Array]:
-    """Levels of a picture along spokes around a point.
-
-    Args:
-        picture: `[H, W]`.
-        centre: (x, y) in px; the centre of pixel (0, 0) is (0, 0).
-        radius: length of the spokes in px.
-        step_deg: angle between spokes; the paper's is 10 degrees.
-        spacing: distance between samples along a spoke in px.
-
-    Returns:
-        Radii `[n]` in px, angles `[m]` in radians, and the levels `[m, n]`, bilinear between pixels.
-
-    Reference:
-        Sato, Dobashi, Yamamoto, section 2.
-
-    Example:
-        >>> import numpy as np
-        >>> r, theta, levels = polar_samples(np.ones((21, 21)), (10, 10), radius=5)
-        >>> len(r), len(theta), float(levels.mean())
-        (6, 36, 1.0)
-    """
-    from scipy.ndimage import map_coordinates
-
-    levels = a_picture("picture", picture, 1)
-    try:
-        x, y = (a_number("centre", c, -1e9, 1e9, unit="pixels") for c in centre)
-    except (TypeError, ValueError):
-        raise FitError(f"centre must be (x, y) in pixels, got {show(centre)}") from None
-    for name, value, most in (("radius", radius, 1e5), ("spacing", spacing, 1e5), ("step_deg", step_deg, 120.1)):
-        try:
-            a_number(name, value, 0.0, most)
-        except FitError:
-            got = f"got {show(radius)}, {show(spacing)}, {show(step_deg)}"
-            raise FitError(f"radius, spacing and step_deg must be positive, {got}") from None
-    if radius / spacing * 360 / step_deg > 1e7:
-        raise FitError(f"spacing and step_deg must give at most 10 million samples, got {spacing:g} and {step_deg:g}")
-    r = np.arange(0.0, radius + 1e-9, spacing)
-    theta = np.deg2rad(np.arange(0.0, 360.0 - 1e-9, step_deg))
-    columns = x + r[None, :] * np.cos(theta)[:, None]
-    rows = y + r[None, :] * np.sin(theta)[:, None]
-    levels = map_coordinates(levels, [rows, columns], order=1, mode="nearest")
-    return r, theta, np.asarray(levels, dtype=np.float64)
-
-
-def blur_strength(
-    sharp: ArrayLike, blurred: ArrayLike, *, step_deg: float = 10.0, spacing: float = 1.0
-) -> tuple[Array, Array, Indices]:
-    """`I_b(r, theta) / I(r, theta)` from the dot's centre to its circumference.
+def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
+    """`I_b(r, theta) / I(r, theta)` from the dot's centre to its circumference, every pixel of r and 10 degrees.
 
     The centre is the dot's in the sharp picture, as in the paper: a displaced defocused dot is not followed. What is
     measured is the dot convolved with the kernel, not the kernel, and it ends at the dot's circumference: use it to
@@ -76,27 +29,42 @@ def blur_strength(
     Args:
         sharp: `[H, W]`, linear light, the dot in focus.
         blurred: `[H, W]`, linear light, the same dot out of focus.
-        step_deg: angle between spokes.
-        spacing: distance between samples along a spoke in px.
 
     Returns:
-        Radii, strengths and the number of the spoke of each sample, all `[n]`.
+        Radii in px, strengths (levels are bilinear between pixels) and the number of the spoke of each sample, all
+        `[n]`.
 
     Raises:
-        FitError: no usable dot (see `find_dot`).
+        FitError: no usable dot.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 2.
+
+    Example:
+        >>> from torchdof.optics import psf
+        >>> dot = psf.disc(6.0, size=31).numpy()
+        >>> r, strength, spoke = blur_strength(dot, 0.5 * dot)
+        >>> round(float(r.max())), round(float(strength.mean()), 3), len(set(spoke.tolist()))
+        (5, 0.5, 36)
     """
+    from scipy.ndimage import map_coordinates
+
     still, moved = a_picture("sharp", sharp, _SMALLEST), a_picture("blurred", blurred, _SMALLEST)
     dot, soft = find_dot(still), find_dot(moved)
     # the last pixel of the dot is half paper
-    r, theta, below = polar_samples(
-        still, (dot.x, dot.y), max(dot.radius - 1.0, 1.0), step_deg=step_deg, spacing=spacing
-    )
-    above = polar_samples(moved, (dot.x, dot.y), float(r[-1]), step_deg=step_deg, spacing=spacing)[2]
+    r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)
+    theta = np.deg2rad(np.arange(0, 360, _STEP_DEG))[:, None]
+    where = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
+    below, above = (map_coordinates(p, where, order=1, mode="nearest") for p in (still, moved))
     below, above = below - dot.background, above - soft.background
     used = below > 0.2 * dot.peak
-    spokes = np.broadcast_to(np.arange(theta.size)[:, None], used.shape)
-    radii = np.broadcast_to(r[None, :], used.shape)
-    return radii[used], above[used] / below[used], spokes[used]
+    spokes, rays = np.nonzero(used)
+    return r[rays], above[used] / below[used], spokes
+
+
+def fit_ratio(sharp: Array | None, blurred: Array, family: str) -> BlurFit:
+    """The paper's procedure: a profile fitted to the blur strength, errors that a spoke has in common allowed for."""
+    if sharp is None:
+        raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
+    r, strength, spokes = blur_strength(sharp, blurred)
+    return replace(fit_profile(r, strength, family, groups=spokes), model="ratio")

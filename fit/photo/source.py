@@ -1,123 +1,234 @@
-"""What stands for the sharp dot in the forward model: its picture, an ideal dot, or a point of light."""
+"""What stands for the sharp dot in the forward model: its picture, an ideal dot fitted to it, or a point of light."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
-from ..result import Array
-from .dot import Dot, noise_of
-from .dot_model import STEPS, Edge, draw_edge
+from ..result import Array, Mask
+from ..solve import best_of, inverse
+from .dot import Dot, distance_from, inner_pixels, radial_mean
+from .noise import correlate, correlation_of, fine_variance, noise_beside, noise_of
 
-__all__ = ["IdealDot", "PictureOfDot", "Source", "point_source"]
+__all__ = ["UNFOCUSED_PX", "Edge", "Source", "ideal_dot", "picture_of_dot", "point_source", "soft_edge"]
+
+UNFOCUSED_PX = 1.0
+"""Sigma of an edge, px, above which it is out of focus: no camera leaves a softer one in focus."""
+
+_FOCUSED_PX = 0.5  # what a camera leaves on average: between a perfect lens and a demosaiced picture
+_STEPS = np.array([1e-2, 0.1])  # px of radius and softness, over which an edge's errors are passed on
+_FINE = 6  # samples across a pixel near the edge
 
 
-class Source(Protocol):
-    """A dot that can be drawn anywhere and at any size.
-
-    Attributes:
-        dot: where it is in the sharp picture.
-        noise: standard deviation of its pixels.
-        reach: radius in px beyond which it is dark.
-    """
-
-    @property
-    def dot(self) -> Dot: ...  # noqa: D102
-    @property
-    def noise(self) -> float: ...  # noqa: D102
-    @property
-    def reach(self) -> float: ...  # noqa: D102
-
-    def draw(self, rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
-        """Level of each pixel with the dot's centre at (x, y), magnified."""
-        ...
-
-    def variants(self) -> tuple[list[Source], Array]:
-        """The same dot one step off in each quantity that was fitted to it, and their covariance in those steps."""
-        ...
+Draw = Callable[[Array, Array, float, float, float], Array]
+"""From rows, columns, the centre (x, y) and the magnification of a dot to the level of each pixel."""
 
 
 @dataclass(frozen=True)
-class PictureOfDot:
-    """The dot as photographed, between its pixels by cubic splines."""
+class Source:
+    """What stands for the sharp dot; lengths in px."""
 
-    dot: Dot
-    noise: float
-    reach: float
-    spline: Array
-
-    @classmethod
-    def of(cls, picture: Array, dot: Dot) -> PictureOfDot:
-        """Cut the dot out of a picture: what lies farther than its reach is dark."""
-        from scipy.ndimage import spline_filter
-
-        rows, columns = np.indices(picture.shape)
-        reach = dot.reach + 2.0
-        inside = np.hypot(columns - dot.x, rows - dot.y) <= reach
-        return cls(
-            dot, noise_of(picture), reach, spline_filter(np.where(inside, picture - dot.background, 0.0), order=3)
-        )
-
-    def draw(self, rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
-        """See `Source`."""
-        from scipy.ndimage import map_coordinates
-
-        where = [(rows - y) / magnification + self.dot.y, (columns - x) / magnification + self.dot.x]
-        return np.asarray(map_coordinates(self.spline, where, order=3, prefilter=False), dtype=np.float64)
-
-    def variants(self) -> tuple[list[Source], Array]:
-        """None: its uncertainty is its pixels' noise."""
-        return [], np.zeros((0, 0))
+    x: float  # where it is in the sharp picture
+    y: float
+    radius: float  # of a uniform disc with the same second moment
+    reach: float  # beyond which it is dark
+    draw: Draw
+    noise: float = 0.0  # standard deviation of its pixels
+    variants: tuple[Draw, ...] = ()  # the same one step off in each quantity that was fitted to it
+    covariance: Array | None = None  # of those quantities, in those steps
 
 
-@dataclass(frozen=True)
-class IdealDot:
-    """A soft disc fitted to the photographed dot: no noise of its own, and exact at any place and size."""
-
-    dot: Dot
-    edge: Edge
-    noise: float = 0.0
-
-    @classmethod
-    def of(cls, dot: Dot, edge: Edge) -> IdealDot:
-        """The ideal dot with a fitted edge."""
-        return cls(replace(dot, x=edge.x, y=edge.y, radius=edge.radius, background=0.0, peak=1.0, noise=0.0), edge)
-
-    @property
-    def reach(self) -> float:
-        """Radius in px beyond which it is dark."""
-        return self.edge.radius + 5 * self.edge.softness + 1.0
-
-    def draw(self, rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
-        """See `Source`. The softness is the sensor's, not the print's: it does not grow with the dot."""
-        softness = self.edge.softness
-        square = magnification**2 * (self.edge.radius**2 + softness**2) - softness**2  # as the light of a soft disc
-        return self.edge.level * draw_edge(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
-
-    def variants(self) -> tuple[list[Source], Array]:
-        """A little more radius, and more softness."""
-        moved = [
-            replace(self.edge, radius=self.edge.radius + STEPS["radius"]),
-            replace(self.edge, softness=self.edge.softness + STEPS["softness"]),
-        ]
-        steps = np.array([STEPS["radius"], STEPS["softness"]])
-        covariance = np.where(np.isfinite(self.edge.covariance), self.edge.covariance, 0.0) / np.outer(steps, steps)
-        return [replace(self, edge=e) for e in moved], covariance
+def picture_of_dot(picture: Array, dot: Dot) -> Source:
+    """The dot as photographed `[H, W]`, between its pixels by cubic splines; what lies beyond its reach is dark."""
+    reach = dot.reach + 2.0
+    inside = distance_from(dot, picture.shape) <= reach
+    draw = _drawn_by_splines(np.where(inside, picture - dot.background, 0.0), dot.x, dot.y)
+    return Source(dot.x, dot.y, dot.radius, reach, draw, noise_of(picture))
 
 
-def point_source(shape: tuple[int, ...], dot: Dot) -> PictureOfDot:
+def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
     """A point of light at the pixel nearest to a blurred dot's centre, blurred as the integral over a pixel is.
 
     Kernels hold the optical blur alone; the pixel's own, a variance of 1/12 px^2 along each axis, is the source's.
     """
-    from scipy.ndimage import convolve1d, spline_filter
+    from scipy.ndimage import convolve1d
 
     x, y = int(round(dot.x)), int(round(dot.y))
     picture = np.zeros(shape)
     picture[y, x] = 1.0
     for axis in (0, 1):
         picture = convolve1d(picture, np.array([1.0, 22.0, 1.0]) / 24.0, axis)
-    point = Dot(float(x), float(y), 0.0, 1.0, 0.0, 1.0, 0.0, 1.0)
-    return PictureOfDot(point, 0.0, 4.0, spline_filter(picture, order=3))
+    return Source(x, y, 0.0, 4.0, _drawn_by_splines(picture, x, y))
+
+
+def _drawn_by_splines(picture: Array, x: float, y: float) -> Draw:
+    from scipy.ndimage import map_coordinates, spline_filter
+
+    spline = spline_filter(picture, order=3)
+
+    def draw(rows: Array, columns: Array, there_x: float, there_y: float, magnification: float) -> Array:
+        where = [(rows - there_y) / magnification + y, (columns - there_x) / magnification + x]
+        return np.asarray(map_coordinates(spline, where, order=3, prefilter=False), dtype=np.float64)
+
+    return draw
+
+
+def ideal_dot(edge: Edge) -> Source:
+    """A soft disc fitted to the photographed dot: no noise of its own, and exact at any place and size.
+
+    Softer than any camera in focus leaves it, it is drawn as it would be in focus. The softness is the sensor's, not
+    the print's: it does not grow with the dot.
+    """
+    edge = edge.with_softness(_FOCUSED_PX) if edge.softness > UNFOCUSED_PX else edge
+
+    def drawn(radius: float, softness: float) -> Draw:
+        def draw(rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
+            square = magnification**2 * (radius**2 + softness**2) - softness**2  # as the light of a soft disc
+            return edge.level * _coverage(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
+
+        return draw
+
+    return Source(
+        edge.x,
+        edge.y,
+        edge.radius,
+        edge.radius + 5 * edge.softness + 1.0,
+        drawn(edge.radius, edge.softness),
+        variants=(drawn(edge.radius + _STEPS[0], edge.softness), drawn(edge.radius, edge.softness + _STEPS[1])),
+        covariance=np.where(np.isfinite(edge.covariance), edge.covariance, 0.0) / np.outer(_STEPS, _STEPS),
+    )
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Where a dot ends, and how softly: a uniform disc with a soft edge, integrated over the pixels; lengths in px."""
+
+    x: float
+    y: float
+    radius: float  # where the level is half
+    softness: float  # sigma of the edge beyond the pixel's own
+    level: float  # of the dot above its background
+    exponent: float  # 1 in linear light; of the edge's levels, where it was fitted
+    covariance: Array  # of radius and softness [2, 2]
+    rms: float  # of what the ideal dot does not explain, over the dot's peak
+    misfit: float  # the same over the noise expected there
+    # by how much of its level the edge's upper half is brighter than its pixels' coverage, and the lower darker: an
+    # S-curve spreads the levels of half-covered pixels apart; no blur does: it brings them together
+    steepness: float
+    steepness_error: float
+    shot_noise: float  # by how much the variance of a pixel's noise grows from the paper to the dot
+
+    def with_softness(self, softness: float) -> Edge:
+        """The edge of the same dot through another blur: its light, pi (radius^2 + softness^2), stays."""
+        square = self.radius**2 + self.softness**2 - softness**2
+        return replace(self, radius=float(np.sqrt(max(square, 0.0))), softness=softness)
+
+
+def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_exponent: bool = False) -> Edge:
+    """Fit a soft disc to a dot in a picture `[H, W]`; pixels at `white` or above may be brighter than they look.
+
+    With `fit_exponent` levels are a power of the light. A round white dot has as much light missing inside its edge as
+    there is outside; encoding (a power of about 0.45) breaks that balance and so shows itself.
+    """
+    grid = np.indices(picture.shape).astype(np.float64)
+    near = distance_from(dot, picture.shape) <= dot.reach + 3
+    rows, columns, levels = grid[0][near], grid[1][near], (picture[near] - dot.background) / dot.peak
+    top = np.inf if white is None else (white - dot.background) / dot.peak
+
+    def model(p: Array) -> Array:
+        dx, dy, radius, softness, level = p[:5]
+        coverage = _coverage(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
+        return np.minimum(level * (coverage ** p[5] if fit_exponent else coverage), top)
+
+    def jacobian(p: Array) -> Array:
+        slopes = []
+        for i, h in enumerate((1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-4)[: len(p)]):
+            up, down = p.copy(), p.copy()
+            up[i], down[i] = up[i] + h, max(down[i] - h, 0.0) if i > 1 else down[i] - h
+            slopes.append((model(up) - model(down)) / (up[i] - down[i]))
+        return np.stack(slopes, axis=1)
+
+    bounds = ([-3, -3, 0.2, 0.0, 0.3], [3, 3, dot.reach + 3, dot.reach + 3, 30.0])
+    starts = [[0, 0, dot.radius, 0.4, 1.0], [0, 0, dot.radius, 0.3 * dot.radius + 0.1, 1.1]]
+    if fit_exponent:
+        bounds = [*bounds[0], 0.2], [*bounds[1], 3.0]
+        starts = [[0, 0, dot.radius - 0.4, s, 1.0, 0.45] for s in (0.1, 0.6, 1.5)]
+    solution = best_of(model, levels, starts, bounds, jacobian=jacobian, tolerance=1e-7)
+    drawn = model(solution)
+    residual, slope = levels - drawn, jacobian(solution)
+    # a soft edge shows by its variance: a step that is finite has a slope even where the softness is 0
+    for i, h in zip((2, 3), _STEPS, strict=True):
+        moved = solution.copy()
+        moved[i] += h
+        slope[:, i] = (model(moved) - drawn) / h
+    freedom = max(levels.size - len(solution), 1)
+    variance = float(residual @ residual) / freedom
+    inside = inner_pixels(picture, dot)
+    shot_noise = 0.0 if inside is None else max(fine_variance(picture, inside) - dot.noise**2, 0.0)
+    fine = noise_beside(picture, dot.background, ~near)[1]
+    expected = float(np.sqrt(np.mean(dot.noise**2 + shot_noise * np.clip(levels, 0, 1)) / fine)) / dot.peak
+    coverage = _coverage(rows, columns, dot.x + solution[0], dot.y + solution[1], solution[2], solution[3])
+    steepness, steepness_error = _steepness(residual / solution[4], coverage)
+    centre = replace(dot, x=dot.x + float(solution[0]), y=dot.y + float(solution[1]))
+    covariance = _covariance(slope, residual, near, distance_from(centre, picture.shape)) * levels.size / freedom
+    return Edge(
+        x=centre.x,
+        y=centre.y,
+        radius=float(solution[2]),
+        softness=float(solution[3]),
+        level=float(solution[4]) * dot.peak,
+        exponent=float(solution[5]) if fit_exponent else 1.0,
+        covariance=covariance[2:4, 2:4],
+        rms=float(np.sqrt(variance)),
+        misfit=float(np.sqrt(variance)) / expected if expected > 0 else np.inf,
+        steepness=steepness,
+        steepness_error=steepness_error,
+        shot_noise=shot_noise,
+    )
+
+
+def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:
+    """Level, 0 to 1, of a soft disc in each pixel, integrated over it."""
+    from scipy.special import erfc
+
+    distance = np.hypot(columns - x, rows - y)
+    level = (distance < radius).astype(np.float64)
+    # within the fine grid's own step an edge is soft anyway
+    sigma = max(softness, 0.3 / _FINE)
+    band = np.abs(distance - radius) < 0.75 + 5 * sigma
+    step = (np.arange(_FINE) + 0.5) / _FINE - 0.5
+    fine = np.hypot(
+        (columns[band] - x)[:, None, None] + step[None, None, :], (rows[band] - y)[:, None, None] + step[None, :, None]
+    )
+    level[band] = (0.5 * erfc((fine - radius) / (np.sqrt(2) * sigma))).mean((1, 2))
+    return level
+
+
+def _covariance(slope: Array, residual: Array, near: Mask, distance: Array) -> Array:
+    """Covariance of a fit's parameters, from slopes and residual of the pixels `near`.
+
+    A mosaic errs at the edge far more than within the dot, and noise that goes together in neighbours does not average
+    out along the edge.
+    """
+    shown = np.zeros(near.shape)
+    shown[near] = residual
+    rings, _ = radial_mean(shown**2, distance)
+    deviation = np.sqrt(rings)[np.minimum(np.floor(distance + 0.5).astype(np.int64), rings.size - 1)]
+    pictures = np.zeros((slope.shape[1], *near.shape))
+    pictures[:, near] = deviation[near] * slope.T
+    correlation = correlation_of(shown / np.maximum(deviation, np.finfo(float).tiny), near)
+    together = deviation[near] * correlate(pictures, correlation)[:, near]
+    bread = inverse(slope.T @ slope)
+    bread = np.where(np.isfinite(bread), bread, 0.0)
+    return np.asarray(bread @ (slope.T @ together.T) @ bread)
+
+
+def _steepness(residual: Array, coverage: Array) -> tuple[float, float]:
+    """Steepness of an edge and its error, from what a soft disc leaves of the levels of pixels so far covered."""
+    low, high = (coverage > 0.02) & (coverage < 0.4), (coverage > 0.6) & (coverage < 0.98)
+    if min(low.sum(), high.sum()) < 8:
+        return 0.0, np.inf
+    error = np.sqrt(sum(float(residual[side].var(ddof=1)) / side.sum() for side in (low, high)))
+    return float(residual[high].mean() - residual[low].mean()), float(error)

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import datetime
 import math
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from torchdof.optics.aperture import Aperture
 from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
 
-from ..problems import ExposureWarning, FitError, FitWarning, SingleDistanceWarning, warn
+from ..problems import FitError, unheard, warn
 from ..result import Array, BlurFit
-from .agreement import check_agreement, frame_width, promised_px
+from ..validation import a_choice
+from .agreement import check_agreement
+from .captures import CAMERA, Capture, Captures
 from .colours import Colour, fit_colours
 from .distances import counted, fit_distances, fit_one, fit_openings
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
-from .manifest import Capture, Captures
 
 __all__ = ["TableFit", "fit_captures", "fit_table"]
 
@@ -55,19 +54,11 @@ class TableFit:
     colours: tuple[Colour, ...] = ()
 
 
-def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **options: Any) -> BlurTable:
+def fit_table(captures: Captures, family: str = "auto", **options: Any) -> BlurTable:
     """The blur table of a camera from photographs of a dot at one or more distances: `fit_captures(...).table`.
 
-    Args:
-        captures: from `read_captures`, or made of arrays.
-        family: "auto", or one of the families of `fit_pair`.
-        **options: see `fit_captures`.
-
-    Returns:
-        A table in mm of the sensor where its width is known, else in fractions of the frame's width.
-
-    Raises:
-        FitError: see `fit_captures`.
+    Arguments and errors are those of `fit_captures`. The table is in mm of the sensor where its width is known, else in
+    fractions of the frame's width.
 
     Example:
         >>> import torch
@@ -80,11 +71,6 @@ def fit_table(captures: Captures | Sequence[Capture], family: str = "auto", **op
         >>> fit_table(Captures((near, far), focus_m=1.0, width_px=1000), "disc")
         BlurTable('unnamed', disc, 2 nodes)
     """
-    if not isinstance(captures, Captures):
-        raise FitError(
-            "captures must be a Captures(pairs, focus_m=..., width_px=...), which knows the focus and the frame's "
-            f"width; got {type(captures).__name__}"
-        )
     return fit_captures(captures, family, **options).table
 
 
@@ -124,51 +110,52 @@ def fit_captures(
         The table and its fits.
 
     Raises:
-        FitError: a pair cannot be fitted; the message names its file.
-        CameraError: the fitted blur is far from what the camera's numbers promise.
-
-    Warns:
-        SingleDistanceWarning: one distance only; the thin lens scales it.
-        CameraWarning: the fitted blur differs from what the camera's numbers promise.
-        ExposureWarning: a fitted gain contradicts the stated exposures.
-        FitWarning: what `fit_pair` warns about.
+        FitError: a pair cannot be fitted; the message names its file. Of kind "camera" where the fitted blur is far
+            from what the camera's numbers promise. It warns where that differs less, where a fitted gain contradicts
+            the stated exposures, of a single distance, and of what `fit_pair` warns about.
     """
     if not isinstance(captures, Captures):
-        raise FitError(f"captures must be a Captures(pairs, focus_m=..., width_px=...), got {show(captures)}")
-    if not isinstance(family, str) or family not in (*SHAPES, "auto"):
-        raise FitError(f"family must be 'auto' or one of {', '.join(SHAPES)}, got {show(family)}")
-    pairs = list(captures)
+        raise FitError(
+            "captures must be a Captures(pairs, focus_m=..., width_px=...), which knows the focus and the frame's "
+            f"width; got {show(captures)}"
+        )
+    a_choice("family", family, ("auto", *SHAPES))
+    pairs = captures.pairs
     twice = family == "auto" or family in OPENINGS
     total, done = len(pairs) * (2 if twice else 1), 0
+
+    def report(pair: Capture) -> None:
+        nonlocal done
+        done += 1
+        if progress:
+            progress(done, total, f"{pair.distance_m:g} m")
+
+    def kept(pair: Capture, fit: BlurFit) -> None:
+        _check_exposure(pair, fit)
+        report(pair)
+
     why, firsts, opening = f"family {family!r} was asked for", list[BlurFit](), None
-    if twice:
-        firsts = _first_fits(pairs, captures.focus_m, family, accuracy_db, progress, total)
-        done = len(pairs)
+    if twice:  # every pair by itself, which tells the family, or the lens's opening; the fit that is kept will warn
+        for pair in pairs:
+            with unheard():
+                firsts.append(fit_one(pair, captures.focus_m, family, accuracy_db=accuracy_db))
+            report(pair)
     if family == "auto":
         # the richest family that any distance needs serves all
         needs_most = max(range(len(pairs)), key=lambda i: _ORDER.index(firsts[i].family))
         family = firsts[needs_most].family
         why = f"{family}, for {pairs[needs_most].distance_m:g} m: {firsts[needs_most].why}"
-
-    def report(pair: Capture, fit: BlurFit) -> None:
-        nonlocal done
-        _check_exposure(pair, fit)
-        done += 1
-        if progress:
-            progress(done, total, f"{pair.distance_m:g} m")
-
     if family in OPENINGS:
-        ordered, opening = fit_openings(pairs, captures.focus_m, family, firsts, report)
+        fits, opening = fit_openings(captures, family, firsts, kept)
     else:
-        ordered = fit_distances(pairs, captures.focus_m, family, smooth, report)
-    ordered = [counted(pair, captures.focus_m, fit) for pair, fit in zip(pairs, ordered, strict=True)]
-    radius_px = [f.radius for f in ordered]
-    captures = replace(captures, width_px=frame_width(captures, radius_px))
+        fits = fit_distances(captures, family, smooth, kept)
+    fits = [counted(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
+    radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)
     coc_px, scale = _keys(captures, radius_px, scale_of)
-    params, colours = _params(ordered, family), tuple[Colour, ...]()
+    params, colours = _params(fits, family), tuple[Colour, ...]()
     if all(pair.colours is not None for pair in pairs):
-        colours = fit_colours(pairs, ordered, captures.focus_m, family, opening)
+        colours = fit_colours(captures, fits, family, opening)
         each = [_params(colour.fits, family) for colour in colours]
         params = {n: np.stack([p[n] for p in each]) for n in params}
     if len(pairs) == 1:
@@ -176,114 +163,13 @@ def fit_captures(
             f"one distance was measured ({pairs[0].distance_m:g} m); the thin lens scales it to all others, and the "
             "other side of focus mirrors it"
         )
-        warn(SingleDistanceWarning(text, file=pairs[0].files[1], number=pairs[0].distance_m))
-    return TableFit(
-        table=_table(captures, ordered, coc_px, params, family, opening, scale, command, why, colours),
-        fits=tuple(ordered),
-        coc_px=tuple(coc_px),
-        why=why,
-        scale=scale,
-        coc_per_dioptre_px=coc_px[0] / (1 / captures.focus_m - 1 / pairs[0].distance_m),
-        colours=colours,
-    )
-
-
-def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
-    """Parameters of a table of these fits by name, px: `[N]`, and `values` `[N, P]`."""
-    radius = np.array([float(f.params.get("radius", 0.0)) for f in fits])
-    if family == "radial":
-        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
-        values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
-        return {"values": values, "radius": radius}
-    if family in OPENINGS:
-        return {"radius": radius}
-    return {n: np.array([float(f.params[n]) for f in fits]) for n in FAMILIES[family]}
-
-
-def _first_fits(
-    pairs: list[Capture],
-    focus_m: float,
-    family: str,
-    accuracy_db: float,
-    progress: Callable[[int, int, str], None] | None,
-    total: int,
-) -> list[BlurFit]:
-    """Every pair by itself, which tells the family, or the lens's opening."""
-    fits = []
-    for i, pair in enumerate(pairs):
-        with warnings.catch_warnings():
-            # the fit that is kept says what there is to say
-            warnings.simplefilter("ignore", FitWarning)
-            fits.append(fit_one(pair, focus_m, family, None, accuracy_db))
-        if progress:
-            progress(i + 1, total, f"{pair.distance_m:g} m")
-    return fits
-
-
-def _check_exposure(pair: Capture, fit: BlurFit) -> None:
-    """Warn where a fitted gain contradicts the stated exposures."""
-    if pair.exposure is None or not fit.gain > 0:
-        return
-    off = fit.gain / pair.exposure
-    if max(off, 1 / off) > _EXPOSED:
-        text = (
-            f"the blurred dot is {off:.2f} times as bright as the exposures say; is the image linear, and did the "
-            "light stay the same?"
-        )
-        warn(ExposureWarning(text, file=pair.files[1], number=off), stacklevel=4)
-
-
-def _keys(captures: Captures, radius_px: list[float], scale_of: TableFit | None) -> tuple[list[float], str]:
-    """Signed circle of confusion of each pair in px of the frame, and where its scale is from."""
-    promised = promised_px(captures)
-    if promised is not None:
-        return promised, "camera"
-    defocus = np.array([1 / captures.focus_m - 1 / p.distance_m for p in captures])
-    if scale_of is not None:
-        return [float(scale_of.coc_per_dioptre_px * d) for d in defocus], scale_of.scale
-    factor = float(np.abs(defocus) @ np.array(radius_px) / (defocus @ defocus))
-    return [float(factor * d) for d in defocus], "measured"
-
-
-def _table(
-    captures: Captures,
-    fits: list[BlurFit],
-    coc_px: list[float],
-    params: dict[str, Array],
-    family: str,
-    opening: Aperture | None,
-    scale: str,
-    command: str,
-    why: str,
-    colours: tuple[Colour, ...],
-) -> BlurTable:
-    """The blur table of the fits, in mm of the sensor where its width is known, with its provenance."""
+        warn(text, "single distance", file=pairs[0].files[1], number=pairs[0].distance_m)
+    provenance = _provenance(captures, fits, colours) | {"coc_from": scale, "family_because": why, "command": command}
     sensor = captures.sensor_width_mm
     unit = captures.width_px if sensor is None else captures.width_px / sensor
-    provenance = {
-        "source": "photographs of a dot",
-        "date": datetime.date.today().isoformat(),
-        "command": command,
-        "focus_m": captures.focus_m,
-        "distances_m": [p.distance_m for p in captures],
-        "coc_from": scale,
-        "width_px": captures.width_px,
-        "family_because": why,
-        "residual_over_noise": [round(f.residual_over_noise, 3) for f in fits if math.isfinite(f.residual_over_noise)],
-        "asymmetry": [round(f.asymmetry, 4) for f in fits],
-        **dict(captures.notes),
-    }
-    if colours:
-        provenance["colours"] = [c.name for c in colours]
-        shifts = [c.focus_shift_dioptres for c in colours]
-        provenance["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
-        provenance["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
-    for name in ("focal_length_mm", "f_number", "sensor_width_mm"):
-        if getattr(captures, name) is not None:
-            provenance[name] = getattr(captures, name)
-    return BlurTable(
+    table = BlurTable(
         family if opening is None else "disc",
-        [c / unit for c in coc_px],
+        (coc_px / unit).tolist(),
         {k: (v / unit if k in LENGTHS else v).tolist() for k, v in params.items()},
         unit="fraction" if sensor is None else "mm",
         sensor_width_mm=sensor,
@@ -292,3 +178,58 @@ def _table(
         residual=[round(f.residual, 6) for f in fits],
         aperture=opening,
     )
+    per_dioptre = float(coc_px[0] / captures.defocus[0])
+    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, per_dioptre, colours)
+
+
+def _check_exposure(pair: Capture, fit: BlurFit) -> None:
+    """Warn where a fitted gain contradicts the stated exposures."""
+    off = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
+    if max(off, 1 / off) > _EXPOSED:
+        text = (
+            f"the blurred dot is {off:.2f} times as bright as the exposures say; is the image linear, and did the "
+            "light stay the same?"
+        )
+        warn(text, "exposure", file=pair.files[1], number=off)
+
+
+def _keys(captures: Captures, radius_px: Array, scale_of: TableFit | None) -> tuple[Array, str]:
+    """Signed circle of confusion of each pair in px of the frame, and where its scale is from."""
+    promised, defocus = captures.promised_px, captures.defocus
+    if promised is not None:
+        return promised, "camera"
+    if scale_of is not None:
+        return scale_of.coc_per_dioptre_px * defocus, scale_of.scale
+    return float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
+
+
+def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
+    """Parameters of a table of these fits by name, px: `[N]`, and `values` `[N, P]`."""
+    if family == "radial":
+        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
+        radius = np.array([float(f.params["radius"]) for f in fits])
+        values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
+        return {"values": values, "radius": radius}
+    names = ("radius",) if family in OPENINGS else FAMILIES[family]
+    return {n: np.array([float(f.params[n]) for f in fits]) for n in names}
+
+
+def _provenance(captures: Captures, fits: Sequence[BlurFit], colours: Sequence[Colour]) -> dict[str, Any]:
+    """Where a table of these fits comes from."""
+    ratios = [f.residual_over_noise for f in fits]
+    known = {
+        "source": "photographs of a dot",
+        "date": datetime.date.today().isoformat(),
+        "focus_m": captures.focus_m,
+        "distances_m": captures.distances_m.tolist(),
+        "width_px": captures.width_px,
+        "residual_over_noise": [round(ratio, 3) for ratio in ratios if math.isfinite(ratio)],
+        "asymmetry": [round(f.asymmetry, 4) for f in fits],
+        **dict(captures.notes),
+    }
+    if colours:
+        shifts = [c.focus_shift_dioptres for c in colours]
+        known["colours"] = [c.name for c in colours]
+        known["focus_shift_dioptres"] = [round(s, 5) if math.isfinite(s) else None for s in shifts]
+        known["lateral_px"] = [[[round(v, 3) for v in xy] for xy in c.lateral_px] for c in colours]
+    return known | {name: getattr(captures, name) for name in CAMERA if getattr(captures, name) is not None}

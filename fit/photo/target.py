@@ -9,16 +9,17 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from torchdof.io.atomic import whole_file
 
-from ..problems import DotNotFoundError, FitError
+from ..problems import FitError
 from ..result import Array, Mask
+from ..validation import a_choice
 
 __all__ = ["DOT_MM", "SQUARE_MM", "Paper", "Target", "find_target", "write_target"]
 
@@ -30,23 +31,13 @@ SQUARE_MM = 100.0
 DOT_MM = 5.0
 """Diameter of the white dot in its middle, mm."""
 
-_PAGE_MM = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
-_POINTS = 72 / 25.4  # PDF points a mm
 _SEARCHED_PX = 500  # width of the copy in which the square is looked for
 _LEVELS = np.linspace(0.1, 0.75, 14)  # of the way from dark to bright
 _SMALLEST, _LARGEST = 0.004, 0.6  # share of the frame that the square may take
-_INSTRUCTIONS = (
-    "torchdof: measure the blur of your camera (docs/phone.md)",
-    "1. Print at 100 %. The line above must measure 100 mm; if not, add --square-mm with what the square measures.",
-    "2. Fix it flat, evenly lit, without shadows or gloss. Photograph it square on, with a tripod if you have one.",
-    "3. Lock focus and exposure on the nearest distance at which the dot is sharp; on a phone press and hold on it.",
-    "4. Take one sharp picture, then five to nine more from farther away (and nearer), without refocusing, no zoom.",
-    "5. Put the pictures as they are into one folder:   torchdof fit FOLDER -o my-phone.json",
-)
 
 
 def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
-    """Write the target as a PDF of one page, to be printed at 100 %.
+    """Write the target, which lies beside this file, as a PDF of one page, to be printed at 100 %.
 
     Args:
         path: ends in .pdf.
@@ -66,93 +57,30 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
     target = Path(path)
     if target.suffix.lower() != ".pdf":
         raise FitError(f"the target is written as PDF: name it {target.with_suffix('.pdf')}", file=str(path))
-    if paper not in _PAGE_MM:
-        raise FitError(f"paper must be one of {', '.join(_PAGE_MM)}, got {paper!r}")
-    width, height = _PAGE_MM[paper]
-    left, bottom = (width - SQUARE_MM) / 2, height - 55.0 - SQUARE_MM
-    x, y = width / 2, bottom + SQUARE_MM / 2
-    drawn = [
-        f"{_POINTS:.6f} 0 0 {_POINTS:.6f} 0 0 cm 0 g",
-        f"{left} {bottom} {SQUARE_MM} {SQUARE_MM} re f",
-        f"1 g {_circle(x, y, DOT_MM / 2)} f 0 g 0.2 w",
-        f"{left} {bottom - 22} m {left + 100} {bottom - 22} l S",
-        *(f"{left + end} {bottom - 24} m {left + end} {bottom - 20} l S" for end in (0, 100)),
-        f"BT /F 3.6 Tf {left + 43} {bottom - 27} Td (100 mm) Tj ET",
-    ]
-    drawn += [f"BT /F 3.2 Tf 18 {bottom - 38 - 7 * i} Td ({line}) Tj ET" for i, line in enumerate(_lines())]
-    content = "\n".join(drawn).encode("ascii")
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width * _POINTS:.2f} {height * _POINTS:.2f}] "
-        "/Resources << /Font << /F 5 0 R >> >> /Contents 4 0 R >>".encode("ascii"),
-        b"<< /Length %d >>\nstream\n%s\nendstream" % (len(content), content),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-    ]
-    written, places = b"%PDF-1.4\n", []
-    for number, body in enumerate(objects, start=1):
-        places.append(len(written))
-        written += b"%d 0 obj\n%s\nendobj\n" % (number, body)
-    table = b"".join(b"%010d 00000 n \n" % place for place in places)
-    end = b"xref\n0 %d\n0000000000 65535 f \n%strailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n"
+    a_choice("paper", paper, get_args(Paper))
+    page = Path(__file__).with_name(f"target-{paper}.pdf").read_bytes()
     with whole_file(target) as temporary:
-        Path(temporary).write_bytes(written + end % (len(objects) + 1, table, len(objects) + 1, len(written)))
-
-
-def _lines() -> list[str]:
-    """Instructions in lines that fit the page, as PDF wants them."""
-    lines = []
-    for text in _INSTRUCTIONS:
-        words, line = text.split(" "), ""
-        for word in words:
-            if len(line) + len(word) > 105:
-                lines.append(line)
-                line = "    "
-            line += word + " "
-        lines.append(line.rstrip())
-    return [line.replace("(", r"\(").replace(")", r"\)") for line in lines]
-
-
-def _circle(x: float, y: float, radius: float) -> str:
-    """A circle as four Bezier curves."""
-    k = 4 / 3 * (math.sqrt(2) - 1) * radius
-    r = radius
-    return (
-        f"{x + r} {y} m {x + r} {y + k} {x + k} {y + r} {x} {y + r} c {x - k} {y + r} {x - r} {y + k} {x - r} {y} c "
-        f"{x - r} {y - k} {x - k} {y - r} {x} {y - r} c {x + k} {y - r} {x + r} {y - k} {x + r} {y} c"
-    )
+        Path(temporary).write_bytes(page)
 
 
 @dataclass(frozen=True)
 class Target:
-    """The target in a photograph.
+    """The target in a photograph."""
 
-    Attributes:
-        x: middle of the square, px.
-        y: the same, downwards.
-        side_px: the square's side.
-        elongation: longer over shorter side; above 1 the camera looked at an angle.
-        white: level of the paper around the square.
-        black: level of the square.
-    """
-
-    x: float
-    y: float
+    x: float  # middle of the square, px
+    y: float  # the same, downwards
     side_px: float
-    elongation: float
-    white: float
-    black: float
+    elongation: float  # longer over shorter side; above 1 the camera looked at an angle
+    white: float  # level of the paper around the square
+    black: float  # level of the square
 
 
 def find_target(light: Array, *, file: str | None = None) -> Target:
-    """Find the black square on its white paper.
-
-    Args:
-        light: `[H, W]`, linear light.
-        file: named in errors.
+    """Find the black square on its white paper in a picture `[H, W]` in linear light.
 
     Raises:
-        DotNotFoundError: there is no dark square with something bright in its middle and bright paper around.
+        FitError: of kind "no dot" where there is no dark square with something bright in its middle and bright paper
+            around.
     """
     step = max(1, round(light.shape[1] / _SEARCHED_PX))
     rows, columns = (n // step for n in light.shape)
@@ -165,15 +93,14 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
             if best is None or contrast > best[0]:
                 best = contrast, candidate
     if best is None:
-        raise DotNotFoundError(
+        text = (
             "no target found: a black square with a white dot in its middle, white paper around it, all in the frame; "
-            "is it evenly lit, square on and not too small?",
-            file=file,
+            "is it evenly lit, square on and not too small?"
         )
+        raise FitError(text, "no dot", file=file)
     rough = best[1]
-    return _refined(light, Target(
-        (rough.x + 0.5) * step - 0.5, (rough.y + 0.5) * step - 0.5, rough.side_px * step, 1.0, rough.white, rough.black
-    ))  # fmt: skip
+    x, y = ((v + 0.5) * step - 0.5 for v in (rough.x, rough.y))
+    return _refined(light, replace(rough, x=x, y=y, side_px=rough.side_px * step))
 
 
 def _squares(small: Array, dark: Mask) -> Sequence[Target]:
@@ -196,7 +123,7 @@ def _squares(small: Array, dark: Mask) -> Sequence[Target]:
         if abs(area / (12 * math.sqrt(max(float(np.linalg.det(covariance)), 1e-9))) - 1) > 0.06:
             continue
         side = math.sqrt(area)
-        target = Target(left + float(x.mean()), top + float(y.mean()), side, 1.0, 0.0, 0.0)
+        target = Target(left + float(x.mean()), top + float(y.mean()), side, elongation=1.0, white=0.0, black=0.0)
         distance = _square_distance(small.shape, target)
         ring = small[(distance > 1.12) & (distance < 1.2)]
         inside = small[(distance > 0.4) & (distance < 0.85)]
@@ -205,7 +132,7 @@ def _squares(small: Array, dark: Mask) -> Sequence[Target]:
             continue
         white, black = float(np.median(ring)), float(np.median(inside))
         if white > 2.5 * black and float(middle.max()) - black > max(0.05 * (white - black), 4 * float(inside.std())):
-            found.append(Target(target.x, target.y, side, 1.0, white, black))
+            found.append(replace(target, white=white, black=black))
     return found
 
 
@@ -223,7 +150,7 @@ def _refined(light: Array, rough: Target) -> Target:
         half = int(0.62 * target.side_px) + 2
         top, left = max(round(target.y) - half, 0), max(round(target.x) - half, 0)
         crop = light[top : round(target.y) + half + 1, left : round(target.x) + half + 1]
-        here = Target(target.x - left, target.y - top, target.side_px, 1.0, target.white, target.black)
+        here = replace(target, x=target.x - left, y=target.y - top)
         distance = _square_distance(crop.shape, here)
         paper, ink = (distance > 1.12) & (distance < 1.22), (distance > 0.5) & (distance < 0.85)
         rows, columns = np.indices(crop.shape)
@@ -239,9 +166,6 @@ def _refined(light: Array, rough: Target) -> Target:
             math.sqrt(12 * float((share * (axis - middle) ** 2).sum()) / area)
             for axis, middle in ((columns, x), (rows, y))
         )
-        target = Target(
-            x + left, y + top, math.sqrt(area), max(wide / high, high / wide), float(np.median(white)), black * float(
-                np.median(white)
-            ),
-        )  # fmt: skip
+        level = float(np.median(white))
+        target = Target(x + left, y + top, math.sqrt(area), max(wide / high, high / wide), level, black * level)
     return target

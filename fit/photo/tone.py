@@ -35,16 +35,10 @@ _LEVELS = np.linspace(0.0, 1.0, 1025)
 
 @dataclass(frozen=True)
 class Tone:
-    """A tone curve, as far as pictures tell it.
+    """A tone curve, as far as pictures tell it."""
 
-    Attributes:
-        bend: three numbers, see :func:`untoned`; zeros where noise would explain the pictures as well.
-        errors: steps of them by one standard error, in three independent directions `[3, 3]`; with what was seen and
-            not believed.
-    """
-
-    bend: tuple[float, float, float]
-    errors: Array
+    bend: tuple[float, float, float]  # see `untoned`; zeros where noise would explain the pictures as well
+    errors: Array  # steps by one standard error, in independent directions [3, 3]; with what was not believed
 
 
 def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
@@ -63,12 +57,7 @@ def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
 
 
 def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> Tone:
-    """The tone curve under which dots and edges are what they must be; none where noise would explain them as well.
-
-    Args:
-        pictures: light `[H, W]`, and where the target is in it.
-        square_mm: side of the square as printed.
-    """
+    """The tone curve under which dots and edges are what they must be; none where noise would explain them as well."""
     from scipy.optimize import least_squares
 
     dots = [_dot(light, target, square_mm) for light, target in pictures]

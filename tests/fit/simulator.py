@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import inspect
 import io
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
+from torchdof.fit import FitError, FitWarning
+from torchdof.io.images import Picture, write_image
 from torchdof.optics.psf import pixel_kernels
 
 
@@ -73,53 +76,29 @@ def blur(picture: np.ndarray, family: str, params: dict) -> np.ndarray:
 
 @dataclass
 class Simulator:
-    """What the camera does to the light; every default is harmless.
+    """What the camera does to the light; every default is harmless."""
 
-    Attributes:
-        size: width of the square window in px.
-        dot_radius: radius of the sharp dot in px.
-        snr_db: 20 log10(1 / read noise), None for none; 1 is the sharp dot's level.
-        full_well: electrons at 1, for shot noise; None for none.
-        level: of the sharp dot; below 1 keeps encoded pictures from clipping.
-        exposure: light in the defocused picture over the sharp one.
-        black: level added to both pictures.
-        offset: level added to the defocused picture alone (stray light).
-        place: of the sharp dot (x, y) in px from the picture's centre; the defocused one is there, too.
-        shift: displacement (x, y) of the defocused dot in px.
-        magnification: size of the defocused picture's dot over the sharp one's.
-        bits: quantisation; None for none.
-        clip: level above which the picture is clipped; None for none.
-        srgb: leave both pictures sRGB encoded.
-        jpeg: JPEG quality the sRGB-encoded pictures are stored at and decoded from; None for none.
-        edge_sigma: softness of the sharp picture in px, in both pictures.
-        misfocus: blur (a Gaussian's sigma in px) of the sharp picture alone.
-        texture: contrast of the paper's and the dot's grain, a few px large, the same in both pictures.
-        uneven: how much brighter the light is at the window's right edge than at its left.
-        tone: strength of an S-curve over the encoded levels that nobody undoes, 0 to 1.
-        bayer: record one colour a pixel and demosaic it bilinearly, as the mean of the colours that comes back.
-    """
-
-    size: int = 101
-    dot_radius: float = 12.0
-    snr_db: float | None = 40.0
-    full_well: float | None = None
-    level: float = 1.0
-    exposure: float = 1.0
-    black: float = 0.0
-    offset: float = 0.0
-    place: tuple[float, float] = (0.0, 0.0)
-    shift: tuple[float, float] = (0.0, 0.0)
-    magnification: float = 1.0
-    bits: int | None = None
-    clip: float | None = None
-    srgb: bool = False
-    jpeg: int | None = None
-    edge_sigma: float = 0.0
-    misfocus: float = 0.0
-    texture: float = 0.0
-    uneven: float = 0.0
-    tone: float = 0.0
-    bayer: bool = False
+    size: int = 101  # of the square window, px
+    dot_radius: float = 12.0  # of the sharp dot, px
+    snr_db: float | None = 40.0  # 20 log10(1 / read noise), None for none; 1 is the sharp dot's level
+    full_well: float | None = None  # electrons at 1, for shot noise
+    level: float = 1.0  # of the sharp dot; below 1 keeps encoded pictures from clipping
+    exposure: float = 1.0  # light in the defocused picture over the sharp one
+    black: float = 0.0  # level added to both pictures
+    offset: float = 0.0  # level added to the defocused picture alone (stray light)
+    place: tuple[float, float] = (0.0, 0.0)  # of the dot (x, y) in px from the middle, in both pictures
+    shift: tuple[float, float] = (0.0, 0.0)  # of the defocused dot (x, y) in px
+    magnification: float = 1.0  # size of the defocused picture's dot over the sharp one's
+    bits: int | None = None  # quantisation, which cuts blacks off as well
+    clip: float | None = None  # level above which the picture is clipped
+    srgb: bool = False  # leave both pictures sRGB encoded
+    jpeg: int | None = None  # quality that the sRGB-encoded pictures are stored at and decoded from
+    edge_sigma: float = 0.0  # softness in px of both pictures
+    misfocus: float = 0.0  # blur (a Gaussian's sigma in px) of the sharp picture alone
+    texture: float = 0.0  # contrast of the paper's and the dot's grain, a few px large, the same in both pictures
+    uneven: float = 0.0  # how much brighter the light is at the window's right edge than at its left
+    tone: float = 0.0  # strength of an S-curve over the encoded levels that nobody undoes, 0 to 1
+    bayer: bool = False  # record one colour a pixel and demosaic it bilinearly, as the mean of the colours
 
     def pair(self, family: str, params: dict, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Sharp and defocused picture `[size, size]` of one dot."""
@@ -197,6 +176,18 @@ def _through_jpeg(picture: np.ndarray, quality: int) -> np.ndarray:
     return np.asarray(Image.open(stored), dtype=np.float64) / 255
 
 
+def heard(call) -> tuple:
+    """What a call returns, or the `FitError` it raises; and every `FitWarning` on the way. Others are errors."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("error")
+        warnings.simplefilter("always", FitWarning)
+        try:
+            result = call()
+        except FitError as error:
+            result = error
+    return result, [w.message for w in caught]
+
+
 def write_captures(
     folder, camera, focus_m, distances, kernel, width=400, height=240, camera_fields="", grid=(), **harm
 ):
@@ -205,12 +196,6 @@ def write_captures(
     `kernel(distance)` gives (family, params), `kernel(distance, x, y)` that of the dot at a place in the sharp picture;
     `camera` is a `Simulator` whose window is ignored.
     """
-    from dataclasses import replace
-
-    import torch
-
-    from torchdof.io.images import Picture, write_image
-
     folder.mkdir(parents=True, exist_ok=True)
     places, across = grid or [(0.0, 0.0)], len(inspect.signature(kernel).parameters) == 3
     shots = []

@@ -23,9 +23,7 @@ from torchdof.fit import (
     fit_profile,
     fit_table,
     natural_psnr,
-    polar_samples,
     read_captures,
-    read_pair,
     trace_table,
 )
 from torchdof.fit.lens.lens import Lens
@@ -63,9 +61,7 @@ R = np.linspace(0, 8, 20)
 TABLE = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="fraction")
 LENS = Lens.read("double_gauss_50mm")
 CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
-    "fit_profile": (
-        fit_profile, {"r": R, "strength": dot(39)[19, 19:], "family": "gaussian", "groups": None, "knots": None}
-    ),
+    "fit_profile": (fit_profile, {"r": R, "strength": dot(39)[19, 19:], "family": "gaussian", "groups": None}),
     "fit_pair": (fit_pair, {"sharp": SHARP, "blurred": BLURRED, "family": "gaussian"}),
     "fit_pair, options": (
         lambda **a: fit_pair(SHARP, BLURRED, **a),
@@ -81,9 +77,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "fit_table": (fit_table, {"captures": None, "family": "gaussian"}),
     "fit_captures": (fit_captures, {"captures": None, "family": "gaussian"}),
     "blur_strength": (blur_strength, {"sharp": SHARP, "blurred": BLURRED}),
-    "polar_samples": (
-        polar_samples, {"picture": SHARP, "centre": (15, 15), "radius": 5.0, "step_deg": 10.0, "spacing": 1.0}
-    ),
     "natural_psnr": (natural_psnr, {"kernel": SHARP, "other": BLURRED}),
     "check_reach": (
         check_reach, {"table": TABLE, "camera": Camera(), "near_m": 1.0, "far_m": 3.0, "width_px": 100}
@@ -104,7 +97,6 @@ CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "Lens.scaled": (LENS.scaled, {"focal_length_mm": 35.0}),
     "Lens.read": (Lens.read, {"source": "wide_22mm"}),
     "read_captures": (read_captures, {"folder": "nowhere"}),
-    "read_pair": (read_pair, {"sharp": "nowhere.png", "blurred": "nowhere.png"}),
 }  # fmt: skip
 
 

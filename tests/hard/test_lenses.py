@@ -19,11 +19,11 @@ from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.fitted import Shown
 from torchdof.cli.main import app
 from torchdof.depth.edges import repair
+from torchdof.fit import FitError
 from torchdof.fit.lens.glass import Glass
 from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
 from torchdof.fit.photo.dot import find_dot
-from torchdof.fit.problems import WindowError
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
@@ -181,7 +181,7 @@ def test_repairs_of_maps_and_light_of_any_size_stay_finite(
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 200), (8, 8)])
 def test_pictures_too_small_for_a_dot_are_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(WindowError, match="too small for a dot"):
+    with pytest.raises(FitError, match="a picture of a dot must be .* at least 9 pixels on a side"):
         find_dot(np.random.default_rng(0).random(size), file="dot.png")
 
 

@@ -8,8 +8,8 @@ from click.testing import CliRunner
 
 from torchdof import BlurTable
 from torchdof.cli.main import app
+from torchdof.fit import FitError
 from torchdof.fit.photo.across import field_of_dots, table_of_dots
-from torchdof.fit.problems import FitError
 from torchdof.optics.field import deviations
 
 
@@ -74,12 +74,9 @@ def test_openings_of_dots_are_turned_to_one_spot():
     torch.testing.assert_close(mirrored.light[:, 0], field.light[:, 0], rtol=0, atol=2e-3 * float(field.light.max()))
 
 
-def test_dots_at_one_distance_are_refused():
+def test_dots_at_one_distance_are_refused_and_none():
     table = BlurTable("disc", coc=[1.0], params={"radius": [1.0]}, unit="fraction")
     with pytest.raises(FitError, match="at two distances from the middle"):
         field_of_dots([table], [(0.0, 0.0)], [1.0])
-
-
-def test_no_dots_are_refused():
     with pytest.raises(FitError, match="two at least, got 0"):
         table_of_dots([])

@@ -5,8 +5,7 @@ import pytest
 
 from torchdof import BlurTable
 from torchdof.fit import Capture, Captures, fit_captures, read_captures
-from torchdof.fit import problems as p
-from torchdof.fit.photo.mosaic import PATTERNS, demosaiced
+from torchdof.fit.photo.frame import PATTERNS, demosaiced
 
 PER_DIOPTRE, FOCUS = 24.0, (-0.04, 0.0, 0.05)  # px a dioptre, and how much nearer each colour is focused, 1/m
 SIDE = ((0.5, -0.2), (0.0, 0.0), (-0.3, 0.4))  # px by which each colour lies beside green
@@ -45,7 +44,7 @@ def check(result, distances, tolerance):
 
 
 # the mean of discs of three sizes is no disc, and what it leaves looks like a tone curve's
-@pytest.mark.filterwarnings("ignore:what the fit leaves goes with the level:torchdof.fit.problems.NotLinearWarning")
+@pytest.mark.filterwarnings("ignore:what the fit leaves goes with the level:torchdof.fit.problems.FitWarning")
 def test_lateral_and_longitudinal_colour_are_told_apart(simulator, tmp_path):
     result = fit_captures(captures(simulator), "disc")
     check(result, DISTANCES, 0.012)
@@ -58,7 +57,7 @@ def test_lateral_and_longitudinal_colour_are_told_apart(simulator, tmp_path):
     assert table.provenance["lateral_px"][0][0] == pytest.approx(SIDE[0], abs=0.05)
 
 
-@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.SingleDistanceWarning")
+@pytest.mark.filterwarnings("ignore:.*one distance was measured:torchdof.fit.problems.FitWarning")
 def test_a_mosaic_tells_the_same_as_three_colours(simulator):
     def through_mosaic(seen):
         mosaic = seen[1].copy()
@@ -86,12 +85,3 @@ def test_a_folder_is_read_by_colour(simulator, tmp_path):
     assert still.shape == moved.shape == (3, *pair.sharp.shape)
     assert np.allclose(still.mean(0), pair.sharp) and np.allclose(moved.mean(0), pair.blurred)
     assert read_captures(tmp_path)[0].pairs[0].colours is None
-    manifest = (tmp_path / "capture.toml").read_text()
-    for line, match in (
-        ('bayer = "RGBG"', "bayer must be one of RGGB, BGGR"),
-        ('bayer = "RGGB"', "is for pictures with one colour a pixel, got 3 colours"),
-        ('colours = "all"', "colours must be 'mean' or 'each'"),
-    ):
-        (tmp_path / "capture.toml").write_text(f"{line}\n{manifest}")
-        with pytest.raises(p.ManifestError, match=match):
-            read_captures(tmp_path)

@@ -6,8 +6,7 @@ import torch
 from scipy.ndimage import center_of_mass, shift
 
 from torchdof import BlurTable
-from torchdof.fit import Capture, Captures, fit_captures, fit_pair, highlight_psnr, natural_psnr
-from torchdof.fit import problems as p
+from torchdof.fit import Capture, Captures, FitError, fit_captures, fit_pair, highlight_psnr, natural_psnr
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.psf import pixel_kernels
 
@@ -54,14 +53,10 @@ def test_auto_takes_the_family_that_a_shape_needs(simulator, kind, family, natur
     found, true = centred(kernel_of(fit)), centred(kernel)
     assert natural_psnr(found, true) > natural and highlight_psnr(found, true) > look
     assert fit.residual_over_noise < 1.2 and ("round" in fit.why) == (family != "ring")
-
-
-def test_the_blades_of_a_polygon_are_counted_and_their_corners_found(simulator):
-    fit = fit_pair(*captured(simulator, "hexagon", 7.5)[0], "polygon")
-    assert fit.aperture.blades == 6 and fit.params["curvature"] < 0.3
-    # the simulator's corner is 11 degrees clockwise from the right, the aperture's counter-clockwise from the top
-    assert abs((fit.params["rotation_deg"] + 90 + 11 + 30) % 60 - 30) < 3
-    assert fit.stderr["rotation_deg"] < 3
+    if family == "polygon":
+        assert fit.aperture.blades == 6 and fit.params["curvature"] < 0.3 and fit.stderr["rotation_deg"] < 3
+        # the simulator's corner is 11 degrees clockwise from the right, the aperture's counter-clockwise from the top
+        assert abs((fit.params["rotation_deg"] + 90 + 11 + 30) % 60 - 30) < 3
 
 
 def test_a_disc_is_neither_a_polygon_nor_a_picture(simulator):
@@ -70,23 +65,13 @@ def test_a_disc_is_neither_a_polygon_nor_a_picture(simulator):
         assert fit_pair(*pair).family == "disc"
 
 
-def test_what_could_not_be_told_from_a_disc_is_said(simulator):
-    pair, _ = captured(simulator, "heptagon", 4.0, dot_radius=5.0, snr_db=34, size=49)
-    fit = fit_pair(*pair)
-    assert fit.family == "disc" and "a hexagon would not have been told from it" in fit.why
-    pair = simulator.Simulator(size=49, dot_radius=5.0, snr_db=50).pair("disc", {"radius": 6.0})
-    assert "hexagon" not in fit_pair(*pair).why
-
-
 def test_an_opening_that_is_known_is_fitted_in_its_size_alone(simulator):
     pair, kernel = captured(simulator, "hexagon", 5.0)
     fit = fit_pair(*pair, "image", aperture=Aperture(6, 19.0))
     assert list(fit.params) == ["radius"] and fit.params["radius"] == pytest.approx(5.0, rel=0.01)
     assert fit.radius == pytest.approx(size_of(kernel), rel=0.01)
-    with pytest.raises(p.FitError, match="goes with family='image'"):
+    with pytest.raises(FitError, match="goes with family='image'"):
         fit_pair(*pair, "disc", aperture=Aperture(6))
-    with pytest.raises(p.FitError, match="a profile over r, which 'polygon' has not"):
-        fit_pair(*pair, "polygon", model="ratio")
 
 
 def test_a_table_holds_the_opening_turned_by_half_in_front_of_the_focus(simulator, tmp_path):

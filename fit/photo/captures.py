@@ -1,0 +1,145 @@
+"""Pictures of a dot, in focus and at other distances, and the camera that took them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchdof.optics.camera import Camera
+from torchdof.validation import show
+
+from ..problems import FitError
+from ..result import Array
+from ..validation import a_number
+
+__all__ = ["CAMERA", "RANGES", "Capture", "Captures", "check_distances"]
+
+RANGES = {  # beyond any camera's
+    "focus_m": (1e-5, 1e6),
+    "distance_m": (1e-5, 1e6),
+    "focal_length_mm": (1e-3, 1e6),
+    "f_number": (1e-2, 1e4),
+    "sensor_width_mm": (1e-3, 1e5),
+    "exposure_s": (1e-9, 1e7),
+    "width_px": (1, 2**31),
+    "full_width_px": (1, 2**31),
+}
+CAMERA = ("focal_length_mm", "f_number", "sensor_width_mm")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One pair of windows of the same dot: in focus, and at another distance.
+
+    Attributes:
+        sharp: `[H, W]`, linear light, in focus.
+        blurred: `[H, W]`, linear light, the same size.
+        distance_m: of the dot in `blurred`, from the lens.
+        files: where the two came from.
+        white: level of clipping in both, or None where it is not known.
+        exposure: of `blurred` over `sharp`, as stated, or None.
+        position_px: the dot's place (x, y) in the sharp frame, from the frame's centre.
+        colours: red, green and blue of `sharp` and of `blurred`, `[3, H, W]` each; None fits their mean alone.
+        uncertain: `sharp` and `blurred` again, as they would be with what was guessed about them (a tone curve) one
+            standard error off, in independent directions. Standard errors count what that does to a fit.
+    """
+
+    sharp: Array
+    blurred: Array
+    distance_m: float
+    files: tuple[str | None, str | None] = (None, None)
+    white: float | None = None
+    exposure: float | None = None
+    position_px: tuple[float, float] = (0.0, 0.0)
+    colours: tuple[Array, Array] | None = None
+    uncertain: tuple[tuple[Array, Array], ...] = ()
+
+
+@dataclass(frozen=True)
+class Captures:
+    """Pairs of one dot at increasing distances, and the camera that took them.
+
+    Attributes:
+        pairs: by increasing distance.
+        focus_m: distance of the sharp picture: what the lens stays focused on.
+        width_px: width of the whole frame, which `sensor_width_mm` belongs to: the pictures may be crops of it.
+        focal_length_mm: of the lens, or None.
+        f_number: of the lens, or None.
+        sensor_width_mm: of the camera, or None.
+        name: of the table to be.
+        notes: more about the capture, for the table's provenance.
+    """
+
+    pairs: tuple[Capture, ...]
+    focus_m: float
+    width_px: int
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    sensor_width_mm: float | None = None
+    name: str = ""
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check what all later steps rely on.
+
+        Raises:
+            FitError: no pair, or a camera number that is not positive; of kind "distance" where distances are not
+                increasing, not positive, or one is that of the focus.
+        """
+        if not isinstance(self.pairs, Sequence) or not all(isinstance(p, Capture) for p in self.pairs):
+            raise FitError(f"pairs must be a tuple of Capture(sharp, blurred, distance_m), got {show(self.pairs)}")
+        if not self.pairs:
+            raise FitError("captures hold no pair of pictures; photograph the dot at one more distance at least")
+        check_distances([p.distance_m for p in self.pairs], self.focus_m, None)
+        for name in ("width_px", *CAMERA):
+            value = getattr(self, name)
+            if value is not None or name == "width_px":
+                a_number(name, value, *RANGES[name])
+
+    def __iter__(self) -> Iterator[Capture]:
+        """Iterate over the pairs."""
+        return iter(self.pairs)
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.pairs)
+
+    @property
+    def distances_m(self) -> Array:
+        """Of the pairs `[n]`."""
+        return np.array([pair.distance_m for pair in self.pairs])
+
+    @property
+    def defocus(self) -> Array:
+        """1/focus - 1/distance of the pairs `[n]`, 1/m: what a thin lens's circle of confusion is proportional to."""
+        return 1 / self.focus_m - 1 / self.distances_m
+
+    @property
+    def promised_px(self) -> Array | None:
+        """Signed circle of confusion of the pairs `[n]`, px of the frame; None where the camera is not known."""
+        focal_length_mm, f_number, sensor_width_mm = (getattr(self, name) for name in CAMERA)
+        if focal_length_mm is None or f_number is None or sensor_width_mm is None:
+            return None
+        camera = Camera(
+            focal_length_mm=focal_length_mm, f_number=f_number, focus_m=self.focus_m, sensor_width_mm=sensor_width_mm
+        )
+        depth = torch.from_numpy(self.distances_m)[None, None, None]
+        return camera.coc_px(depth, width=self.width_px).numpy().reshape(-1)
+
+
+def check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
+    """Refuse distances that are not positive and increasing, or that equal the focus."""
+    a_number("focus_m", focus, 0, 1e100, "metres")
+    for before, distance in zip([0.0, *distances], distances, strict=False):
+        a_number("distance_m", distance, -1e100, 1e100, "metres")
+        if not before < distance:
+            listed = ", ".join(f"{d:g}" for d in distances)
+            text = f"distances must be positive and increasing, got {listed} m"
+            raise FitError(text, "distance", file=where, number=float(distance))
+        if distance == focus:
+            text = f"a shot lies at the focus ({focus:g} m) and has no blur"
+            raise FitError(text, "distance", file=where, number=focus)

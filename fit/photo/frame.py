@@ -1,0 +1,213 @@
+"""A whole picture as the camera took it, in linear light, and the windows around its dots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from torchdof.io.images import read_image
+from torchdof.io.metadata import camera_facts
+from torchdof.io.transfer import Transfer
+
+from ..problems import FitError
+from ..result import Array
+from .captures import Capture
+from .dot import Dot, find_dot, find_dots
+
+__all__ = ["PATTERNS", "Dots", "Frame", "cut_pairs", "demosaiced", "read_frame", "size_of"]
+
+Dots = Literal["one", "centre", "each", "field"]
+
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+"""Colours of the upper left four pixels of a mosaic, by rows."""
+
+_MARGIN = 1.35  # window over the blur's reach
+_CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
+_SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture in linear light, and what its file says."""
+
+    file: Path
+    light: Array  # [H, W], mean of its colours
+    colours: Array  # [C, H, W]
+    white: float | None  # the level at which it is clipped
+    encoded: bool  # whether it was stored in integers, and decoded as sRGB
+    width_px: int  # of the whole picture
+    middle: tuple[float, float]  # (x, y) of the whole picture's centre in px of `light`
+    facts: Mapping[str, float]  # what EXIF says about the camera
+
+
+def read_frame(
+    path: Path,
+    transfer: Transfer | None,
+    dark: Frame | None = None,
+    crop: tuple[int, int, int, int] | None = None,
+    bayer: str | None = None,
+) -> Frame:
+    """Read a picture; `crop` is left, top, width and height in px, `dark` was taken with the lens cap on.
+
+    Raises:
+        FitError: of kind "manifest" where crop, mosaic or dark frame do not go with the picture, of kind "not finite"
+            for NaN in it.
+        OSError: it is missing or damaged.
+    """
+    picture = read_image(path, transfer=transfer)
+    pixels = picture.pixels[0].numpy().astype(np.float64)
+    pixels = pixels[[i for i, name in enumerate(picture.channels) if name != "A"]]
+    if bayer is not None:
+        if len(pixels) != 1:
+            text = f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours"
+            raise FitError(text, "manifest", file=str(path))
+        pixels = demosaiced(pixels[0], bayer)
+    height, width = pixels.shape[1:]
+    left, top, columns, rows = crop or (0, 0, width, height)
+    if left + columns > width or top + rows > height:
+        text = f"crop {[left, top, columns, rows]} leaves the picture of {width}x{height}"
+        raise FitError(text, "manifest", file=str(path))
+    pixels = pixels[:, top : top + rows, left : left + columns]
+    bad = int(np.sum(~np.isfinite(pixels)))
+    if bad:
+        raise FitError(f"{bad} values are NaN or infinite", "not finite", file=str(path), number=float(bad))
+    white = 1.0 if picture.sample in ("8", "16") else None
+    high = pixels >= 1.0 - 1e-6
+    if dark is not None:
+        if dark.colours.shape != pixels.shape:
+            text = f"the dark frame is {size_of(dark.light)}, the picture {size_of(pixels[0])}"
+            raise FitError(text, "manifest", file=str(path))
+        pixels = pixels - dark.colours
+    light = pixels.mean(axis=0)
+    if white is not None:
+        pixels[high] = white
+        light[high.any(axis=0)] = white  # one clipped colour clips the mean
+    facts = camera_facts(picture.metadata, width)
+    if height > width and "sensor_width_mm" in facts:  # turned upright: EXIF speaks of the longer side
+        facts["sensor_width_mm"] *= width / height
+    return Frame(
+        file=path,
+        light=light,
+        colours=pixels,
+        white=white,
+        encoded=white is not None and picture.transfer == "srgb",
+        width_px=width,
+        middle=((width - 1) / 2 - left, (height - 1) / 2 - top),
+        facts=facts,
+    )
+
+
+def demosaiced(mosaic: Array, pattern: str) -> Array:
+    """Red, green and blue `[3, H, W]` of a mosaic `[H, W]`, interpolated bilinearly.
+
+    It is linear, alike in the sharp and the blurred picture, and adds no colour that is not there: all that a fit asks.
+    """
+    from scipy.ndimage import convolve
+
+    colours = []
+    for colour, kernel in (("R", _SQUARE), ("G", _CROSS), ("B", _SQUARE)):
+        sampled = np.zeros_like(mosaic)
+        for i, name in enumerate(pattern):
+            if name == colour:
+                sampled[i // 2 :: 2, i % 2 :: 2] = mosaic[i // 2 :: 2, i % 2 :: 2]
+        colours.append(convolve(sampled, kernel, mode="mirror"))
+    return np.stack(colours)
+
+
+def size_of(picture: Array) -> str:
+    """Width x height, for messages."""
+    return f"{picture.shape[1]}x{picture.shape[0]}"
+
+
+def cut_pairs(
+    still: Frame,
+    moved: Frame,
+    distance_m: float,
+    magnification: float,
+    dots: Dots,
+    exposure: float | None,
+    colours: bool,
+) -> list[Capture]:
+    """Find the dot, or the dots of a grid, in two frames and cut the windows around each.
+
+    `magnification` is the expected size of a dot in `moved` over that in `still`, `exposure` its brightness.
+
+    Raises:
+        FitError: no dot, several, one too near to the frame's edge or to others.
+    """
+    if dots == "one":
+        chosen = [(find_dot(still.light, file=str(still.file)), find_dot(moved.light, file=str(moved.file)))]
+    else:
+        chosen = _matched(still, moved, magnification)
+        chosen = chosen[:1] if dots == "centre" else chosen
+    pairs = []
+    for first, second in chosen:
+        half = _half_width(still, moved, first, second)
+        pairs.append(
+            Capture(
+                sharp=_one_dot(still, first, half),
+                blurred=_one_dot(moved, second, half),
+                distance_m=distance_m,
+                files=(str(still.file), str(moved.file)),
+                white=still.white,
+                exposure=exposure,
+                position_px=(round(first.x - still.middle[0], 2), round(first.y - still.middle[1], 2)),
+                colours=(_cut(still.colours, first, half), _cut(moved.colours, second, half)) if colours else None,
+            )
+        )
+    return pairs
+
+
+def _matched(still: Frame, moved: Frame, magnification: float) -> list[tuple[Dot, Dot]]:
+    """Dots of a grid in both pictures, from the centre outwards: each moves along the line to the centre."""
+    first, second = (find_dots(frame.light, file=str(frame.file), smallest=0.3) for frame in (still, moved))
+    middle, pairs = still.middle, []
+    for dot in sorted(first, key=lambda d: math.dist((d.x, d.y), middle)):
+        where = [m + magnification * (v - m) for m, v in zip(middle, (dot.x, dot.y), strict=True)]
+        near = min(second, key=lambda d: math.dist((d.x, d.y), where))
+        apart = min((math.dist((d.x, d.y), (dot.x, dot.y)) for d in first if d is not dot), default=math.inf)
+        if math.dist((near.x, near.y), where) < 0.4 * magnification * apart:
+            pairs.append((dot, near))
+    if not pairs:
+        text = f"none of the {len(first)} dots of {still.file.name} is found again; are the distances right?"
+        raise FitError(text, "no dot", file=str(moved.file), number=float(len(second)))
+    return pairs
+
+
+def _half_width(still: Frame, moved: Frame, first: Dot, second: Dot) -> int:
+    """Half the side of an odd square around either dot, wide enough for the blur."""
+    needed = max(first.reach, second.reach) + 2
+    room = [_pixels_to_edge(still.light, first), _pixels_to_edge(moved.light, second)]
+    half_width = min(*room, int(math.ceil(_MARGIN * needed)) + 8)
+    if half_width < needed:
+        text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half_width} px"
+        worse = still if room[0] < first.reach + 2 else moved
+        raise FitError(text, "window", file=str(worse.file), number=needed)
+    return half_width
+
+
+def _one_dot(frame: Frame, dot: Dot, half_width: int) -> Array:
+    """The window around a dot, or a refusal where another one lies in it."""
+    window = _cut(frame.light, dot, half_width)
+    count = len(find_dots(window, file=str(frame.file)))
+    if count > 1:
+        text = f"{count} dots in a window of {window.shape[0]} px: print the dots farther apart than their blur"
+        raise FitError(text, "several dots", file=str(frame.file), number=float(count))
+    return window
+
+
+def _cut(picture: Array, dot: Dot, half_width: int) -> Array:
+    """The window around a dot in a picture `[..., H, W]`."""
+    x, y = int(round(dot.x)), int(round(dot.y))
+    return picture[..., y - half_width : y + half_width + 1, x - half_width : x + half_width + 1].copy()
+
+
+def _pixels_to_edge(picture: Array, dot: Dot) -> int:
+    """Whole pixels between a dot's pixel and the nearest edge of the picture."""
+    x, y = int(round(dot.x)), int(round(dot.y))
+    return min(x, y, picture.shape[1] - 1 - x, picture.shape[0] - 1 - y)
