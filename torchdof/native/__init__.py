@@ -86,7 +86,7 @@ class KernelSpots(Protocol):
         """Cells of the templates in use, float32."""
 
     @property
-    def index(self) -> list[tuple[int, int, int, int]]:
+    def which(self) -> list[tuple[int, int, int, int]]:
         """Which of these, four for each kernel."""
 
     @property
@@ -422,8 +422,9 @@ def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool
     memory = torch.empty(sum(areas), dtype=torch.float32, device="cpu")
     made = [part.view(colours, side, side) for part, side in zip(memory.split(areas), sides, strict=True)]
     cells = [template.shape[-1] // 2 - 1 for template in spots.templates]
-    reach, fade, index = (list(itertools.chain.from_iterable(each)) for each in (spots.reach, spots.fade, spots.index))
-    whole = [(ctypes.c_int32 * max(1, len(each)))(*each) for each in (cells, index, spots.flipped, spots.half)]
+    reach, fade, index = (list(itertools.chain.from_iterable(each)) for each in (spots.reach, spots.fade, spots.which))
+    lists: list[list[int]] = [cells, index, list(map(int, spots.flipped)), spots.half]
+    whole = [(ctypes.c_int32 * max(1, len(each)))(*each) for each in lists]
     numbers = [(ctypes.c_double * len(each))(*each) for each in (spots.part, spots.finer, reach, fade)]
     arrays = [*whole[:2], *numbers, *whole[2:]]
     scene = _Spots(count, colours, _pointers(spots.templates), *arrays, squeeze, is_round, is_even)

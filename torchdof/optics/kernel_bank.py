@@ -85,7 +85,7 @@ class Spots(NamedTuple):
 
     Args:
         templates: Cells of the templates in use, each ``[C, 2 n + 3, 2 n + 3]``, float32.
-        index: Which of these, four for each kernel: those of the nodes below and above, and the same of the next finer
+        which: Which of these, four for each kernel: those of the nodes below and above, and the same of the next finer
             level.
         part: How far each lies from the node below to the one above, 0 to 1.
         finer: Share of the finer level, 0 to 1.
@@ -98,7 +98,7 @@ class Spots(NamedTuple):
     """
 
     templates: list[Tensor]
-    index: list[tuple[int, int, int, int]]
+    which: list[tuple[int, int, int, int]]
     part: list[float]
     finer: list[float]
     reach: list[list[float]]
@@ -240,7 +240,7 @@ class KernelBank:
                 ]
                 found = [index_of(*end) for end in ends]
                 index = (found[0], found[1], found[-2], found[-1])
-            spots.index.append(index)
+            spots.which.append(index)
             spots.part.append(place.part)
             spots.finer.append(finer)
             spots.reach.append(reach)
@@ -282,8 +282,8 @@ class KernelBank:
             made = disc / disc.sum((-2, -1), keepdim=True)
         else:
             made = torch.zeros(len(spots.part), self.colours, len(step), len(step), dtype=torch.float64)
-            for key in set(spots.index):
-                which = torch.tensor([i for i, other in enumerate(spots.index) if other == key])
+            for key in set(spots.which):
+                which = torch.tensor([i for i, other in enumerate(spots.which) if other == key])
                 low, high, fine_low, fine_high = (spots.templates[i].double() for i in key)
                 sizes, part = reach[which], parts[which][:, None, None, None]
                 cut = halves[which, None] < sizes.detach() * self.widest - 1e-9

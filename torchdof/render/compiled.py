@@ -53,8 +53,8 @@ def picture(
         # what no layer covers is seen through all of them
         nothing, farthest = torch.zeros_like(light[0, 0]), torch.full_like(coc[0, 0, 0], high)
         items = []
-        for layers in zip(light, coc[:, :, 0], cover[:, :, 0], strict=True):
-            items.append(render([*zip(*layers, strict=True), (nothing, farthest, None)], "stack"))
+        for surfaces in zip(light, coc[:, :, 0], cover[:, :, 0], strict=True):
+            items.append(render([*zip(*surfaces, strict=True), (nothing, farthest, None)], "stack"))
     elif behind_light is not None and behind_coc is not None:
         shown, hidden = zip(light, coc[:, 0], strict=True), zip(behind_light, behind_coc[:, 0], strict=True)
         items = [render([(*a, None), (*b, None)], "background") for a, b in zip(shown, hidden, strict=True)]
