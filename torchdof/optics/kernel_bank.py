@@ -7,8 +7,8 @@ So that part, the *template* ``T``, is made once for each node of a table. A ker
     ``K = A T B'``  with  ``A[m, i] = phi(m - i h)``,  ``B[m, i] = phi(m - i w)``
 
 for cells ``h`` pixels high and ``w`` pixels wide. ``K`` is then limited, made non-negative and scaled to a sum of 1, as
-there. Templates have 16, 32, 64, 128 or 256 cells. The one used has cells of up to a pixel, and the next finer one
-fades in from there to a pixel and a quarter: kernels are continuous functions of the radius. A PSF of more than 256
+there. Templates have 16, 32, 64, 128 or 256 cells. The one used has cells of half a pixel to a pixel, and the
+next finer one fades in from three quarters of a pixel to a pixel: kernels are continuous functions of the radius. A PSF of more than 256
 pixels is sampled linearly from its template.
 
 Between two nodes of a table the template is the mean of theirs, and its size that of the interpolated parameters.
@@ -37,7 +37,7 @@ LEAST_CELLS = 16
 """Cells from the centre to the end of a PSF in the coarsest template."""
 
 _LEVELS = 5  # templates of 16, 32, 64, 128 and 256 cells
-_LARGEST_CELL = 1.25  # px; from 1 px to there the next finer template fades in
+_FADES_FROM = 0.75  # px of a cell; from there to 1 px the next finer template fades in
 _SMALLEST = 1e-7  # px; a smaller PSF counts as one of that size, whose kernel is a single pixel
 _BANKS = 32  # tables whose nodes are kept
 SPOT_MARGIN_PX = 1.0
@@ -231,10 +231,10 @@ class KernelBank:
                 reach = [max(r, _SMALLEST) for r in reach]
                 largest = max(reach) * self.widest
                 half = max(0, math.ceil(largest - 1e-9))
-                level = min(max(0, math.ceil(math.log2(largest / (_LARGEST_CELL * LEAST_CELLS)))), _LEVELS - 1)
+                level = min(max(0, math.ceil(math.log2(largest / LEAST_CELLS))), _LEVELS - 1)
                 if level < _LEVELS - 1:
                     cell = largest / (LEAST_CELLS << level)
-                    finer = min(max((cell - 1.0) / (_LARGEST_CELL - 1.0), 0.0), 1.0)
+                    finer = min(max((cell - _FADES_FROM) / (1.0 - _FADES_FROM), 0.0), 1.0)
                 ends = [
                     (place.side, place.node + above, level + up) for up in range(1 + (finer > 0)) for above in (0, 1)
                 ]
