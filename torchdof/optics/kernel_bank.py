@@ -7,9 +7,9 @@ So that part, the *template* ``T``, is made once for each node of a table. A ker
     ``K = A T B'``  with  ``A[m, i] = phi(m - i h)``,  ``B[m, i] = phi(m - i w)``
 
 for cells ``h`` pixels high and ``w`` pixels wide. ``K`` is then limited, made non-negative and scaled to a sum of 1, as
-there. Templates have 16, 32, 64, 128 or 256 cells. The one used has cells of half a pixel to a pixel, and the
-next finer one fades in from three quarters of a pixel to a pixel: kernels are continuous functions of the radius. A PSF of more than 256
-pixels is sampled linearly from its template.
+there. Templates have 16, 32, 64, 128 or 256 cells. The one used has cells of half a pixel to a pixel, and the next
+finer one fades in from three quarters of a pixel on: kernels are continuous functions of the radius. A PSF of more than
+256 pixels is sampled linearly from its template.
 
 Between two nodes of a table the template is the mean of theirs, and its size that of the interpolated parameters.
 
