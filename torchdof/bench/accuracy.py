@@ -99,7 +99,10 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
         window = _worst(pictures["torchdof"], scene, side)
         for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
             panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
-    tables: dict[str, list[dict[str, Any]]] = {"Means": summary(rows, ["depth", "renderer"], statistics.fmean), "Scenes": rows}
+    tables: dict[str, list[dict[str, Any]]] = {
+        "Means": summary(rows, ["depth", "renderer"], statistics.fmean),
+        "Scenes": rows,
+    }
     remark = "psnr_inner: without the border that light from outside the frame reaches; flip: less is better."
     if degraded:
         publish("What inexact depth costs", tables, [remark], out / "degraded")
