@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as functional
@@ -146,7 +147,7 @@ def draw_field(path: Path) -> None:
     lens = Lens.read("double_gauss_50mm").with_f_number(2.0)
     camera = torchdof.Camera(lens.paraxial().focal_length, f_number=2.0, focus_m=2.0, sensor_width_mm=36.0)
     field_mm = (0.0, 2.7, 5.4, 8.1, 10.9, 13.7, 16.5, 19.8, 21.6)
-    across = {"wavelengths_um": RGB_UM, "field": field_mm, "field_nodes": 8, "field_rays": 30_000}
+    across: dict[str, Any] = {"wavelengths_um": RGB_UM, "field": field_mm, "field_nodes": 8, "field_rays": 30_000}
     table = trace_table(lens, 2.0, 2.0, nodes=9, **across)
     image, depth = street(640, 960)
     shown = {}

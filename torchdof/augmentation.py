@@ -98,11 +98,12 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
         self.focus_m, self.f_number = (near_m, far_m), (widest, narrowest)
         self.renderings = [Options.of(table, **options) for table in tables]
         self.flags = {"transfer": transfer}
-        self._param_generator = rg.PlainUniformGenerator(
+        self._ranges = (
             ((1.0 / far_m, 1.0 / near_m), "focus", None, None),  # dioptres
             ((2 * math.log2(widest), 2 * math.log2(narrowest)), "f_number", None, None),  # stops
             ((0.0, float(len(tables))), "table", None, None),
         )
+        self._param_generator = rg.PlainUniformGenerator(*self._ranges)
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
         """Draws ``focus_m`` [m], ``f_number`` and ``table`` (which of several), each ``[B]``."""
@@ -110,7 +111,7 @@ class RandomDepthOfField(IntensityAugmentationBase2D):
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """The parameters of one image by a generator of the caller's, each ``[1]``; the process's stays as it is."""
-        ends = {name: low_and_high for low_and_high, name, _, _ in self._param_generator.samplers}
+        ends = {name: low_and_high for low_and_high, name, _, _ in self._ranges}
         return self._in_units(
             {name: low + (high - low) * torch.rand(1, generator=generator) for name, (low, high) in ends.items()}
         )

@@ -103,8 +103,10 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
         torch.manual_seed(turn)
         known = json.loads((DATA / "camera.json").read_text())
         depth = read_depth(DATA / "motorcycle_disp.npz", **known["depth"])
-        photo = torch.cat([read_image(DATA / "motorcycle_left.png").pixels, depth], 1)
-        crops = torch.cat([photo[..., y : y + 256, x : x + 256] for y in range(0, 241, 80) for x in range(0, 481, 160)])
+        together = torch.cat([read_image(DATA / "motorcycle_left.png").pixels, depth], 1)
+        crops = torch.cat(
+            [together[..., y : y + 256, x : x + 256] for y in range(0, 241, 80) for x in range(0, 481, 160)]
+        )
         camera = Camera.from_fov(math.degrees(2 * math.atan(128 / known["focal_length_px"])), 0.04, 3.0)
         aug = RandomDepthOfField((2.2, 5.0), (1.4, 8.0), camera, transfer="linear", p=1.0, tolerance="preview")
         batch = BenchScene("crops", *crops.split((3, 1), 1))  # metres in the place of the coc
@@ -122,12 +124,12 @@ def figures(part: str, folder: Path, turn: int) -> Iterator[Figure]:
             name = "ten thousand lamps, 500 px"
         ordinary = scene.seen(0.0, 60.0).cameras(1, 1.0, f"{turn}")[0]
 
-        def beside() -> tuple[Tensor, Seconds]:
+        def just_like_it() -> tuple[Tensor, Seconds]:
             blur_by_coc(ordinary.image, ordinary.coc_px)
             return timed(blur_by_coc, ordinary.image, ordinary.coc_px)
 
         seen, goal = [BenchScene(part, image, coc_px)], "over_beside at most 6, 1000 MiB"
-        yield Figure(f"{name}, 640 x 480", blur_by_coc, seen, goal, "ordinary, 60 px, again", beside)
+        yield Figure(f"{name}, 640 x 480", blur_by_coc, seen, goal, "ordinary, 60 px, again", just_like_it)
     elif part == "command":
         for radius_px in (30, 60, 111):
             seen = shipped(1333, 2000).seen(0.0, radius_px).cameras(1, 1.0, f"{turn}")

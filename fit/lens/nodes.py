@@ -161,9 +161,9 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
             spots[i + 1].append((equations, share, i))
     for order in (_to_focus(places), _to_focus(places)[::-1]) * (_SWEEPS // 2):
         for i in order:
-            gram = sum(share**2 * spot.gram for spot, share, _ in spots[i])
-            pull = sum(share * (spot.pull - (1 - share) * spot.gram @ values[other]) for spot, share, other in spots[i])
-            values[i] = tracer.fitted(gram, pull, nodes[i].histogram)
+            gram = np.sum([share**2 * spot.gram for spot, share, _ in spots[i]], axis=0)
+            pulls = [share * (spot.pull - (1 - share) * spot.gram @ values[other]) for spot, share, other in spots[i]]
+            values[i] = tracer.fitted(gram, np.sum(pulls, axis=0), nodes[i].histogram)
     residual = np.array([tracer.relative(node.error(v)) for node, v in zip(nodes, values, strict=True)])
     return {"values": np.stack(values), "radius": np.array([node.radius for node in nodes]) * tracer.pixel}, residual
 

@@ -14,6 +14,7 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.field import Field
 
 from ..problems import FitError
+from ..result import Array
 from .captures import Captures
 from .table import TableFit
 
@@ -55,7 +56,7 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
     return first.replace(aperture=None, field=field, provenance=first.provenance | found)
 
 
-def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], shrunk: Sequence[float]) -> Field:
+def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], shrunk: Array) -> Field:
     """Spots over blur and distance from the middle, of tables with the same nodes of single places (x, y).
 
     Places are those in the sharp picture, from the middle of the frame, in the tables' unit; pictures shrink towards

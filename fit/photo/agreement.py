@@ -31,7 +31,7 @@ _EXPLAINED = math.log(1.12)
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
 
 
-def check_agreement(captures: Captures, radius_px: Sequence[float]) -> None:
+def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> None:
     """Compare the fitted blur's radius at each distance with the camera's, and name the likely cause of a difference.
 
     Raises:
@@ -188,8 +188,9 @@ def check_reach(
         warn(text, "outside measured", number=factors["coc"])
     for name, most in (("f_number", 1.05), ("focus_m", 1.25)):
         measured_at, used_at = table.provenance.get(name), float(getattr(camera, name))
-        known = isinstance(measured_at, int | float) and not isinstance(measured_at, bool)
-        if not known or not 0 < measured_at < math.inf or math.isinf(used_at):
+        if not isinstance(measured_at, int | float) or isinstance(measured_at, bool):
+            continue
+        if not 0 < measured_at < math.inf or math.isinf(used_at):
             continue
         factors[name] = used_at / measured_at
         if max(factors[name], 1 / factors[name]) > most:

@@ -160,7 +160,9 @@ def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
     noise = np.sqrt(noise_near(pair, solution) ** 2 + through * float(np.sum(pair.kernel(solution) ** 2)))
     rms, rms_error = size_of_blur(pair, solution)
     spread = np.sqrt(np.diag(solution.covariance))
-    stderr = {n: float(s) for n, s in zip(solution.names, spread, strict=True) if n in solution.params}
+    stderr: dict[str, float | Array] = {
+        n: float(s) for n, s in zip(solution.names, spread, strict=True) if n in solution.params
+    }
     opening = {n: float(v) for n, v in solution.params.items()} if solution.family in OPENINGS else None
     rows, columns = pair.pixels
     distance = np.hypot(columns - x, rows - y)

@@ -39,9 +39,9 @@ def fit_distances(
     near = [i for i in range(len(pairs)) if place[i] < 0]
     far = [i for i in range(len(pairs)) if place[i] > 0][::-1]
     for side in (near, far):  # from both ends towards focus, each from its neighbour's fit
-        before = None
+        before: int | None = None
         for i in side:
-            start = None
+            start: BlurFit | None = None
             if before is not None:
                 nearer = abs(place[i]) / abs(place[before])
                 params = {n: v * nearer if n in LENGTHS else v for n, v in fits[before].params.items()}

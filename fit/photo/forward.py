@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -160,7 +161,8 @@ class Forward:
         """The lens's opening with the parameters that belong to it."""
         if self.opening is None:
             raise AssertionError("kernels that are not round are those of an opening")
-        return replace(self.opening, **{n: params[n] for n in ("rotation_deg", "curvature") if n in params})
+        changed: dict[str, Any] = {n: params[n] for n in ("rotation_deg", "curvature") if n in params}
+        return replace(self.opening, **changed)
 
     def rms(self, family: str, params: Mapping[str, Array]) -> Array:
         """Rms radius of the PSFs `[n]` of parameters `[n]`, px.
@@ -264,7 +266,7 @@ class Forward:
             together = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
             meat = meat + through * (spread @ together.reshape(spread.shape).T)
         covariance = bread @ meat @ bread
-        if self.source.variants:
+        if self.source.variants and self.source.covariance is not None:
             plain = self.moved_source(moves)
             moved = [self.moved_source(moves, draw) - plain for draw in self.source.variants]
             changes = np.stack([self.convolve(change, kernel[None])[0] for change in moved], axis=1)

@@ -153,7 +153,9 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
     halves = [float(f.params["radius"]) / f.radius for f in fits]
     place = ((np.arange(_MOST_SIDE) + 0.5) / _MOST_SIDE * 2 - 1) * max(halves)
     mean = np.zeros((_MOST_SIDE, _MOST_SIDE))
-    for mask, half, share in zip((a.mask.numpy() for a in found), halves, weight / weight.sum(), strict=True):
+    for mask, half, share in zip(
+        (a.mask.numpy() for a in found if a.mask is not None), halves, weight / weight.sum(), strict=True
+    ):
         where = np.meshgrid(*[(place / half + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
         mean += share * map_coordinates(mask / mask.mean(), where, order=1, mode="constant") / half**2
     return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))

@@ -101,7 +101,9 @@ def read_photographs(
             "torchdof fit --target target.pdf makes"
         )
         raise FitError(text, "manifest", file=where)
-    pictures, advice, facts, integers = [], [], dict[str, float](), True
+    pictures: list[Photograph] = []
+    advice: list[str] = []
+    facts, integers = dict[str, float](), True
     for path in files:
         picture = read_image(path)
         if colours == "each" and len(picture.channels) < 3:

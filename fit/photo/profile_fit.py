@@ -87,7 +87,8 @@ def fit_profile(
     # from differences of neighbours in r: what no smooth curve can explain
     noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
     _refuse_flat(x, y, noise)
-    fitted, covariance, curve = _fitted(x, y, family, None if groups is None else labels[order])
+    together = None if groups is None else np.asarray(labels[order])
+    fitted, covariance, curve = _fitted(x, y, family, together)
     squares = float(np.sum((y - curve) ** 2))
     scale = np.array([unit if n in LENGTHS else peak if n == "N" else 1.0 for n in names])
     covariance = covariance * np.outer(scale, scale)

@@ -48,7 +48,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 def test_times_are_of_other_cameras_and_errors_of_the_scene_s_own(here: None, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = shipped(48, 160).seen(0.0, 13.0)  # blurred enough for coarse layers to show
     rendered: list[Tensor] = []
-    monkeypatch.setattr(speed, "blur_by_coc", lambda *a, **options: rendered.append(a[1]) or blur_by_coc(*a, **options))
+    monkeypatch.setattr(speed, "blur_by_coc", lambda *a, **options: rendered.append(a[1]) or blur_by_coc(*a, **options))  # type: ignore[func-returns-value]
     rows = {row["setting"]: row for row in speed.compare(scene, repeat=2)}
     assert list(rows) == SETTINGS
     assert all(row["new_ms"] > 0 and row["over_beside"] > 0 and row["kept"] for row in rows.values())
@@ -139,7 +139,7 @@ def test_bench_measures_the_lens_and_focus_that_it_is_told(
 ) -> None:
     measured: list[BenchScene] = []
     row = {"setting": "exact", "kept": True}
-    monkeypatch.setattr(speed, "compare", lambda scene, *_: measured.append(scene) or [row])
+    monkeypatch.setattr(speed, "compare", lambda scene, *_: measured.append(scene) or [row])  # type: ignore[func-returns-value]
     lens = ("--fov-deg", 40, "--aperture-radius-m", 0.02, "--focus-at", "0,0", "--table", "gaussian", "--blades", 5)
     result = run(*files, *lens, "--json")
     assert result.exit_code == 0, result.output
@@ -160,7 +160,9 @@ def test_bench_measures_the_lens_and_focus_that_it_is_told(
 def test_alpha_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[BenchScene] = []
     monkeypatch.setattr(
-        speed, "compare", lambda scene, *_: measured.append(scene) or [{"setting": "exact", "kept": True}]
+        speed,
+        "compare",
+        lambda scene, *_: measured.append(scene) or [{"setting": "exact", "kept": True}],  # type: ignore[func-returns-value]
     )
     write_image(tmp_path / "a.exr", Picture(torch.full((1, 4, 20, 24), 0.5), ("R", "G", "B", "A")))
     write_image(tmp_path / "d.exr", Picture(torch.full((1, 1, 20, 24), 2.0), ("Y",)))

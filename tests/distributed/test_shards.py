@@ -242,11 +242,11 @@ def test_webdataset_reads_the_shards(pairs: list[Pair], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
-        (lambda f: RenderShards(f, format="zip"), ValueError, "format must be 'webdataset' or 'parquet'"),
+        (lambda f: RenderShards(f, format="zip"), ValueError, "format must be 'webdataset' or 'parquet'"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, keep=[]), ValueError, "keep must be some of blurred, sharp, depth"),
         (lambda f: RenderShards(f, keep="blurred"), ValueError, "keep must be some of"),
-        (lambda f: RenderShards(f, picture=".jpg"), ValueError, "picture must be"),
-        (lambda f: RenderShards(f, "disc"), ValueError, "blur must be a RandomDepthOfField"),
+        (lambda f: RenderShards(f, picture=".jpg"), ValueError, "picture must be"),  # type: ignore[arg-type]
+        (lambda f: RenderShards(f, "disc"), ValueError, "blur must be a RandomDepthOfField"),  # type: ignore[arg-type]
         (lambda f: RenderShards(f, depth={"scal": 2.0}), ValueError, "depth must be some of kind, scale, .*'scal'"),
         (lambda f: RenderShards(f, depth={"kind": "relative"}), ValueError, "some of kind, near_m, .*: .*'near_m'"),
         (lambda f: RenderShards(f, seed=-1), ValueError, "seed must be a whole number"),

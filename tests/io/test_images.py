@@ -277,9 +277,9 @@ def test_an_exr_of_any_make_is_read_and_written_again(tmp_path: Path, make: Any)
     if make in WINDOWS:
         spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = make
     if make == "levels":
-        picture = oiio.ImageBuf(spec)
-        picture.set_pixels(oiio.ROI(), values)
-        assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, picture, str(tmp_path / "x.exr"))
+        buffer = oiio.ImageBuf(spec)
+        buffer.set_pixels(oiio.ROI(), values)
+        assert oiio.ImageBufAlgo.make_texture(oiio.MakeTxTexture, buffer, str(tmp_path / "x.exr"))
         source = oiio.ImageInput.open(str(tmp_path / "x.exr"))
         assert source is not None and source.seek_subimage(0, 2)
     else:

@@ -21,11 +21,15 @@ from ..reference.ikoma import layered_fft
 from ..reference.lens_views import lens_views_by_coc
 from ..reference.scenes import Scene, read_scenes
 from .measurement import BenchScene, Renderer, error, measure
-from .report import publish, summary
+from .report import Row, publish, summary
 
 __all__ = ["compare", "read_peer", "renderers"]
 
 _TILE_PX = 128
+
+
+def _lens_views(views: int, image: Tensor, coc_px: Tensor) -> Tensor:
+    return lens_views_by_coc(image, coc_px, views=views).image
 
 
 def renderers(degraded: bool) -> dict[str, Renderer]:
@@ -78,7 +82,7 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
     """
     compared = renderers(degraded) | dict(map(read_peer, peers))
     for count in sorted({*views}):
-        compared[f"reference {count}"] = lambda image, coc, n=count: lens_views_by_coc(image, coc, views=n).image
+        compared[f"reference {count}"] = functools.partial(_lens_views, count)
     scenes, console, rows = list(read_scenes(truth)), Console(stderr=True), []
     side = min(_TILE_PX, *(size for scene in scenes for size in scene.image.shape[-2:]))
     panels: dict[str, list[Tensor]] = {}
@@ -99,7 +103,7 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
         window = _worst(pictures["torchdof"], scene, side)
         for name, picture in {"sharp": scene.image, "truth": scene.truth, **pictures}.items():
             panels.setdefault(name, []).append(picture[window][:, :3].expand(-1, 3, -1, -1))
-    tables: dict[str, list[dict[str, Any]]] = {
+    tables: dict[str, Sequence[Row]] = {
         "Means": summary(rows, ["depth", "renderer"], statistics.fmean),
         "Scenes": rows,
     }

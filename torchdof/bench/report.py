@@ -45,13 +45,13 @@ def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float
         for name, value in row.items():
             if isinstance(value, float) and name not in keys:
                 columns.setdefault(name, []).append(value)
-    found = []
+    found: list[dict[str, Any]] = []
     for values, columns in groups.items():
         found.append(dict(zip(keys, values, strict=True)) | {name: mean(of) for name, of in columns.items()})
         if len(columns.get("new_ms", ())) > 1:
             low, _, high = statistics.quantiles(columns["new_ms"], n=4, method="inclusive")
             found[-1]["spread_ms"] = high - low
-    return found
+    return [*found]
 
 
 def publish(

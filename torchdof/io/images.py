@@ -37,7 +37,7 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hol
     ".hdr": ("float",),
     ".pfm": ("float",),
 }
-_OIIO_SAMPLE = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
+_OIIO_SAMPLE: dict[PixelType, str] = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
 _STORED: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.items()} | {"double": "float"}
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
 _HOLDS_ALPHA = (".exr", ".png", ".tif", ".tiff")

@@ -422,7 +422,8 @@ def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool
     memory = torch.empty(sum(areas), dtype=torch.float32, device="cpu")
     made = [part.view(colours, side, side) for part, side in zip(memory.split(areas), sides, strict=True)]
     cells = [template.shape[-1] // 2 - 1 for template in spots.templates]
-    reach, fade, index = (list(itertools.chain.from_iterable(each)) for each in (spots.reach, spots.fade, spots.which))
+    reach, fade = (list(itertools.chain.from_iterable(each)) for each in (spots.reach, spots.fade))
+    index = list(itertools.chain.from_iterable(spots.which))
     lists: list[list[int]] = [cells, index, list(map(int, spots.flipped)), spots.half]
     whole = [(ctypes.c_int32 * max(1, len(each)))(*each) for each in lists]
     numbers = [(ctypes.c_double * len(each))(*each) for each in (spots.part, spots.finer, reach, fade)]
