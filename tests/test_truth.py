@@ -93,7 +93,6 @@ SPEED_OR_ROUNDING = {
     "placed_kernels._ASIDE",
     "placed_kernels._FINE",
     "placed_kernels._LEAST",
-    "placed_kernels._MARGIN",
     "placed_kernels._MOST",
     "placed_kernels._SMALLEST",
     "plan.KERNELS_PER_PX",

@@ -26,7 +26,7 @@ def drawn(part: str, turn: int = 0) -> list[first_pictures.Figure]:
         ("fresh-39", [(1350, 1080)], [(39, 39)]),
         ("fresh-60", [(1333, 2000)], [(60, 60)]),
         ("command", [(1333, 2000)] * 3, [(30, 30), (60, 60), (111, 111)]),
-        ("cameras", [(96, 128)], [(4, 64)]),
+        ("cameras", [(160, 192)], [(4, 64)]),
         ("pull", [(1080, 1920)] * 2, [(69, 69)] * 2),
         ("small", [(256, 256)] * 3, [(2, 8)] * 3),
         ("lamps", [(480, 640)], [(500, 500)]),
@@ -65,7 +65,9 @@ def test_a_figure_is_of_a_new_camera_the_same_again_and_a_reference(monkeypatch:
 def test_an_installation_that_is_wrong_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     right = first_pictures.blur_by_coc
     monkeypatch.setattr(first_pictures, "figures", lambda *_: [])
-    monkeypatch.setattr(first_pictures, "blur_by_coc", lambda *a, tolerance: right(*a, tolerance=tolerance) + tolerance)
+    monkeypatch.setattr(
+        first_pictures, "blur_by_coc", lambda *a, tolerance: right(*a, tolerance=tolerance) + 4 * tolerance
+    )
     with pytest.raises(RuntimeError, match="does not keep its tolerance"):
         first_pictures.turn_of("cameras", SCENES, 0)
 

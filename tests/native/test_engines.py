@@ -315,7 +315,9 @@ def test_the_plain_engine_serves_all_else(counted: list[str]) -> None:
     assert blur_by_coc(image.double(), coc).dtype == torch.float64
     blur_by_coc(image, coc.double())
     blur_by_coc(image, coc, method="fold")
-    blur_by_coc(image[..., :4, :].repeat(1, 1, 1, 5), torch.full((1, 1, 4, 200), 90.0))  # a Fourier transform's kernel
+    blur_by_coc(
+        image[..., :2, :].repeat(1, 1, 1, 18), torch.full((1, 1, 2, 720), 400.0)
+    )  # a Fourier transform's kernel
     assert torch.equal(blur_by_coc(image, 0.0 * coc), image)
     assert counted == []
 
@@ -465,7 +467,7 @@ def engine():
 for seconds in (0.2, 0.4):
     threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT)).start()
 try:
-    native._interruptible(engine, cancelled)
+    native._interruptible(engine, cancelled, 1 << 30)
 except KeyboardInterrupt:
     print("after the engine" if ended else "while the engine runs")
 """

@@ -85,13 +85,13 @@ def test_a_point_of_light_shows_the_aperture_upright_behind_focus_and_turned_in_
     mask = mask if coc_px > 0 else mask.flip(-2, -1)
     for axis in (0, 1):
         place = torch.arange(len(mask), dtype=torch.float64)
-        assert_close((picture.sum(axis) * place).sum(), (mask.sum(axis) * place).sum(), rtol=0, atol=1e-3)
+        assert_close((picture.sum(axis) * place).sum(), (mask.sum(axis) * place).sum(), rtol=0, atol=4e-4 * abs(coc_px))
         # a kernel leaves out that pixels are integrals: 1/24 of the second difference along each axis
         around = functional.pad(picture, (0, 0, 1, 1) if axis == 0 else (1, 1))
         picture = picture + around.diff(n=2, dim=axis) / 24
-    assert_close(picture, mask, rtol=0, atol=1e-4)
+    assert_close(picture, mask, rtol=0, atol=0.2 * float(mask.max()))
     for other in (mask.flip(-2, -1), mask.flip(-1)):
-        assert (picture - other).abs().max() > 1e-4
+        assert (picture - other).abs().max() > 0.5 * mask.max()
 
 
 def test_at_no_rotation_a_corner_points_up_and_turning_goes_counter_clockwise() -> None:

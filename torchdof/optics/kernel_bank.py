@@ -164,7 +164,7 @@ class KernelBank:
 
     def __init__(self, table: Lens) -> None:
         self.table, self.colours, self.is_even = table, table.channels, table.field is not None
-        self.squeeze = 1.0 if table.aperture is None else float(table.aperture.squeeze)
+        self.squeeze = 1.0 if table.aperture is None else float(torch.as_tensor(table.aperture.squeeze).detach())
         self.widest = max(1.0, 1.0 / self.squeeze)
         self._lens = table.fingerprint()
         self._moved: dict[float, list[float]] = {}
@@ -277,6 +277,7 @@ class KernelBank:
         if spots.moves is not None:
             parts, reach = parts + spots.moves[0], reach + spots.moves[1]
         step = torch.arange(-half, half + 1, dtype=torch.float64)
+        outside = (torch.maximum(step.abs(), step.abs()[:, None]) > halves[:, None, None])[:, None]
         if self.is_even:
             disc = (torch.hypot(step[:, None], step) <= reach[:, :, None, None]).to(torch.float64)
             made = disc / disc.sum((-2, -1), keepdim=True)
@@ -287,13 +288,11 @@ class KernelBank:
                 low, high, fine_low, fine_high = (spots.templates[i].double() for i in key)
                 sizes, part = reach[which], parts[which][:, None, None, None]
                 cut = halves[which, None] < sizes.detach() * self.widest - 1e-9
-                kernel = self._sampled(torch.lerp(low, high, part), sizes, half, cut)
+                kernel = self._sampled(torch.lerp(low, high, part), sizes, outside[which], cut)
                 if bool((finer[which] > 0).any()):
-                    fine = self._sampled(torch.lerp(fine_low, fine_high, part), sizes, half, cut)
+                    fine = self._sampled(torch.lerp(fine_low, fine_high, part), sizes, outside[which], cut)
                     kernel = torch.lerp(kernel, fine, finer[which][:, None, None, None])
                 made = made.index_put((which,), kernel)
-        outside = torch.maximum(step.abs(), step.abs()[:, None]) > halves[:, None, None]
-        made = torch.where(outside[:, None], 0.0, made)
         if any(spots.flipped):
             made = torch.where(torch.tensor(spots.flipped)[:, None, None, None], made.flip(-2, -1), made)
         if bool((fade == 1.0).all()):
@@ -302,14 +301,15 @@ class KernelBank:
         centre[..., half, half] = 1.0
         return torch.lerp(centre, made, fade[:, :, None, None])
 
-    def _sampled(self, cells: Tensor, reach: Tensor, half: int, cut: Tensor) -> Tensor:
-        """Kernels ``[n, C, 2 half + 1, 2 half + 1]`` from templates ``[n, C, cells, cells]`` and reach ``[n, C]``.
+    def _sampled(self, cells: Tensor, reach: Tensor, outside: Tensor, cut: Tensor) -> Tensor:
+        """Kernels ``[n, C, k, k]`` from templates ``[n, C, cells, cells]`` and reach ``[n, C]``.
 
-        Those that are cut have their share of the light.
+        They are 0 at the pixels ``outside`` ``[n, 1, k, k]``. Those that are ``cut`` have their share of the light.
         """
         high = reach / (cells.shape[-1] // 2 - 1)
         wide = high / self.squeeze
-        kernel = psf.sampled(cells, high, high if self.squeeze == 1.0 else wide, half)
+        kernel = psf.sampled(cells, high, high if self.squeeze == 1.0 else wide, outside.shape[-1] // 2)
+        kernel = kernel.masked_fill(outside, 0.0)
         light = cells.sum((-2, -1)) * high.clamp_min(1.0) * wide.clamp_min(1.0)  # of all pixels
         light = torch.where(cut, light, kernel.sum((-2, -1)))
         return kernel / light[..., None, None]

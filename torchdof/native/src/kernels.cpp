@@ -175,8 +175,8 @@ class Maker {
       for (size_t k = 0; k < area; k++) sum += a[k] + part * (b[k] - a[k]);
       sum *= std::max(high, 1.0) * std::max(wide, 1.0);
     }
-    const float per_sum = sum > 0 ? (float)(1 / sum) : 0.0f;
-    for (int k = 0; k < side * side; k++) out[k] *= per_sum;
+    const double per_sum = sum > 0 ? 1 / sum : 0.0;
+    for (int k = 0; k < side * side; k++) out[k] = (float)(out[k] * per_sum);
   }
 
   // Limits the values of a kernel [n, n], and takes what a negative one lacks from its four neighbours.
