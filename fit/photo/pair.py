@@ -16,17 +16,15 @@ from ..problems import FitError, warn
 from ..result import Array, BlurFit
 from ..solve import one_thread
 from ..validation import a_choice, a_count, a_number, a_picture
-from .checks import FAR_ABOVE, check_fit
+from .checks import EXPLAINED, FAR_ABOVE, check_fit, check_focus, check_levels, check_linearity
 from .diagnostics import bic_of, describe
-from .dot import find_dot, fine_share_inside
+from .dot import check_blacks, find_dot, fine_share_inside, used_pixels
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
-from .linearity import EXPLAINED, check_focus, check_levels, check_linearity, check_noise
 from .noise import independent_share
 from .opening import solve_image, solve_opening, solve_polygon
 from .radial import solve_radial, solve_round
 from .ratio import fit_ratio
-from .saturation import check_blacks, used_pixels
 from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
 
 __all__ = ["fit_pair", "prepared_pair"]
@@ -38,7 +36,6 @@ _SMALLEST_WINDOW = 15
 _SMALLEST_DOT_PX = 0.2
 _AS_GOOD = 2e-3
 _GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
-_FINE = 0.5  # share of fine noise from which on its level can be judged
 _EXACT_PX = 4.0  # radius of a dot, and of its blur, below which pixels leave what looks like a tone curve
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
@@ -179,16 +176,13 @@ def fit_pair(
         judged = fit if freest is solution else describe(pair, freest, "")
         check_fit(pair, solution, fit, files[1], judged)
         if edge is not None:
-            # what demosaicing leaves at an edge is louder than what it leaves of the noise
-            if linear and pair.fine_share > _FINE:
-                linear = check_noise(pair, solution, edge.level, files[1])
             # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed,
             # and what that leaves goes with the level, too
             most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
             large = min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
             if linear and large and judged.residual_over_noise < most:
                 check_levels(pair, freest, expected, edge, files[1])
-            check_focus(edge, fit.radius, bool(pair.source.variants), files[0])
+            check_focus(edge, fit.radius, pair.source.ideal, files[0])
     return replace(fit, psnr=psnr)
 
 
