@@ -19,7 +19,6 @@ __all__ = [
     "find_dots",
     "fine_share_inside",
     "inner_pixels",
-    "radial_mean",
     "used_pixels",
 ]
 
@@ -130,7 +129,9 @@ def _measured(above: Array, x: float, y: float, noise: float, peak: float) -> tu
     rows, columns = np.indices(above.shape).astype(np.float64)
     for _ in range(3):
         distance = np.hypot(columns - x, rows - y)
-        mean, count = radial_mean(above, distance)
+        rings = np.floor(distance + 0.5).astype(np.int64).ravel()  # one px wide
+        count = np.bincount(rings)[: max(3, min(above.shape) // 2 + 1)]  # but for those that the crop cuts
+        mean = np.bincount(rings, weights=above.ravel())[: count.size] / np.maximum(count, 1)
         dark = np.abs(mean) < np.maximum(2.5 * noise / np.sqrt(np.maximum(count, 1)), 5e-4 * peak)
         bright = int(np.argmax(mean))
         quiet = np.flatnonzero(dark[bright:-1] & dark[bright + 1 :])
@@ -140,15 +141,6 @@ def _measured(above: Array, x: float, y: float, noise: float, peak: float) -> tu
         x, y = float((inside * columns).sum() / total), float((inside * rows).sum() / total)
     moment = float((inside * ((columns - x) ** 2 + (rows - y) ** 2)).sum() / total)
     return x, y, float(np.sqrt(max(2 * moment, 0.0))), reach
-
-
-def radial_mean(picture: Array, distance: Array) -> tuple[Array, Array]:
-    """Mean of a picture over rings one px wide, and how many pixels each has: both `[largest whole ring]`."""
-    bins = np.floor(distance + 0.5).astype(np.int64).ravel()
-    count = np.bincount(bins)
-    total = np.bincount(bins, weights=picture.ravel())
-    whole = max(3, min(count.size, min(picture.shape) // 2 + 1))
-    return total[:whole] / np.maximum(count[:whole], 1), count[:whole].astype(np.float64)
 
 
 def inner_pixels(picture: Array, dot: Dot) -> Mask | None:

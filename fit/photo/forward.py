@@ -181,13 +181,16 @@ class Forward:
         shape = SHAPES[family]
         names = (*shape, *self.fit_moves)
         unmoved = self.moves({})
-        expected, pull = self._prior(names)
+        # what is expected, as further data that are as uncertain as a pixel
+        noise = max(noise_of(self.data), 1e-5 * self.unit) / self.unit
+        mean, deviation = np.array([self.prior.get(n, (0.0, np.inf)) for n in names]).T
+        pull = noise / deviation
         numbers = best_of(
-            lambda p: np.concatenate([self.project(self._shaped(family, names, p))[0] / self.unit, pull @ p]),
-            np.concatenate([self.values / self.unit, expected]),
+            lambda p: np.concatenate([self.project(self._shaped(family, names, p))[0] / self.unit, pull * p]),
+            np.concatenate([self.values / self.unit, pull * mean]),
             [[start[n] if n in start else unmoved[n] for n in names] for start in self._starts(family)],
             self.bounds(names),
-            jacobian=lambda p: np.concatenate([self._jacobian(family, names, p) / self.unit, pull]),
+            jacobian=lambda p: np.concatenate([self._jacobian(family, names, p) / self.unit, np.diag(pull)]),
             tolerance=1e-7,
             # a neighbour's branch is left only for one that chi squared prefers by 12
             loyalty=12 / self.values.size if family in self.start else 0.0,
@@ -204,7 +207,7 @@ class Forward:
             background=background,
             model=self.picture(fitted, np.nan),
             names=names,
-            covariance=self.covariance(slopes, residual, kernel, gain, self.unit**2 * pull.T @ pull, of_prior=True),
+            covariance=self.covariance(slopes, residual, kernel, gain, np.diag((self.unit * pull) ** 2), of_prior=True),
             squares=float(residual @ residual),
             slopes=slopes,
         )
@@ -213,15 +216,6 @@ class Forward:
         """The moves among fitted parameters, the fixed ones filled in."""
         held = self.magnification if self.held_magnification is None else self.held_magnification
         return {n: params.get(n, held if n == "magnification" else 0.0) for n in ALL_MOVES}
-
-    def _prior(self, names: tuple[str, ...]) -> tuple[Array, Array]:
-        """The prior as further data of the fit: what is expected `[k]`, and its slopes `[k, p]`."""
-        rows = [(i, *self.prior[n]) for i, n in enumerate(names) if n in self.prior]
-        noise = max(noise_of(self.data), 1e-5 * self.unit) / self.unit
-        pull = np.zeros((len(rows), len(names)))
-        for k, (i, _, deviation) in enumerate(rows):
-            pull[k, i] = noise / deviation
-        return np.array([noise * mean / deviation for _, mean, deviation in rows]), pull
 
     def covariance(
         self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array, of_prior: bool = False
@@ -329,13 +323,9 @@ class Forward:
         added = (self.dot.radius**2 - (self.magnification * self.source.radius) ** 2) / 4
         size = min(float(np.sqrt(max(added, 0.15))), self.half / 3)
         if family not in OPENINGS:
-            moments = [{n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family]]
-        elif given:  # an opening's turn is given with it
-            moments = []
-        else:
-            of_one = float(self.rms(family, {"radius": np.ones(1)})[0])
-            moments = [{"radius": np.sqrt(2) * size / of_one}]
-        return [*given, *moments]
+            return [*given, *({n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family])]
+        # an opening's turn is given with it
+        return given or [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
 
 
 def without_level(columns: Array, shaped: Array) -> Array:

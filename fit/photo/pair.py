@@ -153,24 +153,30 @@ def fit_pair(
         # whether the magnification is settled before the fit: a point has none
         held = True if sharp is None else None if fit_magnification is None else not fit_magnification
         pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
+        pair.opening = aperture
+        free_profile = family in ("auto", "radial", *OPENINGS) and aperture is None
+        # no wrong family can mislead a free profile about the magnification
+        expected = freest = solution = solve_round(pair, knots, reach) if free_profile else pair.solve(family)
+        if held is None:
+            unheld = replace(pair, fit_moves=ALL_MOVES)
+            radius = float(solution.params["radius"]) if free_profile else 0.0
+            free = solve_radial(unheld, solution.moves, radius, knots) if free_profile else unheld.solve(family)
+            if _improves(pair, solution, free):
+                pair.fit_moves, freest, solution = ALL_MOVES, free, free
         why, psnr = "", dict[str, float]()
-        if family in ("auto", "radial", *OPENINGS) and aperture is None:
-            expected, solution = _solve_radial(pair, held, knots, reach)
-            freest = solution
+        if free_profile:
+            pair.held_magnification = freest.moves["magnification"]
+            opened = None
             if family == "auto":
                 solution, why, psnr = _choose(pair, freest, accuracy_db)
-                found = solve_opening(pair, freest)
-                if found is not None and not looks_alike(pair.kernel(solution), found[0].kernel(found[1]), accuracy_db):
-                    pair, solution, why = found
-                    freest = expected = solution
+                opened = solve_opening(pair, freest)
+                if opened is not None and looks_alike(pair.kernel(solution), opened[0].kernel(opened[1]), accuracy_db):
+                    opened = None
             elif family != "radial":
-                pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
+                opened = (*(solve_polygon if family == "polygon" else solve_image)(pair, freest), "")
+            if opened is not None:
+                pair, solution, why = opened
                 freest = expected = solution
-        else:
-            pair.opening = aperture
-            solution = freest = expected = pair.solve(family)
-            if held is None and _improves(pair, solution, free := replace(pair, fit_moves=ALL_MOVES).solve(family)):
-                pair.fit_moves, solution, freest = ALL_MOVES, free, free
         fit = describe(pair, solution, why)
         # a family that was chosen for being cheap is not to blame for what the freest kernel explains
         judged = fit if freest is solution else describe(pair, freest, "")
@@ -256,23 +262,6 @@ def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
     floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
     # noise that goes together in neighbours does not average out over them
     return (held.squares - free.squares) / floor * independent_share(pair.noise_correlation) > _SIGNIFICANT
-
-
-def _solve_radial(
-    pair: Forward, held: bool | None, knots: int | None, reach: float | None
-) -> tuple[Solution, Solution]:
-    """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`.
-
-    The first is that with the expected magnification.
-    """
-    expected = solution = solve_round(pair, knots, reach)
-    if held is None:
-        radius = float(solution.params["radius"])
-        free = solve_radial(replace(pair, fit_moves=ALL_MOVES), solution.moves, radius, knots)
-        if _improves(pair, solution, free):
-            pair.fit_moves, solution = ALL_MOVES, free
-    pair.held_magnification = solution.moves["magnification"]
-    return expected, solution
 
 
 def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
