@@ -183,14 +183,11 @@ class Render:
     def _render_each(self, renderer: "Renderer", jobs: Sequence[_Job], read: "Callable[[_Job], Frame]") -> None:
         """Renders frames in order; while one is rendered, the next is read and the one before is written."""
         read_ahead: deque[Future[Frame]] = deque()
-        written: Future[Rendered] | None = None
+        written: list[Future[None]] = []  # the last
 
-        def finish() -> None:
-            nonlocal written
-            last, written = written, None
-            if last is not None:
-                self._tell(last.result())
-                bar.done += 1
+        def write(rendered: "Rendered") -> None:  # in a thread that no interrupt ends between a file and its name
+            self._tell(renderer.write(rendered))
+            bar.done += 1
 
         with Bar("", len(jobs)) as bar, ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
             coming = iter(jobs)
@@ -199,10 +196,12 @@ class Render:
                     bar.what = f"frame {k + 1} of {len(jobs)}"
                     read_ahead += [reader.submit(read, one) for one in itertools.islice(coming, 2 - len(read_ahead))]
                     rendered = renderer.render(read_ahead.popleft().result(), job.out, job.number)
-                    finish()
-                    written = writer.submit(renderer.write, rendered)
+                    for last in written:
+                        last.result()
+                    written = [writer.submit(write, rendered)]
             finally:  # what was rendered is written, whatever happens to the next
-                finish()
+                for last in written:
+                    last.result()
 
     def _tell(self, rendered: "Rendered") -> None:
         click.echo(rendered.told(self.as_json))
