@@ -16,12 +16,12 @@ from ..depth.inspect import tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import coc_mistakes, depth_mistakes
-from ..depth.size import at_size_of
 from ..io.images import Picture, read_image, read_values, write_image
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
+from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect
 from .options import Scene, edges_of, pick_device, refuse_input
 from .printed import Bar, WarnOnce, tell

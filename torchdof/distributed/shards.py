@@ -25,11 +25,11 @@ from ..augmentation import RandomDepthOfField
 from ..depth.holes import resolve_holes
 from ..depth.reading import read_depth
 from ..depth.relative import from_relative
-from ..depth.size import at_size_of
 from ..io.atomic import whole_file, write_text
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.transfer import Transfer
 from ..module import depth_of_field
+from ..render.resample import at_size_of
 from ..validation import number, show, whole
 
 __all__ = ["SUFFIXES", "Format", "Pair", "RenderShards", "name_of", "samples_of", "shard_rows"]
