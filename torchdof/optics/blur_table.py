@@ -358,7 +358,7 @@ class BlurTable:
         cut = [(whole if size is not None else half) + 1] * len(coc_px) if half < reach else []
         made = bank_of(self).kernels(signed, width, longest=cut)
         if size is not None:  # all light is in the size that was asked for
-            made = made / made.sum((-2, -1), keepdim=True)
+            made = made / made.sum((-2, -1), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
         spare = half - made.shape[-1] // 2
         return functional.pad(made, (spare,) * 4).to(coc_px.device)
 
