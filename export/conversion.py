@@ -14,8 +14,8 @@ import torch
 from onnxscript import opset20
 
 from torchdof import DepthOfField
-from torchdof.depth.edges import DepthEdges
 from torchdof.io.atomic import whole_file
+from torchdof.options import DepthEdges
 
 from . import lists, ray_splats
 from .graph import INPUTS, OUTPUT, Portable, trace

@@ -2,22 +2,19 @@
 
 import copy
 import dataclasses
-import functools
 
 import torch
 import torch._dynamo.config
 from torch import Tensor, nn
 
-from torchdof import BlurTable, DepthOfField, blur_by_coc
-from torchdof.depth.edges import DepthEdges
-from torchdof.exporting import Graph, graph_context, where_needed
+from torchdof import BlurTable, DepthOfField
+from torchdof.module import blur
 from torchdof.optics.camera import Camera
+from torchdof.options import DepthEdges, Options
+from torchdof.render.ops import Ops
 from torchdof.render.plan import Blur, Plan
 
-from .lists import by_parts
-from .operators import choose
-from .rays import kernels_of, splat
-from .tiling import seen, side, tile_by_tile
+from .operations import GraphOps
 
 __all__ = ["INPUTS", "OUTPUT", "Portable", "trace"]
 
@@ -62,74 +59,59 @@ class Portable(nn.Module):
                     "focus_m and f_number are inputs "
                     "of the graph, so any value does for them"
                 )
+        check_width(dof.options.table, width)
         self.inputs, self.width = inputs, width
         self.dof = copy.copy(dof)
-        table = pinned(dof.options.table, width)
-        self.dof.options = dataclasses.replace(dof.options, table=table, check=False, depth_edges=depth_edges)
-        self.called = copy.copy(dof)
-        self.called.options = dataclasses.replace(dof.options, table=table, check=False)
+        self.dof.options = dataclasses.replace(dof.options, check=False, depth_edges=depth_edges)
+        self.called = dataclasses.replace(dof.options, check=False)
+        self.plan = Plan.all(dof.options.max_coc_px, dof.options.tolerance, rays=True)
+        self.ops = Ops()
+        self.ops.lens_width = width
         self.eval()
 
     def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
         """Render ``[B, C, H, W]`` with depth and ``(focus_m, f_number)``, or with a map of the coc."""
-        plan = None if torch.compiler.is_exporting() else self.plan
+        out = self._rendered(self.dof.options, self.plan, image, map_, *lens)
         if self.inputs == "coc_px":
-            return blur_by_coc(image, map_, plan=plan, **self.dof.options.arguments())
-        out = self.dof(image, map_, *lens, plan=plan)
+            return out
         focus_m, f_number = lens
         camera = self.dof.camera
         least_m = float(camera.focal_length_mm) / 1000.0 if camera.focus_breathing else 0.0
         possible = (focus_m > least_m) & (f_number > 0) & (f_number < torch.inf)
         undefined = torch.where(possible[:, None, None, None], out, torch.nan)
-        return where_needed(lambda: ~possible.all(), undefined, out)
+        return self.ops.choose(lambda: ~possible.all(), undefined, out)
 
     def as_called(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
         """Render as those do who call the module: layers for the scene, highlights ray by ray, edges mended."""
-        if self.inputs == "coc_px":
-            return blur_by_coc(image, map_, **self.called.options.arguments())
-        return self.called(image, map_, *lens)
+        return self._rendered(self.called, None, image, map_, *lens)
 
-    @property
-    def plan(self) -> Plan:
-        """The layers of the graph."""
-        return Plan.all(self.dof.options.max_coc_px, self.dof.options.tolerance, rays=True)
+    def _rendered(self, options: Options, plan: Plan | None, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
+        if self.inputs == "coc_px":
+            return blur(image, map_, options, plan, ops=self.ops)
+        focus_m, f_number = lens
+        coc_px = self.dof.coc_as_given(image, map_, focus_m, f_number)
+        return blur(image, coc_px, options, plan, ops=self.ops)
 
     def blurs(self, size: tuple[int, int]) -> list[Blur]:
         """Kernels of the graph's layers, for a frame of this height and width."""
         coarse = self.dof.options.method == "layered"
-        return self.plan.blurs(self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse)
+        return self.plan.blurs(self.dof.options.table, size, torch.float32, torch.device("cpu"), coarse, self.width)
 
 
-class _Pinned(BlurTable):
-    """A table whose kernels are those of one image width, whatever the width of the image at hand."""
-
-    def __init__(self, table: BlurTable, width: int) -> None:
-        names = ("unit", "sensor_width_mm", "strength", "name", "provenance", "residual", "aperture", "field")
-        super().__init__(table.family, table.coc, table.node_params, **{name: getattr(table, name) for name in names})
-        self._scale = super().px_per_unit(width)
-        self.unit = "relative"  # to the plan: not tied to the width
-
-    def px_per_unit(self, width: float) -> float:
-        # the plan tells the width of a coarser layer as a part of 1: there the same lengths have fewer pixels
-        return getattr(self, "_scale", 1.0) * min(width, 1.0)
-
-
-def pinned(table: BlurTable, width: int | None) -> BlurTable:
-    """The table with its lengths taken at an image width; a table of unit ``"relative"`` as it is.
+def check_width(table: BlurTable, width: int | None) -> None:
+    """Refuse a width for a table that needs none, and a table with lengths without one.
 
     Raises:
-        ValueError: If the table needs a width and there is none, or the other way round.
+        ValueError: Saying what to do.
     """
     if table.unit == "relative":
-        if width is not None and not isinstance(table, _Pinned):
+        if width is not None:
             raise ValueError(f"{table!r} has the same kernels at any image width; leave out width={width}")
-        return table
-    if isinstance(width, bool) or not isinstance(width, int) or width < 1:
+    elif isinstance(width, bool) or not isinstance(width, int) or width < 1:
         raise ValueError(
             f"{table!r} holds lengths in {table.unit!r}, and the kernels in the file are those of one image width; "
             f"state it as width=1920, say, got {width!r}"
         )
-    return _Pinned(table, width)
 
 
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
@@ -143,16 +125,12 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
         raise ValueError(f"the table blurs {table.channels} channels, the image has {channels}")
     image, map_ = torch.rand(size[0], channels, *size[1:]), torch.rand(size[0], 1, *size[1:]) + 1.0
     example = (image, map_, *(torch.full(size[:1], value) for value in (1.5, 2.8)[: len(INPUTS[portable.inputs]) - 2]))
-    portable.plan.keep_constants(table, portable.dof.options.method == "layered")
+    traced = copy.copy(portable)
+    traced.ops = GraphOps(portable.plan, table, portable.dof.options.method == "layered", portable.width)
     free = torch.export.Dim.AUTO
     batch, frame = {0: free}, {0: free, 2: free, 3: free}
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
     # what torch would keep of each operator, to know one like it again, takes longer than it saves: sizes are symbols
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
-    splat_rays = functools.partial(splat, kernels=kernels_of(table, portable.plan))
-    token = graph_context.set(Graph(side, tile_by_tile, seen, splat_rays, choose, by_parts))
-    try:
-        with torch.no_grad(), uncached:
-            return torch.export.export(portable, example, dynamic_shapes=shapes, strict=False)
-    finally:
-        graph_context.reset(token)
+    with torch.no_grad(), uncached:
+        return torch.export.export(traced, example, dynamic_shapes=shapes, strict=False)

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchdof import pixels
 from torchdof.optics.blur_table import BlurTable
-from torchdof.render.highlights import COARSE_CELL, Highlights
+from torchdof.render.highlights import COARSE_CELL
 from torchdof.render.plan import Plan
+from torchdof.render.surfaces import Highlights
 
 from .operators import operator
 
@@ -46,14 +47,14 @@ class Kernels(NamedTuple):
     margin: int
 
 
-def kernels_of(table: BlurTable, plan: Plan) -> Kernels:
-    """Kernels of the highlights of a plan, for a table that is not tied to a width."""
+def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
+    """Kernels of the highlights of a plan, in an image of a width in pixels."""
     farthest = max(abs(c) for c in plan.coc_px)
     count = int(farthest * plan.kernels_per_px) + 2
     values, size, places = [torch.zeros(table.channels, 1)], 1, []
     seen: dict[bytes, tuple[int, int]] = {}
     for step in range(-count, count + 1):
-        kernel = table.kernels(torch.tensor([step / plan.kernels_per_px], dtype=torch.float64), 1)[0].float()
+        kernel = table.kernels(torch.tensor([step / plan.kernels_per_px], dtype=torch.float64), lens_width)[0].float()
         half = kernel.shape[-1] // 2
         if table.is_round:
             row, column = torch.tril_indices(half + 1, half + 1)

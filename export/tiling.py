@@ -10,9 +10,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof.exporting import where_needed
-from torchdof.render.disocclusion import BEHIND_PX, Level, search
-from torchdof.render.plan import Blur
+from torchdof.render.disocclusion import BEHIND_PX, search
+from torchdof.render.ops import Level, Ops, Seen
 from torchdof.render.surfaces import Frame, Placed
 
 from .operators import collect, window
@@ -28,14 +27,14 @@ def side(margin: int) -> int:
     return next((n for n in (_SIDE, 128) if margin <= n // 2), 256)
 
 
-def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, Sequence[Blur]], Tensor]) -> Tensor:
+def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> Tensor:
     """Render each tile of a frame as a frame of its own.
 
     Args:
         frame: Surfaces and their border; its area is a multiple of :func:`side`.
-        blurs: Kernel and resolution of each layer.
-        render: Renders one tile with them: ``[1, C, side, side]``, or with weights of its light, 1 where it is sharp,
-            in further channels.
+        render: Renders one tile: ``[1, C, side, side]``, or with weights of its light, 1 where it is sharp, in further
+            channels.
+        ops: How a sharp tile is skipped.
 
     Returns:
         The same of the frame, ``[B, C, H, W]``.
@@ -46,21 +45,19 @@ def tile_by_tile(frame: Frame, blurs: Sequence[Blur], render: Callable[[Frame, S
     inner = (..., slice(margin, margin + length), slice(margin, margin + length))
     size = (length, length)
     piece = Frame(surfaces, frame.nodes, frame.ramps, behind, margin, size, size, frame.occlusion)
-    rendered, sharp = render(piece, blurs), surfaces[0].light[inner]
+    rendered, sharp = render(piece), surfaces[0].light[inner]
     weights = int(rendered.shape[1]) - frame.colours
     if weights:
         sharp = torch.cat([sharp, torch.ones_like(sharp[:, :weights])], 1)
-    tile = where_needed(lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0, rendered, sharp)
+    tile = ops.choose(lambda: torch.stack([s.x.abs().max() for s in surfaces]).max() > 0, rendered, sharp)
     rows, columns = (n // length for n in frame.area)
     batch = frame.surfaces[0].light.shape[0]
     pieces = collect(tile, batch * rows * columns)
     return _joined(pieces, (batch, rows, columns))[..., : frame.size[0], : frame.size[1]]
 
 
-def seen(
-    levels: Sequence[Level], coc_px: Tensor, mask: Tensor, step: int = 1, farthest: bool = False
-) -> tuple[Tensor, Tensor]:
-    """What levels of a pyramid show behind the surfaces of a map, as :data:`torchdof.render.disocclusion.Seen`.
+def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops, step: int, farthest: bool) -> Seen:
+    """What levels of a pyramid show behind the surfaces of a map, as :mod:`torchdof.render.disocclusion` looks for it.
 
     Behind cells it is looked for at once, behind pixels tile by tile, and only in those behind which there may be
     something.
@@ -71,7 +68,7 @@ def seen(
         lists = [samples(v, size, lv.step / step, (zero, zero)) for v, lv in zip(around, levels, strict=True)]
         shown, total = search(levels, lists, coc_px, farthest)
         found = torch.cat([shown, total * mask], 1)
-        found = where_needed(lambda: mask.any(), found, torch.zeros_like(found))
+        found = ops.choose(lambda: mask.any(), found, torch.zeros_like(found))
         return found[:, :-1], found[:, -1:]
 
     whole = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # both have one centre
@@ -95,7 +92,7 @@ def seen(
         most = torch.stack([level.values[:, -2].max() for level in pieces]).max()
         return (mask.max() > 0) & (most > coc_px.min() + (BEHIND_PX - 0.5))
 
-    tile = where_needed(hides, found, torch.zeros_like(found))
+    tile = ops.choose(hides, found, torch.zeros_like(found))
     rows, columns = ((w + m) // _SIDE for w, m in zip(whole, more, strict=True))
     batch = looking.shape[0]
     tiles = collect(tile, batch * rows * columns)

@@ -88,6 +88,7 @@ SPEED_OR_ROUNDING = {
     "matting.NEVER_PX",
     "matting._MOST_WEIGHT",
     "matting._UNBOUNDED",
+    "ops._PART",
     "pipeline._REACH",
     "placed_kernels.DISTANCES",
     "placed_kernels._ASIDE",
@@ -99,6 +100,7 @@ SPEED_OR_ROUNDING = {
     "plan._FEWER_KERNELS_PER_PX",
     "plan._SMALL_RADII",
     "scatter._COLUMN_BYTES",
+    "traced._KEPT",
 }
 """What does not decide how a picture looks: budgets, safety, finer steps, and numbers that only have to be small."""
 HELD_BESIDE_IT = {
@@ -129,9 +131,12 @@ FOLDERS = ("torchdof.render.", "torchdof.optics.placed_kernels")
 
 
 def numbers() -> list[str]:
-    """Numbers that the plain engine is made with, as ``module.NAME``."""
+    """Numbers that the plain engine is made with, as ``module.NAME``; repair has none to do where depth is exact."""
     found = []
-    for path in [*sorted(Path(torchdof.render.__file__).parent.glob("*.py")), Path(placed_kernels.__file__)]:
+    files = [*sorted(Path(torchdof.render.__file__).parent.glob("*.py")), Path(placed_kernels.__file__)]
+    for path in files:
+        if path.stem == "edges":
+            continue
         for statement in ast.parse(path.read_text()).body:
             if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
                 name = f"{path.stem}.{statement.targets[0].id}"

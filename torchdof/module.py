@@ -1,8 +1,9 @@
 """Depth of field as a module and as functions: configuration, checks, then one call of the pipeline."""
 
+import contextlib
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Unpack
 
 import torch
@@ -10,15 +11,14 @@ from torch import Tensor, nn
 
 from . import validation
 from .batch import flattened, leading_axes, numbers, restored
-from .depth.edges import STEP_PX, repair
-from .depth.size import at_size_of
-from .exporting import where_needed
 from .optics.blur_table import BlurTable
 from .optics.camera import CAMERA_NUMBERS, Camera
 from .options import OPTION_NAMES, OptionArguments, Options, read_state, spells_options
-from .render import pipeline
+from .render import edges, pipeline
 from .render.attention import Attention
+from .render.ops import EAGER, Ops
 from .render.plan import Plan
+from .render.resample import at_size_of
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -111,13 +111,13 @@ class DepthOfField(nn.Module):
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
         background = flattened(axes, "background", background, "C")
         background_depth = flattened(axes, "background_depth", background_depth)
-        coc = self._coc_px(image, depth, *lens, "depth")
+        coc = self.coc_as_given(image, depth, *lens)
         validation.background(image, background, "background_depth", background_depth, "in metres")
         behind = None
         if background is not None and background_depth is not None:
-            behind = self._coc_px(background, background_depth, *lens, "background_depth")
+            behind = self.coc_as_given(background, background_depth, *lens, name="background_depth")
         attention = flattened(axes, "attention", attention)
-        return restored(axes, _blur(image, coc, options, plan, background, behind, attention))
+        return restored(axes, blur(image, coc, options, plan, background, behind, attention))
 
     def layers(
         self,
@@ -154,8 +154,9 @@ class DepthOfField(nn.Module):
         if not options.occlusion:
             raise ValueError("layers hide each other: they need occlusion=True")
         frame = rgba.new_empty(batch, 1, height, width)
-        cocs = [self._coc_px(frame, layer, focus_m, f_number, "depth_m") for layer in maps.unbind(1)]
-        return _rendered(pipeline.blur_stack, rgba, torch.stack(cocs, 1), options)
+        cocs = [self.coc_as_given(frame, layer, focus_m, f_number, name="depth_m") for layer in maps.unbind(1)]
+        with _engine(rgba):
+            return pipeline.blur_stack(rgba, torch.stack(cocs, 1), options)
 
     def coc_px(
         self,
@@ -174,19 +175,27 @@ class DepthOfField(nn.Module):
         axes = leading_axes(image)
         lens = (numbers(axes, "focus_m", focus_m), numbers(axes, "f_number", f_number))
         image, depth = flattened(axes, "image", image, "C"), flattened(axes, "depth", depth)
-        coc = self._coc_px(image, depth, *lens, "depth")
+        coc = self.coc_as_given(image, depth, *lens)
         validation.image_and_map(image, "coc_px", coc, "in pixels")  # as many items as the image, whatever the lens has
-        return restored(axes, _with_edges(image, coc, self.options))
+        return restored(axes, edges.mended(image, coc, self.options.depth_edges))
 
-    def _coc_px(
+    def coc_as_given(
         self,
         image: Tensor,
         depth: Tensor,
         focus_m: float | Tensor | None,
         f_number: float | Tensor | None,
-        name: str,
+        name: str = "depth",
     ) -> Tensor:
-        """That of a depth as it is given, which the caller knows by a name."""
+        """The circle of confusion of a depth whose edges are as they are given.
+
+        Args:
+            image: ``[B, C, H, W]``.
+            depth: ``[B or 1, 1, H, W]``, of the image's size or one that may be resampled to it.
+            focus_m: A number or ``[B]``; None takes the camera's.
+            f_number: The same.
+            name: Of the depth, in messages.
+        """
         check = self.options.check
         if not validation.is_traced() and validation.is_resizable(image, depth):
             depth = at_size_of(image, depth)
@@ -325,7 +334,7 @@ def blur_by_coc(
         torch.Size([1, 3, 8, 12])
     """
     axes = leading_axes(image)
-    rendered = _blur(
+    rendered = blur(
         flattened(axes, "image", image, "C"),
         flattened(axes, "coc_px", coc_px),
         Options.of(table, **options),
@@ -337,16 +346,20 @@ def blur_by_coc(
     return restored(axes, rendered)
 
 
-def _blur(
+def blur(
     image: Tensor,
     coc_px: Tensor,
     options: Options,
     plan: Plan | None,
-    background: Tensor | None,
-    background_coc_px: Tensor | None,
-    attention: Attention | None,
+    background: Tensor | None = None,
+    background_coc_px: Tensor | None = None,
+    attention: Attention | None = None,
+    ops: Ops = EAGER,
 ) -> Tensor:
-    """Check the arguments of a rendering, then render."""
+    """Check the arguments of a rendering, then render: what all of the names above come to.
+
+    Arguments are those of :func:`blur_by_coc`, of four axes, and the operations that the pipeline is made of.
+    """
     channels = options.table.channels
     validation.image_and_coc(image, coc_px, channels, values=options.check)
     _check_plan(plan)
@@ -357,34 +370,16 @@ def _blur(
     if hidden is not None and not options.occlusion:
         raise ValueError("without occlusion nothing is hidden: a background needs occlusion=True")
     _check_attention(attention, plan, options)
-    coc_px = _with_edges(image, coc_px, options)
-    return _rendered(pipeline.blur_attended, image, coc_px, plan, options, hidden, attention)
+    with _engine(image):
+        return pipeline.blur(image, coc_px, plan, options, hidden, attention, ops)
 
 
-def _rendered(render: Callable[..., Tensor], light: Tensor, *arguments: Any) -> Tensor:
-    """What a function of the pipeline makes of light, with autocast off: it would convolve in half precision."""
+def _engine(light: Tensor) -> contextlib.AbstractContextManager[Any]:
+    """What the pipeline runs in: with autocast off, for it would convolve in half precision."""
     if not validation.is_traced():
         _has_rendered.set()
     device = light.device.type
-    if not torch.is_autocast_enabled(device):
-        return render(light, *arguments)
-    with torch.autocast(device, enabled=False):
-        return render(light, *arguments)
-
-
-def _with_edges(image: Tensor, coc_px: Tensor, options: Options) -> Tensor:
-    """A map of the coc with its edges where the image has them, as far as the options ask for that."""
-    if options.depth_edges == "as given" or (not validation.is_traced() and not _has_steps(coc_px)):
-        return coc_px
-    mended = repair(image, coc_px.detach(), STEP_PX, auto=options.depth_edges == "auto", of_coc=True)
-    mended = where_needed(lambda: _has_steps(coc_px), mended, coc_px)
-    return torch.where(mended == coc_px, coc_px, mended) if validation.is_differentiated(coc_px) else mended
-
-
-def _has_steps(coc_px: Tensor) -> Tensor:
-    """Whether two pixels of a map are so far apart that a repair could change one: half a step, beside lamps."""
-    low, high = validation.ends(coc_px)
-    return ~(high - low < 0.5 * STEP_PX)  # holes tell nothing
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else contextlib.nullcontext()
 
 
 _has_rendered = threading.Event()

@@ -6,30 +6,28 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
-from .depth.edges import DepthEdges
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .validation import depth_edges as check_depth_edges
-from .validation import show
+from .validation import show, tolerance_of
 
 __all__ = [
-    "NAMED",
     "OPTION_NAMES",
+    "DepthEdges",
     "Method",
     "OptionArguments",
     "Options",
     "Tolerance",
     "read_state",
     "spells_options",
-    "tolerance_of",
 ]
 
 Method = Literal["layered", "fold"]
+DepthEdges = Literal["auto", "repair", "as given"]
+"""What is done to depth edges before rendering: repaired where the map proves inexact, or all of them, or nothing."""
+
 Tolerance = float | Literal["draft", "preview", "final"]
 """RMS difference, display-encoded, from the same rendering with exact kernels, dense layers and full resolution."""
-
-NAMED = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
-"""For looking around, for judging a picture, and one that differs by less than a display shows."""
 
 _DISC = BlurTable.disc()  # one for all: what was computed of a table is kept with it
 _LATER_NUMBERS = {"focus_range_m": None, "tilt_deg": 0.0, "swing_deg": 0.0}  # of the camera; older states lack them
@@ -163,24 +161,6 @@ def spells_options(function: _Spelled) -> _Spelled:
                 shown.append(line)
         function.__doc__ = "\n".join(shown)
     return function
-
-
-def tolerance_of(value: Any) -> float:
-    """The number behind a tolerance.
-
-    Raises:
-        ValueError: If it is neither a name nor a number from 0 to below 1.
-
-    Example:
-        >>> tolerance_of("preview") == 4 / 255
-        True
-    """
-    if isinstance(value, str) and value in NAMED:
-        return NAMED[value]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
-        names = ", ".join(repr(name) for name in NAMED)
-        raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, or one of {names}, got {show(value)}")
-    return value
 
 
 def read_state(state: Any) -> tuple[Camera, Options]:

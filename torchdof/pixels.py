@@ -3,18 +3,10 @@
 Depth edges, hidden surfaces and highlights concern few pixels; these are looked at as lists ``[P]``.
 """
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
-from . import validation
-from .exporting import exported_graph
-
-__all__ = ["around", "by_parts", "corners", "indices", "pick", "places", "put"]
-
-
-_PART = 40_000  # pixels that are looked at together
+__all__ = ["around", "corners", "indices", "pick", "places", "put"]
 
 
 def indices(mask: Tensor) -> Tensor:
@@ -64,13 +56,3 @@ def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) 
     first = (item * height + top.long()) * width + left.long()
     below, beside = min(1, height - 1) * width, min(1, width - 1)
     return [first, first + beside, first + below, first + (below + beside)], row - top, column - left
-
-
-def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
-    """What a function finds at pixels ``[P]``, so many at a time that what it needs stays small: ``[n, P]``."""
-    graph = exported_graph()
-    if graph is not None:
-        return graph.by_parts(look, pixels)
-    if validation.is_traced():
-        return look(pixels)
-    return torch.cat([look(part) for part in pixels.split(_PART)], 1)

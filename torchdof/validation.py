@@ -11,6 +11,7 @@ from torch.autograd import forward_ad
 from . import native
 
 __all__ = [
+    "NAMED_TOLERANCES",
     "WHOLE_NUMBERS",
     "background",
     "broadcast_shapes",
@@ -32,12 +33,16 @@ __all__ = [
     "same_aspect",
     "show",
     "stack",
+    "tolerance_of",
     "whole",
 ]
 
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 """Types of number that PyTorch computes with; of smaller ones it only stores."""
+
+NAMED_TOLERANCES = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
+"""For looking around, for judging a picture, and one that differs by less than a display shows."""
 
 WHOLE_NUMBERS = (
     *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
@@ -167,6 +172,24 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
         raise ValueError(f"{name} must be a dense tensor {what}, got {value.layout}; convert it with .to_dense()")
     if value.device.type == "meta":
         raise ValueError(f"{name} must be a tensor {what} that holds data, got one on the meta device")
+    return value
+
+
+def tolerance_of(value: Any) -> float:
+    """The number behind a tolerance.
+
+    Raises:
+        ValueError: If it is neither a name nor a number from 0 to below 1.
+
+    Example:
+        >>> tolerance_of("preview") == 4 / 255
+        True
+    """
+    if isinstance(value, str) and value in NAMED_TOLERANCES:
+        return NAMED_TOLERANCES[value]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
+        names = ", ".join(repr(name) for name in NAMED_TOLERANCES)
+        raise ValueError(f"tolerance must be a number in [0, 1), such as 1/255, or one of {names}, got {show(value)}")
     return value
 
 

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from torchdof import BlurTable, Camera, depth_of_field
-from torchdof.depth import from_relative
+from torchdof.depth import at_size_of, from_relative
 from torchdof.depth.inspect import tint_focus
-from torchdof.depth.size import at_size_of
 from torchdof.io.transfer import decode, encode
 from torchdof.optics.aperture import Aperture
 

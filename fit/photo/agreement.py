@@ -8,7 +8,7 @@ And a table that was measured at one focus and f-number reaches only so far.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -47,8 +47,8 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     off = _misfit(expected, measured, telling)
     if off < _WARNED:
         return
-    readings = _readings(captures, expected, measured, telling)
-    likely = [text for misfit, text in sorted(readings, key=lambda r: r[0]) if misfit < min(_EXPLAINED, 0.5 * off)]
+    readings = sorted(_readings(captures, expected, measured, telling))
+    likely = [text for misfit, text in readings if misfit < min(_EXPLAINED, 0.5 * off)]
     worst = int(np.argmax(np.where(telling, np.abs(np.log(measured / expected)), 0.0)))
     who = "the other distances" if promised is None else "the camera's numbers"
     text = (
@@ -65,36 +65,29 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     warn(text, "camera", file=file, number=factor)
 
 
-def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask) -> list[tuple[float, str]]:
+def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask) -> Iterator[tuple[float, str]]:
     """Mistakes that could each explain it, and how far the blur is then from what the numbers promise."""
     distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
-    readings = []
     if captures.promised_px is not None:
         factor = _common_factor(expected, measured)
-        readings.append((_misfit(factor * expected, measured, telling), _scale_causes(captures, factor)))
+        yield _misfit(factor * expected, measured, telling), _scale_causes(captures, factor)
     for i, k in combinations(range(len(distance)), 2):
         exchanged = expected.copy()
         exchanged[[i, k]] = expected[[k, i]]
         text = f"the pictures at {distance[i]:g} and {distance[k]:g} m are exchanged"
-        readings.append((_misfit(exchanged, measured, telling), text))
+        yield _misfit(exchanged, measured, telling), text
     if telling.sum() < 3:
-        return readings
-    for i in map(int, np.flatnonzero(telling)):
-        others = telling.copy()
-        others[i] = False
-        stands = _stands(captures, math.copysign(measured[i] / per_dioptre, defocus[i]))
-        text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands or 'beyond infinity'}"
-        readings.append((_misfit(expected, measured, others), text))
+        return
+    for i in np.flatnonzero(telling).tolist():
+        stands = _stands(captures, math.copysign(measured[i] / per_dioptre, defocus[i])) or "beyond infinity"
+        text = f"the distance of {distance[i]:g} m is misread: by its blur it stands at {stands}"
+        yield _misfit(expected, measured, telling & (np.arange(len(distance)) != i)), text
     if (defocus[telling] > 0).any() and (defocus[telling] < 0).any():
         moved = np.linspace(-1, 1, 401) * float(np.abs(defocus).max())
-        misfits = [_misfit(per_dioptre * np.abs(defocus - m), measured, telling) for m in moved]
-        best = int(np.argmin(misfits))
-        stands = _stands(captures, moved[best])
-        if stands:
-            text = f"the lens was focused at {stands}, not at {captures.focus_m:g} m"
-            readings.append((misfits[best], text))
-    return readings
+        misfit, shift = min((_misfit(per_dioptre * np.abs(defocus - m), measured, telling), m) for m in moved)
+        if stands := _stands(captures, shift):
+            yield misfit, f"the lens was focused at {stands}, not at {captures.focus_m:g} m"
 
 
 def _stands(captures: Captures, defocus: float) -> str:

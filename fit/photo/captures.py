@@ -121,14 +121,11 @@ class Captures:
     @property
     def promised_px(self) -> Array | None:
         """Signed circle of confusion of the pairs `[n]`, px of the frame; None where the camera is not known."""
-        focal_length_mm, f_number, sensor_width_mm = (getattr(self, name) for name in CAMERA)
-        if focal_length_mm is None or f_number is None or sensor_width_mm is None:
+        camera = {name: getattr(self, name) for name in CAMERA}
+        if None in camera.values():
             return None
-        camera = Camera(
-            focal_length_mm=focal_length_mm, f_number=f_number, focus_m=self.focus_m, sensor_width_mm=sensor_width_mm
-        )
         depth = torch.from_numpy(self.distances_m)[None, None, None]
-        return camera.coc_px(depth, width=self.width_px).numpy().reshape(-1)
+        return Camera(focus_m=self.focus_m, **camera).coc_px(depth, width=self.width_px).numpy().reshape(-1)
 
 
 def check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:

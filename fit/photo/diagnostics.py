@@ -58,8 +58,8 @@ def unexplained(pair: Forward, solution: Solution, basis: Array) -> tuple[Array,
     residual = pair.values - solution.model[pair.used]
     # a smooth deviation would take the shape itself for noise: its level beside the dot and within it is enough. And
     # noise is at most what is left: a JPEG has less of it in the dark than goes with that in the light
-    deviation = np.full(residual.shape, min(noise_near(pair, solution), rms_left(pair, solution)))
-    return basis.T @ residual, basis.T @ pair.noise_times(basis, deviation, pair.noise_correlation)
+    variance = min(noise_near(pair, solution), rms_left(pair, solution)) ** 2
+    return basis.T @ residual, variance * basis.T @ pair.together(basis, pair.noise_correlation)
 
 
 def left_open(pair: Forward, solution: Solution, basis: Array) -> Array:

@@ -1,9 +1,10 @@
-"""The distances of one capture, fitted so that each informs its neighbours."""
+"""The distances of one capture, fitted so that each informs its neighbours, and its colours one by one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,19 @@ from torchdof.optics.psf import FAMILIES, LENGTHS
 from ..problems import unheard
 from ..result import Array, BlurFit
 from .captures import Capture, Captures
-from .forward import OPENINGS
+from .dot import find_dot
 from .opening import common_opening, turned
 from .pair import fit_pair
+from .source import soft_edge
 
-__all__ = ["counted", "fit_distances", "fit_one", "fit_openings"]
+__all__ = ["Colour", "counted", "fit_colours", "fit_distances", "fit_one", "fit_openings"]
 
 _KNOTS = 33  # values of a free profile, the same at all distances
 _SWEEPS = 2
+_COLOURS = ("red", "green", "blue")
+_GREEN = 1
+_DEFOCUSED_PX = 1.5  # a smaller blur does not tell on which side of focus a colour is
+_KNOWN = 0.02  # share of a radius to which the thin lens is believed
 
 
 def fit_one(pair: Capture, focus_m: float, family: str, **known: Any) -> BlurFit:
@@ -34,57 +40,47 @@ def fit_distances(
     captures: Captures, family: str, smooth: bool, done: Callable[[Capture, BlurFit], None]
 ) -> list[BlurFit]:
     """Fit all pairs with one family; `smooth` lets neighbouring distances inform each other after the first fits."""
-    place, pairs = captures.defocus, captures.pairs
-    fits: dict[int, BlurFit] = {}
-    near = [i for i in range(len(pairs)) if place[i] < 0]
-    far = [i for i in range(len(pairs)) if place[i] > 0][::-1]
-    for side in (near, far):  # from both ends towards focus, each from its neighbour's fit
-        before: int | None = None
-        for i in side:
-            start: BlurFit | None = None
-            if before is not None:
-                nearer = abs(place[i]) / abs(place[before])
-                params = {n: v * nearer if n in LENGTHS else v for n, v in fits[before].params.items()}
-                start = replace(fits[before], params=params)
-            fits[i] = fit_one(pairs[i], captures.focus_m, family, start=start)
-            done(pairs[i], fits[i])
-            before = i
+    place, fits = captures.defocus, dict[int, BlurFit]()
+    for sign in (-1, 1):  # from both ends towards focus, each from its neighbour's fit
+        start: BlurFit | None = None
+        side = sorted(np.flatnonzero(place * sign > 0).tolist(), key=lambda k: -abs(place[k]))
+        for before, i in zip([None, *side], side, strict=False):
+            if start is not None:
+                nearer = abs(place[i] / place[before])
+                start = replace(start, params={n: v * nearer if n in LENGTHS else v for n, v in start.params.items()})
+            start = fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=start)
+            done(captures.pairs[i], start)
     if smooth:
         with unheard():
             (_refine_aligned if family == "radial" else _refine_together)(captures, family, fits)
-    return [fits[i] for i in range(len(pairs))]
+    return [fits[i] for i in range(len(place))]
 
 
 def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit]) -> None:
-    """Fit every pair once more, expecting what its neighbours on the same side of focus say.
+    """Fit every pair once more, expecting what lies on the line between its neighbours on the same side of focus.
 
     Parameters that trade with each other (a rim's height and its steepness) are thus told alike at all distances,
     while what the pictures determine stays as they say: the expectation is loose.
     """
     place = captures.defocus
-    for _ in range(_SWEEPS):
-        for i in sorted(fits, key=lambda k: -abs(place[k])):
-            side = [k for k in fits if place[k] * place[i] > 0]
-            inner = max((k for k in side if abs(place[k]) < abs(place[i])), key=lambda k: abs(place[k]), default=None)
-            outer = min((k for k in side if abs(place[k]) > abs(place[i])), key=lambda k: abs(place[k]), default=None)
-            beside = [k for k in (inner, outer) if k is not None]
-            if beside:
-                neighbours = [fits[k] for k in beside]
-                prior = {n: _expected(n, place[i], place[beside], fits[i], neighbours) for n in FAMILIES[family]}
-                fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], prior=prior)
-
-
-def _expected(name: str, place: float, beside: Array, fit: BlurFit, neighbours: list[BlurFit]) -> tuple[float, float]:
-    """Value and standard deviation expected of a parameter: on the line between the neighbours, as the table has it."""
-    values = [float(f.params[name]) for f in neighbours]
-    if len(values) == 1:
-        value = values[0] * (abs(place / beside[0]) if name in LENGTHS else 1.0)
-    else:
-        fraction = (place - beside[0]) / (beside[1] - beside[0])
-        value = (1 - fraction) * values[0] + fraction * values[1]
-    size = max(float(fit.params[n]) for n in fit.params if n in LENGTHS)
-    loose = 3.0 if len(values) == 1 else 1.0
-    return float(value), loose * {"b": 0.1, "m": 0.3}.get(name, 0.05 * size + 0.05)
+    for i in _SWEEPS * sorted(fits, key=lambda k: -abs(place[k])):
+        side = sorted((k for k in fits if place[k] * place[i] > 0), key=lambda k: abs(place[k]))
+        order = side.index(i)
+        beside = side[max(order - 1, 0) : order] + side[order + 1 : order + 2]
+        if not beside:
+            continue
+        size = max(float(v) for n, v in fits[i].params.items() if n in LENGTHS)
+        loose = {n: {"b": 0.1, "m": 0.3}.get(n, 0.05 * size + 0.05) for n in FAMILIES[family]}
+        prior = {}
+        for n, deviation in loose.items():
+            values = [float(fits[k].params[n]) for k in beside]
+            if len(beside) == 1:
+                scaled = values[0] * (abs(place[i] / place[beside[0]]) if n in LENGTHS else 1.0)
+                prior[n] = (float(scaled), 3 * deviation)
+            else:
+                share = (place[i] - place[beside[0]]) / (place[beside[1]] - place[beside[0]])
+                prior[n] = (float((1 - share) * values[0] + share * values[1]), deviation)
+        fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=fits[i], prior=prior)
 
 
 def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -> None:
@@ -134,33 +130,91 @@ def fit_openings(
     return fits, opening
 
 
+def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **known: Any) -> BlurFit:
+    """Fit other pictures of a pair as it was fitted: with its family and opening, a free profile up to its end."""
+    family, start = (fit.family, fit) if fit.aperture is None else ("image", None)
+    known |= {"start": start, "aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
+    return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **known)
+
+
 def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
     """A fit whose standard errors also count what was guessed about its pictures."""
     if not pair.uncertain:
         return fit
-    family, start = ("image", None) if fit.family in OPENINGS else (fit.family, fit)
-    reach = float(fit.params["radius"]) if family == "radial" else None
     with unheard():
         plain, *others = (
-            fit_one(
-                replace(pair, sharp=sharp, blurred=blurred),
-                focus_m,
-                family,
-                start=start,
-                reach=reach,
-                aperture=fit.aperture,
-            )
-            for sharp, blurred in ((pair.sharp, pair.blurred), *pair.uncertain)
+            _fit_like(fit, pair, focus_m, *pictures) for pictures in ((pair.sharp, pair.blurred), *pair.uncertain)
         )
-    changes = {n: np.stack([np.subtract(o.params[n], plain.params[n]) for o in others]) for n in plain.params}
-    apart = np.linalg.norm([o.radius - plain.radius for o in others])
-    along = np.stack([changes[n] if n in changes else np.zeros(len(others)) for n in fit.names], axis=-1)
-    along = changes["values"] if family == "radial" else along  # [others, parameters]
+    zero = np.zeros(1)
+    names = ("values",) if fit.family == "radial" else fit.names
+    changes = np.stack(
+        [np.hstack([np.subtract(o.params.get(n, zero), plain.params.get(n, zero)) for n in names]) for o in others]
+    )  # [others, parameters]
+    covariance = fit.covariance + changes.T @ changes
+    spread = np.sqrt(np.diag(covariance))
+    errors = {"values": spread} if fit.family == "radial" else dict(zip(names, spread.tolist(), strict=True))
     return replace(
         fit,
-        stderr={
-            n: np.hypot(e, np.linalg.norm(changes[n], axis=0)) if n in changes else e for n, e in fit.stderr.items()
-        },
-        covariance=fit.covariance + along.T @ along,
-        radius_stderr=float(np.hypot(fit.radius_stderr, apart)),
+        stderr=fit.stderr | {n: error for n, error in errors.items() if n in fit.params},
+        covariance=covariance,
+        radius_stderr=float(np.hypot(fit.radius_stderr, np.linalg.norm([o.radius - plain.radius for o in others]))),
     )
+
+
+@dataclass(frozen=True)
+class Colour:
+    """One colour of a capture.
+
+    Attributes:
+        name: "red", "green" or "blue".
+        fits: one for each distance, as those of the mean of the colours.
+        focus_shift_dioptres: 1/distance of its focus less that of green's, 1/m: longitudinal colour. NaN where
+            fewer than two distances are blurred enough to tell.
+        lateral_px: (x, y) by which its dot lies beside green's, px: in focus, then at each distance: lateral colour.
+    """
+
+    name: str
+    fits: tuple[BlurFit, ...]
+    focus_shift_dioptres: float
+    lateral_px: tuple[tuple[float, float], ...]
+
+
+def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ...]:
+    """Fit red, green and blue of every pair as their mean was fitted.
+
+    In the sharp picture a colour that is not the one in focus is itself blurred a little. The sharpest colour's edge
+    stands for all, so that each kernel holds all of its colour's blur.
+    """
+    found: list[list[BlurFit]] = [[] for _ in _COLOURS]
+    for pair, mean in zip(captures, fits, strict=True):
+        if pair.colours is None:
+            raise AssertionError("only captures with colours are fitted by colour")
+        softness = min(soft_edge(still, find_dot(still, file=pair.files[0])).softness for still in pair.colours[0])
+        known: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
+        with unheard():  # what is wrong with a capture its mean has said
+            for colour, *pictures in zip(found, *pair.colours, strict=True):
+                colour.append(_fit_like(mean, pair, captures.focus_m, *pictures, **known))
+    shifts = [_focus_shift(captures.defocus, colour) for colour in found]
+    return tuple(
+        Colour(name, tuple(colour), shift - shifts[_GREEN], _beside(colour, found[_GREEN]))
+        for name, colour, shift in zip(_COLOURS, found, shifts, strict=True)
+    )
+
+
+def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
+    """1/distance of a colour's focus less the capture's, 1/m: where the line through its signed radii crosses 0."""
+    radius: Array = np.array([f.radius for f in fits]) * np.sign(defocus)
+    error = np.hypot([f.radius_stderr for f in fits], _KNOWN * radius)
+    telling = np.abs(radius) > _DEFOCUSED_PX
+    if telling.sum() < 2:
+        return math.nan
+    slope, start = np.polyfit(defocus[telling], radius[telling], 1, w=1 / error[telling])
+    # the blur is slope * (1/focus - shift' - 1/distance) with the colour's own 1/focus - shift'
+    return float(start / slope)
+
+
+def _beside(fits: Sequence[BlurFit], green: Sequence[BlurFit]) -> tuple[tuple[float, float], ...]:
+    """(x, y) by which dots lie beside green's: of the sharp picture, then of each distance."""
+    moved = np.array([np.subtract(f.centre, g.centre) for f, g in zip(fits, green, strict=True)])
+    shifted = np.array([np.subtract(f.shift, g.shift) for f, g in zip(fits, green, strict=True)])
+    return tuple((float(x), float(y)) for x, y in [(moved - shifted).mean(axis=0), *moved])

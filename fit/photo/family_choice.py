@@ -45,17 +45,14 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """
     first, second = _square("kernel", kernel), _square("other", other)
     width = max(_WIDTH, first.shape[-1], second.shape[-1])
-    frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.rfftfreq(width)[None, :])
-    power = np.zeros_like(frequency)
-    power[frequency > 0] = frequency[frequency > 0] ** -2
-    # the half plane of a real transform stands for both halves
-    twice = np.where((np.arange(power.shape[1]) == 0) | (2 * np.arange(power.shape[1]) == width), 1.0, 2.0)
-    power *= twice / float((power * twice).sum())
+    frequency = np.hypot(np.fft.fftfreq(width)[:, None], np.fft.fftfreq(width))
+    frequency[0, 0] = np.inf
+    power = frequency**-2 / np.sum(frequency**-2)
     difference = np.zeros((width, width))
     for sign, k in ((1, first), (-1, second)):
         around = np.arange(k.shape[0]) - k.shape[0] // 2
         difference[np.ix_(around, around)] += sign * k
-    return _decibels(_CONTRAST**2 * float((power * np.abs(np.fft.rfft2(difference)) ** 2).sum()))
+    return _decibels(_CONTRAST**2 * float((power * np.abs(np.fft.fft2(difference)) ** 2).sum()))
 
 
 def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:

@@ -21,7 +21,7 @@ from ..result import Array, Mask
 from ..solve import best_of, inverse
 from .dot import Dot, distance_from
 from .noise import correlate, correlation_of, noise_beside, noise_of
-from .source import Draw, Source
+from .source import Source
 
 __all__ = ["ALL_MOVES", "OPENINGS", "SHAPES", "Forward", "Solution", "without_level"]
 
@@ -97,15 +97,15 @@ class Forward:
         # the largest level, so that one tolerance serves all pictures
         self.unit = max(float(np.abs(self.values - self.dot.background).max()), np.finfo(float).tiny)
 
-    def moved_source(self, moves: Mapping[str, float], draw: Draw | None = None) -> Array:
+    def moved_source(self, moves: Mapping[str, float]) -> Array:
         """The source displaced and magnified, Fourier transformed on the padded grid."""
-        return self._transformed(self._drawn(moves, draw))
+        return self._transformed(self._drawn(moves))
 
-    def _drawn(self, moves: Mapping[str, float], draw: Draw | None = None) -> Array:
+    def _drawn(self, moves: Mapping[str, float]) -> Array:
         rows, columns = self.pixels[(slice(None), *self.box)]
         x, y = self.dot.x + moves["dx"], self.dot.y + moves["dy"]
         picture = np.zeros(self.data.shape)
-        picture[self.box] = (draw or self.source.draw)(rows, columns, x, y, moves["magnification"])
+        picture[self.box] = self.source.draw(rows, columns, x, y, moves["magnification"])
         return picture
 
     def _transformed(self, pictures: Array) -> Array:
@@ -181,13 +181,16 @@ class Forward:
         shape = SHAPES[family]
         names = (*shape, *self.fit_moves)
         unmoved = self.moves({})
-        expected, pull = self._prior(names)
+        # what is expected, as further data that are as uncertain as a pixel
+        noise = max(noise_of(self.data), 1e-5 * self.unit) / self.unit
+        mean, deviation = np.array([self.prior.get(n, (0.0, np.inf)) for n in names]).T
+        pull = noise / deviation
         numbers = best_of(
-            lambda p: np.concatenate([self.project(self._shaped(family, names, p))[0] / self.unit, pull @ p]),
-            np.concatenate([self.values / self.unit, expected]),
+            lambda p: np.concatenate([self.project(self._shaped(family, names, p))[0] / self.unit, pull * p]),
+            np.concatenate([self.values / self.unit, pull * mean]),
             [[start[n] if n in start else unmoved[n] for n in names] for start in self._starts(family)],
             self.bounds(names),
-            jacobian=lambda p: np.concatenate([self._jacobian(family, names, p) / self.unit, pull]),
+            jacobian=lambda p: np.concatenate([self._jacobian(family, names, p) / self.unit, np.diag(pull)]),
             tolerance=1e-7,
             # a neighbour's branch is left only for one that chi squared prefers by 12
             loyalty=12 / self.values.size if family in self.start else 0.0,
@@ -204,7 +207,7 @@ class Forward:
             background=background,
             model=self.picture(fitted, np.nan),
             names=names,
-            covariance=self.covariance(slopes, residual, kernel, gain, moves, self.unit * pull),
+            covariance=self.covariance(slopes, residual, kernel, gain, np.diag((self.unit * pull) ** 2), of_prior=True),
             squares=float(residual @ residual),
             slopes=slopes,
         )
@@ -214,71 +217,40 @@ class Forward:
         held = self.magnification if self.held_magnification is None else self.held_magnification
         return {n: params.get(n, held if n == "magnification" else 0.0) for n in ALL_MOVES}
 
-    def _prior(self, names: tuple[str, ...]) -> tuple[Array, Array]:
-        """The prior as further data of the fit: what is expected `[k]`, and its slopes `[k, p]`."""
-        rows = [(i, *self.prior[n]) for i, n in enumerate(names) if n in self.prior]
-        noise = max(noise_of(self.data), 1e-5 * self.unit) / self.unit
-        pull = np.zeros((len(rows), len(names)))
-        for k, (i, _, deviation) in enumerate(rows):
-            pull[k, i] = noise / deviation
-        return np.array([noise * mean / deviation for _, mean, deviation in rows]), pull
-
     def covariance(
-        self,
-        jacobian: Array,
-        residual: Array,
-        kernel: Array,
-        gain: float,
-        moves: Mapping[str, float],
-        prior: Array | None = None,
+        self, slopes: Array, residual: Array, kernel: Array, gain: float, penalty: Array, of_prior: bool = False
     ) -> Array:
         """Covariance of the parameters under both pictures' noise (a sandwich).
 
-        The defocused picture's noise is as large as the residual says around each pixel, and goes together in
-        neighbours as the residual does. The sharp picture's passes through the kernel and is then alike in neighbouring
-        pixels too. Both make naive errors too small. An ideal dot brings the errors of its radius and softness instead.
+        The defocused picture's noise is as large as the residual where the light is, and goes together in neighbours as
+        the residual does, or the paper. The sharp picture's passes through the kernel and is then alike in neighbouring
+        pixels too. Both make naive errors too small. A penalty `[p, p]` of the fit shrinks them; that of a prior, which
+        is a measurement as uncertain as a pixel, adds its own.
         """
-        from scipy.ndimage import gaussian_filter
-
-        known_before = 0.0 if prior is None else prior.T @ prior
-        bread = inverse(jacobian.T @ jacobian + known_before)
+        bread = inverse(slopes.T @ slopes + penalty)
         known = np.isfinite(np.diag(bread))
         bread = np.where(np.outer(known, known), bread, 0.0)
-        n, p = jacobian.shape
-        # the noise is as large as the residual around each pixel
         full = self.picture(residual, 0.0)
-        share = np.maximum(gaussian_filter(self.used.astype(np.float64), 2.0), 1e-6)
-        around = np.sqrt(n / max(n - p - 2, 1) * np.maximum(gaussian_filter(full**2, 2.0) / share, 0.0))
+        variance = float(np.sum(full[self.lit] ** 2)) / max(int(self.lit.sum()) - slopes.shape[1] - 2, 1)
         # few pixels show how far neighbours go together; the paper's many show more, where its noise is alike
-        near = self.used & (self.distance <= self.dot.reach + 2)
-        found = correlation_of(full / np.maximum(around, 1e-12 * self.unit), near)
-        correlation = self.noise_correlation if self.noise_correlation.sum() > found.sum() else found
-        deviation = around[self.used]
+        found = correlation_of(full, self.used & (self.distance <= self.dot.reach + 2))
+        correlation = max(self.noise_correlation, found, key=np.sum)
         through = (gain * self.source.noise) ** 2 / self.fine_share
-        if through > 0:
-            least = np.sqrt(0.1) * deviation
-            deviation = np.sqrt(np.maximum(deviation**2 - through * float(np.sum(kernel**2)), least**2))
-        meat = jacobian.T @ self.noise_times(jacobian, deviation, correlation) + known_before
+        own = max(variance - through * float(np.sum(kernel**2)), 0.1 * variance)
+        meat = own * (slopes.T @ self.together(slopes, correlation) + (penalty if of_prior else 0.0))
         if through > 0:  # by (K' J)' (K' J) over the pixels of the source that carry noise
-            pictures = self._transformed(self.picture(jacobian.T, 0.0))
+            pictures = self._transformed(self.picture(slopes.T, 0.0))
             carrying = (self.distance <= self.source.reach * self.magnification).ravel()
             spread = np.where(carrying, self.convolve(pictures, kernel[None], whole=True), 0.0)
-            together = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
-            meat = meat + through * (spread @ together.reshape(spread.shape).T)
+            alike = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
+            meat = meat + through * (spread @ alike.reshape(spread.shape).T)
         covariance = bread @ meat @ bread
-        if self.source.variants and self.source.covariance is not None:
-            plain = self.moved_source(moves)
-            moved = [self.moved_source(moves, draw) - plain for draw in self.source.variants]
-            changes = np.stack([self.convolve(change, kernel[None])[0] for change in moved], axis=1)
-            pulled = bread @ (jacobian.T @ (gain * changes))
-            covariance = covariance + pulled @ self.source.covariance @ pulled.T
         covariance[~known, ~known] = np.inf
         return np.asarray(covariance)
 
-    def noise_times(self, columns: Array, deviation: Array, correlation: Array) -> Array:
-        """Covariance of the pixels' noise times columns `[pixels used, p]`."""
-        together = correlate(self.picture((deviation[:, None] * columns).T, 0.0), correlation)
-        return np.asarray(deviation[:, None] * together[:, self.used].T)
+    def together(self, columns: Array, correlation: Array) -> Array:
+        """Correlation of the pixels' noise times columns `[pixels used, p]`."""
+        return np.asarray(correlate(self.picture(columns.T, 0.0), correlation)[:, self.used].T)
 
     def _shaped(self, family: str, names: tuple[str, ...], p: Array) -> Array:
         """Kernel convolved with the moved source, before gain and background: `[pixels used]`."""
@@ -351,13 +323,9 @@ class Forward:
         added = (self.dot.radius**2 - (self.magnification * self.source.radius) ** 2) / 4
         size = min(float(np.sqrt(max(added, 0.15))), self.half / 3)
         if family not in OPENINGS:
-            moments = [{n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family]]
-        elif given:  # an opening's turn is given with it
-            moments = []
-        else:
-            of_one = float(self.rms(family, {"radius": np.ones(1)})[0])
-            moments = [{"radius": np.sqrt(2) * size / of_one}]
-        return [*given, *moments]
+            return [*given, *({n: v * size if n in LENGTHS else v for n, v in s.items()} for s in _STARTS[family])]
+        # an opening's turn is given with it
+        return given or [{"radius": np.sqrt(2) * size / float(self.rms(family, {"radius": np.ones(1)})[0])}]
 
 
 def without_level(columns: Array, shaped: Array) -> Array:

@@ -73,8 +73,7 @@ def read_frame(
         text = f"crop {[left, top, columns, rows]} leaves the picture of {width}x{height}"
         raise FitError(text, "manifest", file=str(path))
     pixels = pixels[:, top : top + rows, left : left + columns]
-    bad = int(np.sum(~np.isfinite(pixels)))
-    if bad:
+    if bad := int(np.sum(~np.isfinite(pixels))):
         raise FitError(f"{bad} values are NaN or infinite", "not finite", file=str(path), number=float(bad))
     white = 1.0 if picture.sample in ("8", "16") else None
     high = pixels >= 1.0 - 1e-6
@@ -125,39 +124,48 @@ def size_of(picture: Array) -> str:
 
 
 def cut_pairs(
-    still: Frame,
-    moved: Frame,
-    distance_m: float,
-    magnification: float,
-    dots: Dots,
-    exposure: float | None,
-    colours: bool,
+    still: Frame, moved: Frame, focus_m: float, distance_m: float, dots: Dots, exposure: float | None, colours: bool
 ) -> list[Capture]:
     """Find the dot, or the dots of a grid, in two frames and cut the windows around each.
 
-    `magnification` is the expected size of a dot in `moved` over that in `still`, `exposure` its brightness.
+    `exposure` is the brightness of `moved` over that of `still`.
 
     Raises:
         FitError: no dot, several, one too near to the frame's edge or to others.
     """
+    frames = (still, moved)
     if dots == "one":
-        chosen = [(find_dot(still.light, file=str(still.file)), find_dot(moved.light, file=str(moved.file)))]
+        matched = [(find_dot(still.light, file=str(still.file)), find_dot(moved.light, file=str(moved.file)))]
     else:
-        chosen = _matched(still, moved, magnification)
-        chosen = chosen[:1] if dots == "centre" else chosen
+        matched = _matched(still, moved, focus_m / distance_m)[: 1 if dots == "centre" else None]
     pairs = []
-    for first, second in chosen:
-        half = _half_width(still, moved, first, second)
+    for first, second in matched:
+        places = [(round(dot.x), round(dot.y)) for dot in (first, second)]
+        height, width = still.light.shape
+        room = [min(x, y, width - 1 - x, height - 1 - y) for x, y in places]
+        needed = max(first.reach, second.reach) + 2
+        half = min(*room, math.ceil(_MARGIN * needed) + 8)
+        if half < needed:
+            text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
+            worse = still if room[0] < first.reach + 2 else moved
+            raise FitError(text, "window", file=str(worse.file), number=needed)
+        cut = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in places]
+        sharp, blurred = (frame.light[window].copy() for frame, window in zip(frames, cut, strict=True))
+        for frame, window in ((still, sharp), (moved, blurred)):
+            count = len(find_dots(window, file=str(frame.file)))
+            if count > 1:
+                text = f"{count} dots in a window of {2 * half + 1} px: print the dots farther apart than their blur"
+                raise FitError(text, "several dots", file=str(frame.file), number=float(count))
         pairs.append(
             Capture(
-                sharp=_one_dot(still, first, half),
-                blurred=_one_dot(moved, second, half),
+                sharp=sharp,
+                blurred=blurred,
                 distance_m=distance_m,
                 files=(str(still.file), str(moved.file)),
                 white=still.white,
                 exposure=exposure,
                 position_px=(round(first.x - still.middle[0], 2), round(first.y - still.middle[1], 2)),
-                colours=(_cut(still.colours, first, half), _cut(moved.colours, second, half)) if colours else None,
+                colours=(still.colours[cut[0]].copy(), moved.colours[cut[1]].copy()) if colours else None,
             )
         )
     return pairs
@@ -177,37 +185,3 @@ def _matched(still: Frame, moved: Frame, magnification: float) -> list[tuple[Dot
         text = f"none of the {len(first)} dots of {still.file.name} is found again; are the distances right?"
         raise FitError(text, "no dot", file=str(moved.file), number=float(len(second)))
     return pairs
-
-
-def _half_width(still: Frame, moved: Frame, first: Dot, second: Dot) -> int:
-    """Half the side of an odd square around either dot, wide enough for the blur."""
-    needed = max(first.reach, second.reach) + 2
-    room = [_pixels_to_edge(still.light, first), _pixels_to_edge(moved.light, second)]
-    half_width = min(*room, int(math.ceil(_MARGIN * needed)) + 8)
-    if half_width < needed:
-        text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half_width} px"
-        worse = still if room[0] < first.reach + 2 else moved
-        raise FitError(text, "window", file=str(worse.file), number=needed)
-    return half_width
-
-
-def _one_dot(frame: Frame, dot: Dot, half_width: int) -> Array:
-    """The window around a dot, or a refusal where another one lies in it."""
-    window = _cut(frame.light, dot, half_width)
-    count = len(find_dots(window, file=str(frame.file)))
-    if count > 1:
-        text = f"{count} dots in a window of {window.shape[0]} px: print the dots farther apart than their blur"
-        raise FitError(text, "several dots", file=str(frame.file), number=float(count))
-    return window
-
-
-def _cut(picture: Array, dot: Dot, half_width: int) -> Array:
-    """The window around a dot in a picture `[..., H, W]`."""
-    x, y = int(round(dot.x)), int(round(dot.y))
-    return picture[..., y - half_width : y + half_width + 1, x - half_width : x + half_width + 1].copy()
-
-
-def _pixels_to_edge(picture: Array, dot: Dot) -> int:
-    """Whole pixels between a dot's pixel and the nearest edge of the picture."""
-    x, y = int(round(dot.x)), int(round(dot.y))
-    return min(x, y, picture.shape[1] - 1 - x, picture.shape[0] - 1 - y)

@@ -21,16 +21,18 @@ __all__ = ["MANIFEST", "Captures", "Colours", "inside", "read_captures"]
 MANIFEST = "capture.toml"
 Colours = Literal["mean", "each"]
 
-_NUMBERS = ("focus_m", "exposure_s", "full_width_px", *CAMERA)
-_TEXTS = ("sharp", "dark", "name")
 _CHOICES: Mapping[str, tuple[str, ...]] = {
     "transfer": ("linear", "srgb"),
     "dots": get_args(Dots),
     "colours": get_args(Colours),
     "bayer": PATTERNS,
 }
-_FIELDS = ("shot", "crop", *_NUMBERS, *_TEXTS, *_CHOICES)
+_FIELDS = (
+    *("shot", "crop", "focus_m", "exposure_s", "full_width_px", *CAMERA, "sharp", "dark", "name"),
+    *_CHOICES,
+)
 _OF_A_SHOT = ("file", "distance_m", "exposure_s")
+_NEEDED = ("focus_m", "sharp", "file", "distance_m")
 
 
 def read_captures(
@@ -84,38 +86,33 @@ def read_captures(
     where, base = str(path), path.parent
     if root is not None:
         inside(path, root, where)
-    fields = _manifest(path)
+    fields, shots = _manifest(path)
     fields |= {name: value for name, value in (("dots", dots), ("colours", colours)) if value}
-    shots = fields.get("shot")
-    if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
-        raise FitError("give at least one [[shot]] with file and distance_m", "manifest", file=where)
-    known = {name: _field(fields, name, where, needed=name in ("focus_m", "sharp")) for name in _FIELDS[2:]}
-    focus, crop = known["focus_m"], _crop(fields, where)
-    for some, names in ((fields, _FIELDS), *((shot, _OF_A_SHOT) for shot in shots)):
-        for name in some:
-            if name not in names:
-                raise FitError(f"{name!r} is not a field; known are {', '.join(names)}", "manifest", file=where)
-    distances = [_field(shot, "distance_m", where, needed=True) for shot in shots]
+    known = {name: _field(fields, name, where) for name in _FIELDS[1:]}
+    shots = [{name: _field(shot, name, where) for name in _OF_A_SHOT} for shot in shots]
+    focus, distances = known["focus_m"], [shot["distance_m"] for shot in shots]
     check_distances(distances, focus, where)
-    sharp, *files = (base / f for f in (known["sharp"], *(_field(shot, "file", where, needed=True) for shot in shots)))
-    dark_file = None if known["dark"] is None else base / known["dark"]
-    for file in (sharp, *files, dark_file):
-        if root is not None and file is not None:
-            inside(file, root, where)
-    dark = None if dark_file is None else read_frame(dark_file, known["transfer"], None, crop, known["bayer"])
-    first = read_frame(sharp, known["transfer"], dark, crop, known["bayer"])
+    names = [known["sharp"], *(shot["file"] for shot in shots), *([known["dark"]] if known["dark"] else [])]
+    if root is not None:
+        for name in names:
+            inside(base / name, root, where)
+
+    def read(name: str, dark: Frame | None) -> Frame:
+        return read_frame(base / name, known["transfer"], dark, known["crop"], known["bayer"])
+
+    dark = read(known["dark"], None) if known["dark"] else None
+    first = read(known["sharp"], dark)
     each = known["colours"] == "each"
     if each and first.colours.shape[0] != 3:
         text = f"colours = 'each' needs pictures of three colours, or bayer = 'RGGB', got {first.colours.shape[0]}"
         raise FitError(text, "manifest", file=where)
-    columns, encoded = [], [sharp.name] if first.encoded else []
-    for shot, distance, file in zip(shots, distances, files, strict=True):
-        moved = read_frame(file, known["transfer"], dark, crop, known["bayer"])
+    columns, encoded = [], [first.file.name] if first.encoded else []
+    for shot in shots:
+        moved = read(shot["file"], dark)
         _check_alike(first, moved, where)
-        encoded += [file.name] if moved.encoded else []
-        exposed = _field(shot, "exposure_s", where)
-        exposure = exposed / known["exposure_s"] if exposed and known["exposure_s"] else None
-        columns.append(cut_pairs(first, moved, distance, focus / distance, known["dots"] or "one", exposure, each))
+        encoded += [moved.file.name] if moved.encoded else []
+        exposure = shot["exposure_s"] / known["exposure_s"] if shot["exposure_s"] and known["exposure_s"] else None
+        columns.append(cut_pairs(first, moved, focus, shot["distance_m"], known["dots"] or "one", exposure, each))
     if known["transfer"] is None and encoded:
         more = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = (
@@ -132,7 +129,7 @@ def read_captures(
     notes = {
         "manifest": path.name,
         "transfer": known["transfer"] or "by file type",
-        "pictures": [s["file"] for s in shots],
+        "pictures": [shot["file"] for shot in shots],
         "dots": known["dots"] or "one",
     }
     if from_exif := [name for name in CAMERA if known[name] is None and camera[name] is not None]:
@@ -160,42 +157,44 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
         raise FitError(text, "manifest", file=where)
 
 
-def _manifest(path: Path) -> dict[str, Any]:
+def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The fields of a manifest and those of its shots, all of which have names that are known."""
+    where = str(path)
     if not path.is_file():
-        text = "there is no such manifest; write a capture.toml beside the pictures"
-        raise FitError(text, "manifest", file=str(path))
+        raise FitError("there is no such manifest; write a capture.toml beside the pictures", "manifest", file=where)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        fields = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FitError(f"is not TOML: {error}", "manifest", file=str(path)) from error
+        raise FitError(f"is not TOML: {error}", "manifest", file=where) from error
+    shots = fields.get("shot")
+    if not isinstance(shots, list) or not shots or not all(isinstance(s, dict) for s in shots):
+        raise FitError("give at least one [[shot]] with file and distance_m", "manifest", file=where)
+    for table, names in ((fields, _FIELDS), *((shot, _OF_A_SHOT) for shot in shots)):
+        for name in table:
+            if name not in names:
+                raise FitError(f"{name!r} is not a field; known are {', '.join(names)}", "manifest", file=where)
+    return fields, shots
 
 
-def _field(fields: Mapping[str, Any], name: str, where: str, needed: bool = False) -> Any:
-    """A field of the manifest, None where it was left out; a refusal where it is not as it must be."""
+def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
+    """A field of the manifest, None where it was left out and may be; a refusal where it is not as it must be."""
     value = fields.get(name)
-    if value is None and not needed:
+    if value is None and name not in _NEEDED:
         return None
     try:
         if name in RANGES:
             return a_number(name, value, *RANGES[name])
         if name in _CHOICES:
             a_choice(name, value, _CHOICES[name])
+        elif name == "crop":
+            numbers = value if isinstance(value, list) and len(value) == 4 else [-1]
+            if not all(type(v) is int and 0 <= v < 2**31 for v in numbers) or not all(numbers[2:]):
+                raise FitError(f"crop must be [left, top, width, height] in pixels, got {show(value)}")
         elif not isinstance(value, str) or not value or "\0" in value:
             raise FitError(f"{name} must be a text, got {show(value)}")
     except FitError as error:
         raise FitError(str(error), "manifest", file=where) from None
     return value
-
-
-def _crop(fields: Mapping[str, Any], where: str) -> tuple[int, int, int, int] | None:
-    value = fields.get("crop")
-    if value is None:
-        return None
-    whole = isinstance(value, list) and len(value) == 4 and all(type(v) is int and 0 <= v < 2**31 for v in value)
-    if not whole or value[2] < 1 or value[3] < 1:
-        text = f"crop must be [left, top, width, height] in pixels, got {show(value)}"
-        raise FitError(text, "manifest", file=where)
-    return value[0], value[1], value[2], value[3]
 
 
 def _check_alike(first: Frame, second: Frame, where: str) -> None:
@@ -204,11 +203,10 @@ def _check_alike(first: Frame, second: Frame, where: str) -> None:
         text = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
         raise FitError(text, "manifest", file=where)
     for what, word in (("f_number", "f-number"), ("focal_length_mm", "focal length")):
-        if what in first.facts and what in second.facts:
-            before, after = first.facts[what], second.facts[what]
-            if abs(math.log(before / after)) > 0.02:
-                text = (
-                    f"EXIF says this was taken at {word} {after:g}, and {first.file.name} at {before:g}; aperture and "
-                    "zoom must stay as they are"
-                )
-                raise FitError(text, "manifest", file=str(second.file), number=after)
+        before, after = first.facts.get(what), second.facts.get(what)
+        if before and after and abs(math.log(before / after)) > 0.02:
+            text = (
+                f"EXIF says this was taken at {word} {after:g}, and {first.file.name} at {before:g}; aperture and "
+                "zoom must stay as they are"
+            )
+            raise FitError(text, "manifest", file=str(second.file), number=after)

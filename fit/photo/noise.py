@@ -72,30 +72,26 @@ def correlation_of(values: Array, used: Mask) -> Array:
     It is `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the middle; 0 at lags where chance would explain what there is. Its spectrum
     is nowhere negative.
     """
+    from scipy.signal import correlate as correlated
+
     size = 2 * LAGS + 1
     white = np.zeros((size, size))
     white[LAGS, LAGS] = 1.0
-    count = int(used.sum())
-    power = float(np.mean(values[used] ** 2)) if count else 0.0
-    if count < _FEWEST or power <= 0:
+    power = float(np.mean(values[used] ** 2)) if used.any() else 0.0
+    if used.sum() < _FEWEST or power <= 0:
         return white
     # outliers (dust, an edge that is not quite fitted) count as five deviations
-    limit = 5 * np.sqrt(power)
-    kept = np.where(used, np.clip(values, -limit, limit), 0.0)
-    shape = tuple(n + LAGS for n in values.shape)
-    spectrum, seen = np.fft.rfft2(kept, shape), np.fft.rfft2(used.astype(np.float64), shape)
-    sums, pairs = (np.fft.irfft2(np.abs(s) ** 2, shape) for s in (spectrum, seen))
-    around = np.ix_(np.arange(-LAGS, LAGS + 1), np.arange(-LAGS, LAGS + 1))
-    sums, pairs = sums[around], np.maximum(np.round(pairs[around]), 1.0)
+    kept = np.where(used, np.clip(values, -5 * np.sqrt(power), 5 * np.sqrt(power)), 0.0)
+    around = tuple(slice(n - 1 - LAGS, n + LAGS) for n in values.shape)
+    sums, pairs = (correlated(p, p, method="fft")[around] for p in (kept, used.astype(np.float64)))
+    pairs = np.maximum(np.round(pairs), 1.0)
     found = sums / pairs
     found = found / max(float(found[LAGS, LAGS]), np.finfo(float).tiny)
     # neighbours' correlation makes the estimates of the others less certain
     certain = _CLEAR * np.sqrt(np.sum(np.where(np.abs(found) > _CLEAR / np.sqrt(pairs), found, 0.0) ** 2) / pairs)
-    found = np.where(np.abs(found) > certain, found, 0.0)
-    wide = np.zeros((4 * size, 4 * size))
-    wide[:size, :size] = found
-    spectrum_of_found = np.fft.rfft2(np.roll(wide, (-LAGS, -LAGS), (0, 1))).real
-    found = np.roll(np.fft.irfft2(np.maximum(spectrum_of_found, 0.0), wide.shape), (LAGS, LAGS), (0, 1))[:size, :size]
+    wide = np.pad(np.where(np.abs(found) > certain, found, 0.0), 2 * size)
+    spectrum = np.maximum(np.fft.rfft2(np.fft.ifftshift(wide)).real, 0.0)
+    found = np.fft.fftshift(np.fft.irfft2(spectrum, wide.shape))[2 * size : 3 * size, 2 * size : 3 * size]
     if not found[LAGS, LAGS] > 0:
         return white
     found = found / found[LAGS, LAGS]

@@ -1,4 +1,10 @@
-"""Blur that is not round: the lens's opening, as a polygon of blades where that explains it, else as a picture."""
+"""Blur that is not round: the lens's opening, as a polygon of blades where that explains it, else as a picture.
+
+The picture is the dot's deconvolved from the defocused one. Its pixels are free but for four things: none is negative,
+they sum to 1, neighbours are alike as far as the noise leaves them undetermined, and there is no light where a first
+estimate has next to none (it would be noise that could not be negative). The smoothing is the one under which pixels
+that were kept back are foretold best.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +17,10 @@ import torch
 
 from torchdof.optics.aperture import Aperture
 
-from ..result import Array, BlurFit
-from .deconvolution import deconvolved
+from ..result import Array, BlurFit, Mask
 from .diagnostics import CHANCE, UNEVEN, asymmetry_of, bic_of, noise_near, rms_left, size_of_blur, unexplained
 from .forward import Forward, Solution
+from .noise import independent_share
 
 __all__ = ["common_opening", "solve_image", "solve_opening", "solve_polygon", "turned"]
 
@@ -25,6 +31,11 @@ _FORETOLD = 24.0  # by how much the log likelihood of pixels that were kept back
 _UNEXPLAINED = 2.0  # residual over noise
 _FINEST = 8  # samples of an opening's picture a pixel of the kernel
 _MOST_SIDE = 64
+_SMOOTHNESS = 10.0 ** np.arange(0.0, -6.5, -0.5)
+_STEPS, _STILL = 150, 1e-4  # the most, and the change over the peak that ends them
+_KEPT_BACK = 0.2
+_LIT = 0.06  # of the peak of a first estimate, smoothed by a pixel, below which the kernel is dark
+_WORSE = 3  # strengths of smoothing in a row that foretell worse, after which weaker ones are not tried
 
 
 def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution, str] | None:
@@ -43,9 +54,9 @@ def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
             why = f"a polygon of {blades} blades, its BIC lower by {gained:.0f} than that of any round profile"
     share, chance = asymmetry_of(*known)
     if (share > UNEVEN and chance < CHANCE) or rms_left(*known) > _UNEXPLAINED * noise_near(*known):
-        kernel, gained = deconvolved(*known)
+        kernel, gained = _deconvolved(*known)
         if gained > _FORETOLD:
-            known = _with_picture(*known, kernel)
+            known = solve_image(*known, kernel)
             why = (
                 f"the blur is not {what}: pixels that were kept back are foretold better by a picture of it "
                 f"(log likelihood higher by {gained / 2:.0f})"
@@ -65,13 +76,9 @@ def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
     return _solved(pair, round_one, Aperture(blades), "polygon", start)
 
 
-def solve_image(pair: Forward, round_one: Solution) -> tuple[Forward, Solution]:
-    """The opening as a picture."""
-    return _with_picture(pair, round_one, deconvolved(pair, round_one)[0])
-
-
-def _with_picture(pair: Forward, before: Solution, kernel: Array) -> tuple[Forward, Solution]:
-    opening, half = _opening_of_kernel(kernel)
+def solve_image(pair: Forward, before: Solution, kernel: Array | None = None) -> tuple[Forward, Solution]:
+    """The opening as a picture, of a kernel if that is known; the moves begin from those of a solution before."""
+    opening, half = _opening_of_kernel(_deconvolved(pair, before)[0] if kernel is None else kernel)
     return _solved(pair, before, opening, "image", {"radius": half})
 
 
@@ -159,3 +166,67 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
         where = np.meshgrid(*[(place / half + 1) / 2 * mask.shape[0] - 0.5] * 2, indexing="ij")
         mean += share * map_coordinates(mask / mask.mean(), where, order=1, mode="constant") / half**2
     return Aperture(mask=torch.from_numpy(np.round(mean / mean.max(), 4)))
+
+
+def _deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
+    """The kernel of a pair of pictures, from a solution to begin with that gives the moves and the kernel's reach.
+
+    Returns:
+        The kernel `[k, k]`, k odd, not negative, summing to 1; and twice the log likelihood of pixels that were kept
+        back, over that of the solution it began from.
+    """
+    from scipy.ndimage import binary_dilation, gaussian_filter
+
+    source = pair.moved_source(shape.moves)
+    half = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1)
+    # a fifth of the pixels is kept back; the smoothing under which they are foretold best is taken
+    kept_back = np.random.default_rng(0).random(pair.values.size) < _KEPT_BACK
+    judged = kept_back & pair.lit[pair.used]
+    tried: list[tuple[float, float, Array]] = []
+    kernel = pair.kernel(shape)
+    margin = half - kernel.shape[0] // 2
+    kernel = np.pad(kernel, margin) if margin >= 0 else np.ascontiguousarray(kernel[-margin:margin, -margin:margin])
+    for smoothness in _SMOOTHNESS:
+        kernel, model = _descend(pair, source, kernel, smoothness, ~kept_back)
+        tried.append((float(np.sum((pair.values - model)[judged] ** 2)), float(smoothness), kernel))
+        if min(t[0] for t in tried) < min(t[0] for t in tried[-_WORSE:]):
+            break
+    squares, smoothness, kernel = min(tried, key=lambda t: t[0])
+    smooth = gaussian_filter(kernel, 1.0)
+    lit = binary_dilation(smooth > _LIT * smooth.max())
+    before = float(np.sum((pair.values - shape.model[pair.used])[judged] ** 2))
+    kernel, _ = _descend(pair, source, kernel * lit, smoothness, np.ones_like(kept_back), lit)
+    count = judged.sum() * independent_share(pair.noise_correlation)
+    return kernel, float(count * np.log(before / squares))
+
+
+def _descend(
+    pair: Forward, source: Array, start: Array, smoothness: float, fitted: Mask, lit: Mask | None = None
+) -> tuple[Array, Array]:
+    """The kernel and the model of the pixels used, by accelerated projected gradients on those that may be lit.
+
+    Reference:
+        Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.
+    """
+    from scipy.ndimage import laplace
+
+    level = float(pair.values.mean())
+    shaped = pair.convolve(source, start[None])[0]
+    gain = max(float((shaped - shaped.mean()) @ (pair.values - level)) / float(np.var(shaped) * shaped.size), 1e-12)
+    largest = float(np.abs(source).max()) ** 2
+    penalty = smoothness * largest * 1e-2
+    step = 1.0 / (largest + 8 * penalty)
+    weights = ahead = gain * start
+    pace = 1.0
+    for _ in range(_STEPS):
+        error = pair.convolve(source, ahead[None])[0] - pair.values
+        error = np.where(fitted, error - error[fitted].mean(), 0.0)
+        gradient = pair.correlate(source, error, start.shape[0]) - penalty * laplace(ahead, mode="constant")
+        after = np.maximum(ahead - step * gradient, 0.0) * (1.0 if lit is None else lit)
+        faster = (1 + np.sqrt(1 + 4 * pace * pace)) / 2
+        ahead = after + (pace - 1) / faster * (after - weights)
+        moved, weights, pace = float(np.abs(after - weights).max()), after, faster
+        if moved < _STILL * float(after.max()):
+            break
+    model = pair.convolve(source, weights[None])[0]
+    return weights / float(weights.sum()), model + float((pair.values - model)[fitted].mean())

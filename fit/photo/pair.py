@@ -16,17 +16,15 @@ from ..problems import FitError, warn
 from ..result import Array, BlurFit
 from ..solve import one_thread
 from ..validation import a_choice, a_count, a_number, a_picture
-from .checks import FAR_ABOVE, check_fit
+from .checks import EXPLAINED, FAR_ABOVE, check_fit, check_focus, check_levels, check_linearity
 from .diagnostics import bic_of, describe
-from .dot import find_dot, fine_share_inside
+from .dot import check_blacks, find_dot, fine_share_inside, used_pixels
 from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
-from .linearity import EXPLAINED, check_focus, check_levels, check_linearity, check_noise
 from .noise import independent_share
 from .opening import solve_image, solve_opening, solve_polygon
 from .radial import solve_radial, solve_round
 from .ratio import fit_ratio
-from .saturation import check_blacks, used_pixels
 from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
 
 __all__ = ["fit_pair", "prepared_pair"]
@@ -38,7 +36,6 @@ _SMALLEST_WINDOW = 15
 _SMALLEST_DOT_PX = 0.2
 _AS_GOOD = 2e-3
 _GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
-_FINE = 0.5  # share of fine noise from which on its level can be judged
 _EXACT_PX = 4.0  # radius of a dot, and of its blur, below which pixels leave what looks like a tone curve
 _SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
 
@@ -156,39 +153,42 @@ def fit_pair(
         # whether the magnification is settled before the fit: a point has none
         held = True if sharp is None else None if fit_magnification is None else not fit_magnification
         pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
+        pair.opening = aperture
+        free_profile = family in ("auto", "radial", *OPENINGS) and aperture is None
+        # no wrong family can mislead a free profile about the magnification
+        expected = freest = solution = solve_round(pair, knots, reach) if free_profile else pair.solve(family)
+        if held is None:
+            unheld = replace(pair, fit_moves=ALL_MOVES)
+            radius = float(solution.params["radius"]) if free_profile else 0.0
+            free = solve_radial(unheld, solution.moves, radius, knots) if free_profile else unheld.solve(family)
+            if _improves(pair, solution, free):
+                pair.fit_moves, freest, solution = ALL_MOVES, free, free
         why, psnr = "", dict[str, float]()
-        if family in ("auto", "radial", *OPENINGS) and aperture is None:
-            expected, solution = _solve_radial(pair, held, knots, reach)
-            freest = solution
+        if free_profile:
+            pair.held_magnification = freest.moves["magnification"]
+            opened = None
             if family == "auto":
                 solution, why, psnr = _choose(pair, freest, accuracy_db)
-                found = solve_opening(pair, freest)
-                if found is not None and not looks_alike(pair.kernel(solution), found[0].kernel(found[1]), accuracy_db):
-                    pair, solution, why = found
-                    freest = expected = solution
+                opened = solve_opening(pair, freest)
+                if opened is not None and looks_alike(pair.kernel(solution), opened[0].kernel(opened[1]), accuracy_db):
+                    opened = None
             elif family != "radial":
-                pair, solution = (solve_polygon if family == "polygon" else solve_image)(pair, freest)
+                opened = (*(solve_polygon if family == "polygon" else solve_image)(pair, freest), "")
+            if opened is not None:
+                pair, solution, why = opened
                 freest = expected = solution
-        else:
-            pair.opening = aperture
-            solution = freest = expected = pair.solve(family)
-            if held is None and _improves(pair, solution, free := replace(pair, fit_moves=ALL_MOVES).solve(family)):
-                pair.fit_moves, solution, freest = ALL_MOVES, free, free
         fit = describe(pair, solution, why)
         # a family that was chosen for being cheap is not to blame for what the freest kernel explains
         judged = fit if freest is solution else describe(pair, freest, "")
         check_fit(pair, solution, fit, files[1], judged)
         if edge is not None:
-            # what demosaicing leaves at an edge is louder than what it leaves of the noise
-            if linear and pair.fine_share > _FINE:
-                linear = check_noise(pair, solution, edge.level, files[1])
             # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed,
             # and what that leaves goes with the level, too
             most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
             large = min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
             if linear and large and judged.residual_over_noise < most:
                 check_levels(pair, freest, expected, edge, files[1])
-            check_focus(edge, fit.radius, bool(pair.source.variants), files[0])
+            check_focus(edge, fit.radius, pair.source.ideal, files[0])
     return replace(fit, psnr=psnr)
 
 
@@ -262,23 +262,6 @@ def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
     floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
     # noise that goes together in neighbours does not average out over them
     return (held.squares - free.squares) / floor * independent_share(pair.noise_correlation) > _SIGNIFICANT
-
-
-def _solve_radial(
-    pair: Forward, held: bool | None, knots: int | None, reach: float | None
-) -> tuple[Solution, Solution]:
-    """The free profile, which no wrong family can mislead about the magnification; it is kept in `pair`.
-
-    The first is that with the expected magnification.
-    """
-    expected = solution = solve_round(pair, knots, reach)
-    if held is None:
-        radius = float(solution.params["radius"])
-        free = solve_radial(replace(pair, fit_moves=ALL_MOVES), solution.moves, radius, knots)
-        if _improves(pair, solution, free):
-            pair.fit_moves, solution = ALL_MOVES, free
-    pair.held_magnification = solution.moves["magnification"]
-    return expected, solution
 
 
 def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:

@@ -178,6 +178,8 @@ def _refuse_flat(x: Array, y: Array, noise: float) -> None:
 
 def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Array, Array, Array]:
     """Parameters, their covariance (errors may be correlated within groups: a sandwich) and the fitted curve."""
+    from scipy.optimize import approx_fprime
+
     names = _NAMES[family]
 
     def model(p: Array) -> Array:
@@ -186,19 +188,12 @@ def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Arra
     starts = [*_STARTS[family], *([[1.0, float(x[np.argmax(y)]), 0.3]] if family == "ring" else [])]
     params = best_of(model, y, starts, ([_BOUNDS[n][0] for n in names], [_BOUNDS[n][1] for n in names]))
     curve = model(params)
-    columns = []
-    for i, value in enumerate(params):
-        step = 1e-5 * max(abs(float(value)), 1e-2)
-        up, down = params.copy(), params.copy()
-        up[i] += step
-        down[i] = max(down[i] - step, 0.0) if value >= 0 else down[i] - step
-        columns.append((model(up) - model(down)) / (up[i] - down[i]))
-    jacobian, residual = np.stack(columns, axis=1), y - curve
+    jacobian = approx_fprime(params, model, 1e-5 * np.maximum(np.abs(params), 1e-2))
+    residual = y - curve
     bread = inverse(jacobian.T @ jacobian)
     if groups is None:
         return params, bread * float(residual @ residual) / max(y.size - len(names), 1), curve
     _, label = np.unique(groups, return_inverse=True)
     count = int(label.max()) + 1
-    scores = np.zeros((count, len(names)))
-    np.add.at(scores, label, jacobian * residual[:, None])
+    scores = np.stack([np.bincount(label, column, count) for column in (jacobian * residual[:, None]).T], axis=1)
     return params, bread @ (scores.T @ scores) @ bread * count / max(count - 1, 1), curve

@@ -8,7 +8,6 @@ import torch
 from torchdof.optics.psf import pixel_kernels
 
 from ..result import Array
-from ..solve import inverse
 from .forward import Forward, Solution, without_level
 
 __all__ = ["size_of_profile", "solve_radial", "solve_round"]
@@ -60,12 +59,9 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
             break
     free = weights > 0
     tall = (columns - columns.mean(axis=1, keepdims=True))[free].T
-    normal = tall.T @ tall
-    # the penalty shrinks the response to noise
-    shrink = inverse(normal + smooth[np.ix_(free, free)]) @ normal
-    plain = pair.covariance(tall, residual, kernel, gain, moves)
+    known = pair.covariance(tall, residual, kernel, gain, smooth[np.ix_(free, free)])
     covariance = np.zeros((count, count))
-    covariance[np.ix_(free, free)] = shrink @ np.where(np.isfinite(plain), plain, 0.0) @ shrink.T
+    covariance[np.ix_(free, free)] = np.where(np.isfinite(known), known, 0.0)
     return Solution(
         family="radial",
         params={"values": weights / float(mass @ weights), "radius": radius},

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..result import Array, Mask
-from ..solve import best_of, inverse
-from .dot import Dot, distance_from, inner_pixels, radial_mean
-from .noise import correlate, correlation_of, fine_variance, noise_beside, noise_of
+from ..result import Array
+from ..solve import best_of
+from .dot import Dot, distance_from, inner_pixels
+from .noise import fine_variance, noise_beside, noise_of
 
 __all__ = ["UNFOCUSED_PX", "Edge", "Source", "ideal_dot", "picture_of_dot", "point_source", "soft_edge"]
 
@@ -18,7 +18,6 @@ UNFOCUSED_PX = 1.0
 """Sigma of an edge, px, above which it is out of focus: no camera leaves a softer one in focus."""
 
 _FOCUSED_PX = 0.5  # what a camera leaves on average: between a perfect lens and a demosaiced picture
-_STEPS = np.array([1e-2, 0.1])  # px of radius and softness, over which an edge's errors are passed on
 _FINE = 6  # samples across a pixel near the edge
 
 
@@ -36,8 +35,7 @@ class Source:
     reach: float  # beyond which it is dark
     draw: Draw
     noise: float = 0.0  # standard deviation of its pixels
-    variants: tuple[Draw, ...] = ()  # the same one step off in each quantity that was fitted to it
-    covariance: Array | None = None  # of those quantities, in those steps
+    ideal: bool = False  # whether it was drawn, without noise and never softer than a camera in focus leaves it
 
 
 def picture_of_dot(picture: Array, dot: Dot) -> Source:
@@ -82,23 +80,13 @@ def ideal_dot(edge: Edge) -> Source:
     the print's: it does not grow with the dot.
     """
     edge = edge.with_softness(_FOCUSED_PX) if edge.softness > UNFOCUSED_PX else edge
+    radius, softness = edge.radius, edge.softness
 
-    def drawn(radius: float, softness: float) -> Draw:
-        def draw(rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
-            square = magnification**2 * (radius**2 + softness**2) - softness**2  # as the light of a soft disc
-            return edge.level * _coverage(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
+    def draw(rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
+        square = magnification**2 * (radius**2 + softness**2) - softness**2  # as the light of a soft disc
+        return edge.level * _coverage(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
 
-        return draw
-
-    return Source(
-        edge.x,
-        edge.y,
-        edge.radius,
-        edge.radius + 5 * edge.softness + 1.0,
-        drawn(edge.radius, edge.softness),
-        variants=(drawn(edge.radius + _STEPS[0], edge.softness), drawn(edge.radius, edge.softness + _STEPS[1])),
-        covariance=np.where(np.isfinite(edge.covariance), edge.covariance, 0.0) / np.outer(_STEPS, _STEPS),
-    )
+    return Source(edge.x, edge.y, radius, radius + 5 * softness + 1.0, draw, ideal=True)
 
 
 @dataclass(frozen=True)
@@ -111,7 +99,6 @@ class Edge:
     softness: float  # sigma of the edge beyond the pixel's own
     level: float  # of the dot above its background
     exponent: float  # 1 in linear light; of the edge's levels, where it was fitted
-    covariance: Array  # of radius and softness [2, 2]
     rms: float  # of what the ideal dot does not explain, over the dot's peak
     misfit: float  # the same over the noise expected there
     # by how much of its level the edge's upper half is brighter than its pixels' coverage, and the lower darker: an
@@ -156,33 +143,28 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
         bounds = [*bounds[0], 0.2], [*bounds[1], 3.0]
         starts = [[0, 0, dot.radius - 0.4, s, 1.0, 0.45] for s in (0.1, 0.6, 1.5)]
     solution = best_of(model, levels, starts, bounds, jacobian=jacobian, tolerance=1e-7)
-    drawn = model(solution)
-    residual, slope = levels - drawn, jacobian(solution)
-    # a soft edge shows by its variance: a step that is finite has a slope even where the softness is 0
-    for i, h in zip((2, 3), _STEPS, strict=True):
-        moved = solution.copy()
-        moved[i] += h
-        slope[:, i] = (model(moved) - drawn) / h
-    freedom = max(levels.size - len(solution), 1)
-    variance = float(residual @ residual) / freedom
+    residual = levels - model(solution)
+    rms = float(np.sqrt(residual @ residual / max(levels.size - len(solution), 1)))
     inside = inner_pixels(picture, dot)
     shot_noise = 0.0 if inside is None else max(fine_variance(picture, inside) - dot.noise**2, 0.0)
     fine = noise_beside(picture, dot.background, ~near)[1]
     expected = float(np.sqrt(np.mean(dot.noise**2 + shot_noise * np.clip(levels, 0, 1)) / fine)) / dot.peak
-    coverage = _coverage(rows, columns, dot.x + solution[0], dot.y + solution[1], solution[2], solution[3])
-    steepness, steepness_error = _steepness(residual / solution[4], coverage)
-    centre = replace(dot, x=dot.x + float(solution[0]), y=dot.y + float(solution[1]))
-    covariance = _covariance(slope, residual, near, distance_from(centre, picture.shape)) * levels.size / freedom
+    dx, dy, radius, softness, level = solution[:5].tolist()
+    coverage = _coverage(rows, columns, dot.x + dx, dot.y + dy, radius, softness)
+    low, high = ((coverage > least) & (coverage < least + 0.38) for least in (0.02, 0.6))
+    steepness, steepness_error = 0.0, np.inf
+    if min(low.sum(), high.sum()) >= 8:
+        steepness = float(residual[high].mean() - residual[low].mean()) / level
+        steepness_error = float(np.sqrt(sum(residual[side].var(ddof=1) / side.sum() for side in (low, high)))) / level
     return Edge(
-        x=centre.x,
-        y=centre.y,
-        radius=float(solution[2]),
-        softness=float(solution[3]),
-        level=float(solution[4]) * dot.peak,
+        x=dot.x + dx,
+        y=dot.y + dy,
+        radius=radius,
+        softness=softness,
+        level=level * dot.peak,
         exponent=float(solution[5]) if fit_exponent else 1.0,
-        covariance=covariance[2:4, 2:4],
-        rms=float(np.sqrt(variance)),
-        misfit=float(np.sqrt(variance)) / expected if expected > 0 else np.inf,
+        rms=rms,
+        misfit=rms / expected if expected > 0 else np.inf,
         steepness=steepness,
         steepness_error=steepness_error,
         shot_noise=shot_noise,
@@ -204,31 +186,3 @@ def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, so
     )
     level[band] = (0.5 * erfc((fine - radius) / (np.sqrt(2) * sigma))).mean((1, 2))
     return level
-
-
-def _covariance(slope: Array, residual: Array, near: Mask, distance: Array) -> Array:
-    """Covariance of a fit's parameters, from slopes and residual of the pixels `near`.
-
-    A mosaic errs at the edge far more than within the dot, and noise that goes together in neighbours does not average
-    out along the edge.
-    """
-    shown = np.zeros(near.shape)
-    shown[near] = residual
-    rings, _ = radial_mean(shown**2, distance)
-    deviation = np.sqrt(rings)[np.minimum(np.floor(distance + 0.5).astype(np.int64), rings.size - 1)]
-    pictures = np.zeros((slope.shape[1], *near.shape))
-    pictures[:, near] = deviation[near] * slope.T
-    correlation = correlation_of(shown / np.maximum(deviation, np.finfo(float).tiny), near)
-    together = deviation[near] * correlate(pictures, correlation)[:, near]
-    bread = inverse(slope.T @ slope)
-    bread = np.where(np.isfinite(bread), bread, 0.0)
-    return np.asarray(bread @ (slope.T @ together.T) @ bread)
-
-
-def _steepness(residual: Array, coverage: Array) -> tuple[float, float]:
-    """Steepness of an edge and its error, from what a soft disc leaves of the levels of pixels so far covered."""
-    low, high = (coverage > 0.02) & (coverage < 0.4), (coverage > 0.6) & (coverage < 0.98)
-    if min(low.sum(), high.sum()) < 8:
-        return 0.0, np.inf
-    error = np.sqrt(sum(float(residual[side].var(ddof=1)) / side.sum() for side in (low, high)))
-    return float(residual[high].mean() - residual[low].mean()), float(error)

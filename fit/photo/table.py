@@ -19,8 +19,7 @@ from ..result import Array, BlurFit
 from ..validation import a_choice
 from .agreement import check_agreement
 from .captures import CAMERA, Capture, Captures
-from .colours import Colour, fit_colours
-from .distances import counted, fit_distances, fit_one, fit_openings
+from .distances import Colour, counted, fit_colours, fit_distances, fit_one, fit_openings
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
 
@@ -155,7 +154,7 @@ def fit_captures(
     coc_px, scale = _keys(captures, radius_px, scale_of)
     params, colours = _params(fits, family), tuple[Colour, ...]()
     if all(pair.colours is not None for pair in pairs):
-        colours = fit_colours(captures, fits, family, opening)
+        colours = fit_colours(captures, fits)
         each = [_params(colour.fits, family) for colour in colours]
         params = {n: np.stack([p[n] for p in each]) for n in params}
     if len(pairs) == 1:

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -191,27 +192,37 @@ def test_a_bar_shows_frames_and_what_is_left_but_only_of_what_takes_long(monkeyp
     assert terminal.getvalue() == ""
     monkeypatch.setattr(printed, "_PATIENCE_S", 0.0)
     with printed.Bar("", 4) as bar:
-        bar.step(2, 4, "frame 3 of 4")
+        for done in range(3):
+            time.sleep(0.4)
+            bar.update(f"frame {done + 1} of 4", done)
         time.sleep(0.5)
-    assert "frame 3 of 4" in terminal.getvalue() and "about 0 s left" in terminal.getvalue()
-    with printed.Bar("rendering [out].png") as bar:
-        bar.expect(60.0)
+    assert "frame 3 of 4" in terminal.getvalue() and re.search(r"0:00:0[01]\S* \S*0:00:0[0-3]", terminal.getvalue())
+    with printed.Bar("rendering [out].png"):
         time.sleep(0.5)
     assert "rendering [out].png" in terminal.getvalue()
-    left = [
-        int(words.split()[-1]) for words in terminal.getvalue().split(" s left")[:-1] if words.split()[-2] == "about"
-    ]
-    assert 40 <= left[-1] <= 61
+
+
+def test_what_is_printed_to_a_file_stays_there_while_a_bar_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, file = Terminal(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(sys, "stdout", file)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(printed, "_PATIENCE_S", 0.0)
+    with printed.Bar("frame 1 of 2", 2):
+        time.sleep(0.3)
+        printed.tell(True, {"out": "a.png"}, "")
+    assert "frame 1 of 2" in terminal.getvalue()
+    assert file.getvalue() == '{"out": "a.png"}\n' and "a.png" not in terminal.getvalue()
 
 
 def test_a_large_image_is_measured_by_a_strip_where_somebody_looks(
     scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected: list[float] = []
+    told: list[str] = []
     monkeypatch.setattr(frame, "_LARGE_PX", 100)
-    monkeypatch.setattr(printed.Bar, "expect", lambda self, seconds: expected.append(seconds))
+    monkeypatch.setattr(printed.Bar, "update", lambda self, what: told.append(what))
     run("render image.exr depth.npy -o out.exr --focus-m 2")
-    assert expected == []
-    monkeypatch.setattr(printed.Bar, "is_seen", property(lambda self: True))
+    assert told == []
+    monkeypatch.setattr(printed, "_is_terminal", lambda: True)
     run("render image.exr depth.npy -o out.exr --focus-m 2")
-    assert len(expected) == 1 and expected[0] > 0
+    assert len(told) == 1 and re.fullmatch(r"rendering out.exr, about \d+ s", told[0])

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from torchdof import Camera, blur_by_coc
-from torchdof.depth import edges
-from torchdof.depth.edges import DepthEdges
 from torchdof.export import describe
 from torchdof.export.verification import TOLERANCE, local_range, session
+from torchdof.options import DepthEdges
 from torchdof.reference.degraded import degrade
 from torchdof.reference.scenes import Plane, plane_scene, posts, waves
+from torchdof.render import edges
 from torchdof.render.plan import Plan
 
 KINDS = ("half-res", "near -1px", "exact")

@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 import torch
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.depth import edges, read_depth
+from torchdof.depth import read_depth
 from torchdof.export import describe
 from torchdof.fit import FitError, read_captures
 from torchdof.fit.lens.lens import Lens
@@ -27,6 +27,7 @@ from torchdof.io.images import Picture, read_image, read_values, write_image
 from torchdof.io.metadata import camera_facts
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
+from torchdof.render import edges
 
 REFUSED = (ValueError, OSError, FitError)
 

@@ -20,9 +20,8 @@ import torch
 from torchdof import BlurTable, Camera, DepthOfField
 from torchdof.optics import kernel_bank, placed_kernels, psf
 from torchdof.optics.field import Field
-from torchdof.render import plan
 
-CACHES = [kernel_bank._templates, plan._constants, placed_kernels._shares, psf._quadrants]
+CACHES = [kernel_bank._templates, placed_kernels._shares, psf._quadrants]
 
 
 def lens_with_a_field() -> BlurTable:

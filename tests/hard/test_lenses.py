@@ -18,7 +18,6 @@ from torch import Tensor
 from torchdof import BlurTable, blur_by_coc
 from torchdof.cli.fitted import Shown
 from torchdof.cli.main import app
-from torchdof.depth.edges import repair
 from torchdof.fit import FitError
 from torchdof.fit.lens.glass import Glass
 from torchdof.fit.lens.lens import Lens
@@ -27,6 +26,7 @@ from torchdof.fit.photo.dot import find_dot
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
+from torchdof.render.edges import repair
 
 pytestmark = pytest.mark.hard
 

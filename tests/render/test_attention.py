@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 import torchdof
-from torchdof.options import NAMED
 from torchdof.reference.scenes import posts, waves
 from torchdof.render.attention import box_around, weight_map
+from torchdof.validation import NAMED_TOLERANCES
 
 
 def scene(height: int = 192, width: int = 320) -> tuple[Tensor, Tensor]:
@@ -98,7 +98,7 @@ def test_attention_with_a_plan_is_refused() -> None:
 
 def test_names_stand_for_tolerances() -> None:
     image, coc = scene(96, 160)
-    for name, value in NAMED.items():
+    for name, value in NAMED_TOLERANCES.items():
         named = torchdof.blur_by_coc(image, coc, tolerance=name)  # type: ignore[arg-type]
         assert torch.equal(named, torchdof.blur_by_coc(image, coc, tolerance=value))
         assert torchdof.DepthOfField(torchdof.Camera(), tolerance=name).tolerance == value  # type: ignore[arg-type]

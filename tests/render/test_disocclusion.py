@@ -7,10 +7,10 @@ from torch import Tensor
 
 from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
-from torchdof.render.disocclusion import HIDDEN_WEIGHT, behind_pixels, fill_hidden
+from torchdof.render.disocclusion import behind_pixels, fill_hidden, surfaces_of_image
 from torchdof.render.highlights import threshold
 from torchdof.render.plan import Blur
-from torchdof.render.surfaces import Surface, framed, surfaces_of_image
+from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface, framed
 
 RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
 
@@ -111,6 +111,6 @@ def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, in
             Surface(light, coc, torch.full_like(coc, cover)),
             Surface(light, coc + 9.0, torch.full_like(coc, 1 - cover)),
         ]
-        frame = framed(surfaces, cells, (0.0, 1.0), blurs, occlusion=True, stacked=False)
+        frame = framed(surfaces, behind_pixels(cells, size), (0.0, 1.0), 0, 1, occlusion=True, stacked=False)
         shown = over(frame, blurs, convolve)
         torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)

@@ -11,8 +11,7 @@ from torch import Tensor
 from torchdof import BlurTable, blur_by_coc
 from torchdof.reference import metrics
 from torchdof.render import highlights
-from torchdof.render.disocclusion import HIDDEN_WEIGHT
-from torchdof.render.surfaces import Surface
+from torchdof.render.surfaces import HIDDEN_WEIGHT, Surface
 
 LAMP = 3000.0
 
@@ -75,7 +74,8 @@ def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) 
     other_px = stretch * 3.0 + torch.zeros_like(coc_px)
     others = torch.where(covers < 0.3, 0.9 - covers, HIDDEN_WEIGHT)  # what is hidden covers nothing
     nothing = torch.zeros_like(coc_px)
-    hiding = highlights._Hiding([Surface(nothing, coc_px, covers), Surface(nothing, other_px, others)])
+    shown = [Surface(nothing, coc_px, covers), Surface(nothing, other_px, others)]
+    hiding = highlights._Hiding(highlights._obstacles(shown))
     hidden = hiding.hidden(torch.zeros_like(source), row, column, coc, step, 9.0 * stretch)
 
     wanted = torch.zeros_like(hidden)

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from torchdof.render.disocclusion import HIDDEN_WEIGHT
-from torchdof.render.surfaces import Placed, _mixed, _stacked
+from torchdof.render.surfaces import HIDDEN_WEIGHT, Placed, _mixed, _stacked
 
 
 @pytest.mark.parametrize(("share", "known"), [(0.0, 0.0), (0.01, 0.0894), (0.03, 0.2546), (0.06, 0.06), (1.0, 1.0)])

@@ -131,7 +131,7 @@ class Bench:
         from ..bench import speed
         from ..bench.measurement import shipped
 
-        table, console = self.blur.table_of(self.blur.table), Console(stderr=True)
+        table, console = self.blur.chosen(), Console(stderr=True)
         if (self.speed.onnx or self.speed.compiled) and table.depends_on_place:
             raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
         scene = dataclasses.replace(shipped() if self.image is None else self._read(self.image), table=table)

@@ -4,6 +4,7 @@ Fields that are dataclasses themselves are groups of options that several comman
 heads them in ``--help``. Nothing here imports PyTorch, so that help and wrong arguments are answered at once.
 """
 
+import contextlib
 import dataclasses
 import inspect
 import types
@@ -59,75 +60,50 @@ def numbers(count: int | None, expected: str) -> Callable[[str], tuple[float, ..
     """Reads so many numbers, or any, with commas between them; the message of an error is what was expected."""
 
     def read(text: str) -> tuple[float, ...]:
-        try:
+        with contextlib.suppress(ValueError):
             values = tuple(map(float, text.split(",")))
-        except ValueError:
-            values = ()
-        if len(values) != count and (count is not None or not values):
-            raise ValueError(f"{expected}, got {text!r}")
-        return values
+            if count in (None, len(values)):
+                return values
+        raise ValueError(f"{expected}, got {text!r}")
 
     return read
 
 
 def word_or_number(words: tuple[str, ...], expected: str) -> Callable[[str], float | str]:
     """Reads one of some words, or a number; what was expected is the message where it is neither."""
-
-    def read(text: str) -> float | str:
-        try:
-            return text if text in words else float(text)
-        except ValueError:
-            raise ValueError(f"{expected}, got {text!r}") from None
-
-    return read
-
-
-def command_of(name: str, kind: type[Any]) -> click.Command:
-    """The command whose arguments are the fields of a class, whose docstring says what it does, and ``run`` does it."""
-    parameters, told = list(_parameters(kind, "Options")), inspect.getdoc(kind)
-    return _Command(
-        name,
-        params=parameters,
-        help=told,
-        short_help=" ".join((told or "").partition("\n\n")[0].split()),
-        no_args_is_help=any(parameter.required for parameter in parameters),
-        callback=lambda **values: _made(kind, values).run(),
-        context_settings={"max_content_width": 120},
-    )
+    return lambda text: text if text in words else numbers(1, expected)(text)[0]
 
 
 class _Command(click.Command):
     """A command whose help lists options by their groups."""
 
+    groups: dict[str | None, str]  # of each parameter's name
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        groups: dict[str, list[tuple[str, str]]] = {"Options": []}
+        shown: dict[str, list[tuple[str, str]]] = {"Options": []}
         for parameter in self.get_params(ctx):
             row = parameter.get_help_record(ctx)
             if row is not None and not isinstance(parameter, click.Argument):
-                groups.setdefault(getattr(parameter, "group", "Options"), []).append(row)
-        for group, rows in groups.items():
+                shown.setdefault(self.groups.get(parameter.name, "Options"), []).append(row)
+        for group, rows in shown.items():
             with formatter.section(group):
                 formatter.write_dl(rows, col_max=28)
 
 
-class _Option(click.Option):
-    """An option in a group."""
-
-    def __init__(self, *arguments: Any, group: str, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self.group = group
-
-
-class _Read(click.ParamType):
-    """The type of a value that a function makes of its text."""
-
-    name = "text"
-
-    def __init__(self, read: Callable[[str], Any]) -> None:
-        self._read = read
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        return self._read(value) if isinstance(value, str) else value
+def command_of(name: str, kind: type[Any]) -> click.Command:
+    """The command whose arguments are the fields of a class, whose docstring says what it does, and ``run`` does it."""
+    parameters, told = list(_parameters(kind, "Options")), inspect.getdoc(kind) or ""
+    command = _Command(
+        name,
+        params=[parameter for parameter, _ in parameters],
+        help=told,
+        short_help=" ".join(told.partition("\n\n")[0].split()),
+        no_args_is_help=any(parameter.required for parameter, _ in parameters),
+        callback=lambda **values: _made(kind, values).run(),
+        context_settings={"max_content_width": 120},
+    )
+    command.groups = {parameter.name: group for parameter, group in parameters}
+    return command
 
 
 def _fields(kind: type[Any]) -> list[tuple[Any, Any]]:
@@ -136,45 +112,47 @@ def _fields(kind: type[Any]) -> list[tuple[Any, Any]]:
     return [(field, hints[field.name]) for field in dataclasses.fields(kind)]
 
 
-def _parameters(kind: type[Any], group: str) -> Iterator[click.Parameter]:
-    """The arguments and options that the fields of a class are, and those of the classes in it."""
+def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, str]]:
+    """The arguments and options that the fields of a class are, and those of the classes in it, with their groups."""
     for field, hint in _fields(kind):
         if dataclasses.is_dataclass(hint):
             yield from _parameters(hint, (hint.__doc__ or "").rstrip("."))  # type: ignore[arg-type]
         else:
-            yield _parameter(field, hint, field.metadata["group"] or group)
+            yield _parameter(field, hint), field.metadata["group"] or group
 
 
-def _parameter(field: Any, hint: Any, group: str) -> click.Parameter:
+def _parameter(field: Any, hint: Any) -> click.Parameter:
     """The argument or option that a field is."""
     facts, required = field.metadata, field.default is dataclasses.MISSING
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         hint = typing.get_args(hint)[0]
     several = typing.get_origin(hint) is tuple and facts["read"] is None
     hint = typing.get_args(hint)[0] if several else hint
+    given: dict[str, Any] = {"help": facts["help"], "metavar": facts["metavar"], "required": required}
     if facts["read"] is not None:
-        kind: click.ParamType = _Read(facts["read"])
+        given["type"] = click.STRING
     elif typing.get_origin(hint) is Literal:
-        kind = click.Choice(typing.get_args(hint))
+        given["type"] = click.Choice(typing.get_args(hint))
     else:
-        kind = _TYPES[hint] if facts["least"] is None else click.IntRange(min=facts["least"])
-    given: dict[str, Any] = {"type": kind, "help": facts["help"], "metavar": facts["metavar"], "required": required}
+        given["type"] = _TYPES[hint] if facts["least"] is None else click.IntRange(min=facts["least"])
     if not required and field.default not in (None, ()):
         given["default"] = field.default
-    names = facts["names"] or (f"--{field.name.replace('_', '-')}",)
-    if names == ("argument",):
+    if facts["names"] == ("argument",):
         return click.Argument([field.name], nargs=-1 if several else 1, **given)
     if hint is bool:
         given["is_flag"] = True
     else:
         given |= {"multiple": several, "show_default": bool(field.default) and not required}
-    return _Option([field.name, *names], group=group, **given)
+    return click.Option([field.name, *(facts["names"] or (f"--{field.name.replace('_', '-')}",))], **given)
 
 
 def _made(kind: type[Any], values: dict[str, Any]) -> Any:
     """An object of a class, and of the classes in it, from the values of all their fields."""
-    made = {
-        field.name: _made(hint, values) if dataclasses.is_dataclass(hint) else values[field.name]  # type: ignore[arg-type]
-        for field, hint in _fields(kind)
-    }
+    made = {}
+    for field, hint in _fields(kind):
+        if dataclasses.is_dataclass(hint):
+            made[field.name] = _made(hint, values)  # type: ignore[arg-type]
+        else:
+            value, read = values[field.name], field.metadata["read"]
+            made[field.name] = value if read is None or value is None else read(value)
     return kind(**made)

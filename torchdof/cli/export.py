@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import click
-
 from .command import option
 from .options import Accuracy, Blur, Sensor, edges_of, edges_option, json_option
-from .printed import Bar, json_line
+from .printed import Bar, tell
 
 __all__ = ["Export"]
 
@@ -60,16 +58,19 @@ class Export:
 
     def run(self) -> None:
         """Writes a file, or reads one."""
-        if self.show is not None and self.out is None:
+        if (self.out is None) == (self.show is None):
+            raise ValueError("give either -o FILE to write or --show FILE to read")
+        if self.show is not None:
             from torchdof.export.metadata import describe
 
-            facts = describe(self.show)
-            click.echo(json_line(facts) if self.as_json else _lines(facts))
-            return
-        if self.out is None or self.show is not None:
-            raise ValueError("give either -o FILE to write or --show FILE to read")
-        if self.out.suffix != ".onnx":
-            raise ValueError(f"the file is ONNX: name it {self.out.with_suffix('.onnx')}")
+            described = describe(self.show)
+            tell(self.as_json, described, _lines(described))
+        elif self.out is not None:
+            self._write(self.out)
+
+    def _write(self, out: Path) -> None:
+        if out.suffix != ".onnx":
+            raise ValueError(f"the file is ONNX: name it {out.with_suffix('.onnx')}")
         from torchdof import Camera, DepthOfField
         from torchdof.export.conversion import to_onnx
 
@@ -78,19 +79,11 @@ class Export:
             camera = Camera(**{name: value for name, value in stated.items() if value is not None})
         else:
             camera = Camera.from_fov(self.sensor.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
-        dof = DepthOfField(
-            camera, self.blur.table_of(self.blur.table), **self.accuracy.options(), max_coc_px=self.max_coc, check=False
-        )
+        dof = DepthOfField(camera, self.blur.chosen(), **self.accuracy.options(), max_coc_px=self.max_coc, check=False)
+        graph = {**dataclasses.asdict(self.graph), "depth_edges": edges_of(self.depth_edges)}
         with Bar("tracing") as bar:
-            report = to_onnx(
-                dof,
-                self.out,
-                **dataclasses.asdict(self.graph),
-                depth_edges=edges_of(self.depth_edges),
-                progress=bar.tell,
-            )
-        facts = {"out": str(self.out), **dataclasses.asdict(report)}
-        click.echo(json_line(facts) if self.as_json else f"{report}\nwrote {self.out}")
+            report = to_onnx(dof, out, **graph, progress=bar.update)
+        tell(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")
 
 
 def _lines(facts: Mapping[str, Any], indent: str = "") -> str:

@@ -1,4 +1,4 @@
-"""What ``torchdof fit`` tells and draws of its results."""
+"""How ``torchdof fit`` makes its tables, and what it tells and draws of them."""
 
 from __future__ import annotations
 
@@ -7,25 +7,115 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.fit.photo.manifest import Captures
-from torchdof.fit.photo.photographs import Photographs
-from torchdof.fit.photo.table import TableFit
+from torchdof.cli.printed import Bar, json_line
+from torchdof.fit.lens import trace
+from torchdof.fit.lens.lens import RGB_UM, Lens
+from torchdof.fit.photo.across import table_of_dots
+from torchdof.fit.photo.manifest import MANIFEST, Captures, read_captures
+from torchdof.fit.photo.photographs import Photographs, read_photographs
+from torchdof.fit.photo.table import TableFit, fit_captures
 from torchdof.fit.problems import FitWarning
 from torchdof.io.atomic import whole_file
 from torchdof.io.columns import print_columns
+from torchdof.validation import number
 
-__all__ = ["Shown", "facts_of", "heard"]
+if TYPE_CHECKING:
+    from torchdof.cli.fit import Fit
+
+__all__ = ["Shown", "fit_photographs", "trace_lens"]
 
 _WIDTH = 1920  # px of the image that a table's texture is drawn for
 
 
+def trace_lens(said: Fit, source: str) -> None:
+    """Traces the table of a lens, tells what it is, and writes it."""
+    lens, options = Lens.read(source), said.lens
+    focal = lens.paraxial().focal_length
+    number("--focus-m", options.focus_m, low=focal / 1000, unit="metres", infinite=True)
+    image_mm = focal / (1 - focal / 1000 / options.focus_m)
+    with Bar(f"tracing {source}"):
+        table = trace.trace_table(
+            lens,
+            f_number=options.f_number,
+            focus_m=options.focus_m,
+            nodes=options.nodes,
+            field_mm=image_mm * math.tan(math.radians(options.field_deg)),
+            wavelengths_um=RGB_UM if options.wavelengths == () else options.wavelengths,
+            field=options.field,
+        )
+    shown, facts, coc = Shown(quiet=said.as_json), table.provenance, table.coc.tolist()
+    shown.say(
+        f"{facts['lens']}: {facts['focal_length_mm']:g} mm, f/{facts['f_number']:g}, focus {facts['focus_m']} m; "
+        f"{len(coc)} distances from {facts['nearest_m']:.3g} m to infinity, circles of confusion "
+        f"from {coc[0]:+.3f} to {coc[-1]:+.3f} mm"
+    )
+    if table.residual is not None:
+        middle, most = 100 * float(table.residual.median()), 100 * float(table.residual.max())
+        shown.say(f"family: {table.family}, residual {middle:.2f} %, {most:.2f} % at most")
+    if table.field is not None:
+        shown.say(f"across the field: {table.field.radius.tolist()} mm from the middle")
+    shown.write(table, said.out)
+    shown.facts({"out": str(said.out), "family": table.family, **facts})
+    if said.plots is not None:
+        shown.draw(table, said.plots, said.out.stem)
+
+
+def fit_photographs(said: Fit, folder: Path) -> None:
+    """Fits photographs of the target, or the dots of a manifest, tells how well, and writes their tables."""
+    options, photographs, shown = said.photographs, None, Shown(quiet=said.as_json)
+    with _heard() as doubts:
+        if folder.is_dir() and not (folder / MANIFEST).is_file():
+            colours: Literal["mean", "each"] = "each" if options.colours == "each" else "mean"
+            photographs = read_photographs(folder, square_mm=said.target.square_mm, colours=colours, root=options.root)
+            capture_sets = [photographs.captures]
+        else:
+            dots = None if options.dots == "manifest" else options.dots
+            colour = None if options.colours == "manifest" else options.colours
+            capture_sets = read_captures(str(folder), dots=dots, colours=colour, root=options.root)
+    if photographs is not None:
+        shown.photographs(photographs)
+    across = photographs is None and capture_sets[0].notes["dots"] == "field"
+    command = f"torchdof fit {folder.name} --family {options.family} --accuracy-db {options.accuracy_db:g}"
+    told = set[str]()
+    fitted: list[tuple[Captures, TableFit]] = []
+    for i, captures in enumerate(capture_sets):
+        table_file = said.out if len(capture_sets) == 1 else said.out.with_name(f"{said.out.stem}_{i:02d}.json")
+        if len(capture_sets) > 1:
+            shown.say(f"dot {i} at {captures.notes['position_px']} px from the centre")
+        with _heard() as heard, Bar("fitting") as bar:
+            result = fit_captures(
+                captures,
+                options.family,
+                accuracy_db=options.accuracy_db,
+                progress=lambda done, total, what, bar=bar: bar.update(what, done, total),  # type: ignore[misc]
+                command=command,
+                scale_of=fitted[0][1] if fitted else None,  # the dot nearest to the centre, whose scale all share
+            )
+        messages = [*doubts, *heard]
+        fitted.append((captures, result))
+        shown.fit(captures, result, [message for message in messages if message not in told])
+        told.update(messages)
+        if not across:
+            shown.write(result.table, table_file)
+        facts = {"out": str(table_file), **_facts_of(captures, result), "warnings": messages}
+        if photographs is not None:
+            shown.sheet(photographs, result, said.out.with_suffix(".png"))
+            facts["advice"] = list(photographs.advice)
+        shown.facts(facts)
+        if said.plots is not None and photographs is None:
+            shown.draw_fits(captures, result, said.plots, table_file.stem)
+            shown.draw(result.table, said.plots, table_file.stem)
+    if across:
+        shown.write(table_of_dots(fitted), said.out)
+
+
 @contextmanager
-def heard() -> Iterator[list[str]]:
+def _heard() -> Iterator[list[str]]:
     """Collects warnings, which are in the list once the block has ended; what is said twice is in it once."""
     messages = list[str]()
     with warnings.catch_warnings(record=True) as caught:
@@ -34,7 +124,7 @@ def heard() -> Iterator[list[str]]:
     messages += dict.fromkeys(str(w.message) for w in caught)
 
 
-def facts_of(captures: Captures, result: TableFit, messages: Sequence[str]) -> dict[str, Any]:
+def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
     """What :meth:`Shown.fit` tells, for programs."""
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
     fits = [
@@ -51,22 +141,24 @@ def facts_of(captures: Captures, result: TableFit, messages: Sequence[str]) -> d
         for colour in result.colours
     ]
     chosen = {"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale}
-    return {**chosen, "focus_m": captures.focus_m, "fits": fits, "colours": colours, "warnings": messages}
+    return {**chosen, "focus_m": captures.focus_m, "fits": fits, "colours": colours}
 
 
 class Shown:
-    """What is told on standard output, and pictures.
-
-    Args:
-        quiet: Tell nothing.
-    """
+    """What is told on standard output, and pictures; quiet, it tells facts for programs alone."""
 
     def __init__(self, quiet: bool) -> None:
+        self._quiet = quiet
         self._console = Console(soft_wrap=True, quiet=quiet, markup=False, highlight=False)
 
     def say(self, text: str, style: str = "") -> None:
-        """One line."""
+        """One line for people."""
         self._console.print(text, style=style)
+
+    def facts(self, facts: dict[str, Any]) -> None:
+        """One line for programs."""
+        if self._quiet:
+            print(json_line(facts), flush=True)
 
     def photographs(self, photographs: Photographs) -> None:
         """What was found in photographs of the target, and what to do better, on one screen."""
@@ -107,10 +199,8 @@ class Shown:
 
     def _colours(self, captures: Captures, result: TableFit) -> None:
         """What differs between the colours: the size of their blur, their focus, and where they lie."""
-        focuses = []
-        for colour in result.colours:
-            vergence = 1 / captures.focus_m + colour.focus_shift_dioptres
-            focuses.append("" if math.isnan(vergence) else f"{1 / vergence:.4g}" if vergence > 0 else "beyond infinity")
+        vergences = [1 / captures.focus_m + colour.focus_shift_dioptres for colour in result.colours]
+        focuses = [f"{1 / v:.4g}" if v > 0 else "" if math.isnan(v) else "beyond infinity" for v in vergences]
         columns = {"": [colour.name for colour in result.colours], "focus m": focuses}
         for i, pair in enumerate(captures):
             fits = [colour.fits[i] for colour in result.colours]
@@ -120,20 +210,6 @@ class Shown:
         print_columns(self._console, "colours, beside green", columns)
         self.say("the table holds a kernel a colour; lateral colour is no blur, and not in it")
 
-    def lens(self, table: BlurTable) -> None:
-        """What was traced and how well the kernels fit the spots."""
-        facts, places = table.provenance, table.coc.tolist()
-        self.say(
-            f"{facts['lens']}: {facts['focal_length_mm']:g} mm, f/{facts['f_number']:g}, focus {facts['focus_m']} m; "
-            f"{len(places)} distances from {facts['nearest_m']:.3g} m to infinity, circles of confusion "
-            f"from {places[0]:+.3f} to {places[-1]:+.3f} mm"
-        )
-        if table.residual is not None:
-            middle, most = 100 * float(table.residual.median()), 100 * float(table.residual.max())
-            self.say(f"family: {table.family}, residual {middle:.2f} %, {most:.2f} % at most")
-        if table.field is not None:
-            self.say(f"across the field: {table.field.radius.tolist()} mm from the middle")
-
     def write(self, table: BlurTable, target: Path) -> None:
         """Writes a table."""
         table.save(target)
@@ -141,9 +217,9 @@ class Shown:
 
     def sheet(self, photographs: Photographs, result: TableFit, target: Path) -> None:
         """Draws what was found, fitted and made of it; without matplotlib it says so."""
-        from torchdof.fit.sheet import sheet_of_photographs
-
         try:
+            from torchdof.fit.sheet import sheet_of_photographs
+
             sheet = sheet_of_photographs(photographs, result, lambda *scene: blur_by_coc(*scene[:2], table=scene[2]))
         except ModuleNotFoundError as error:
             self.say(f"no sheet of pictures: {error.name} is not installed (pip install torchdof[plot])")
@@ -162,11 +238,9 @@ class Shown:
         from torchdof.fit.plots import picture_of_table, picture_of_texture
 
         self._save(picture_of_table(table), folder / f"{stem}_table.png")
-        largest = float(table.coc[table.coc.abs().argmax()])
-        scale = {"fraction": float(_WIDTH), "mm": _WIDTH / (table.sensor_width_mm or 36.0), "relative": 16.0}[
-            table.unit
-        ]
-        self._save(picture_of_texture(table, largest * scale, _WIDTH), folder / f"{stem}_texture.png")
+        scales = {"fraction": float(_WIDTH), "mm": _WIDTH / (table.sensor_width_mm or 36.0), "relative": 16.0}
+        largest = float(table.coc[table.coc.abs().argmax()]) * scales[table.unit]
+        self._save(picture_of_texture(table, largest, _WIDTH), folder / f"{stem}_texture.png")
 
     def _save(self, figure: Any, target: Path) -> None:
         """Writes a figure, whole or not at all."""

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import math
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,17 +16,16 @@ from ..depth.inspect import tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import coc_mistakes, depth_mistakes
-from ..depth.size import at_size_of
 from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
-from ..io.metadata import camera_facts
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
+from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect
-from .options import Scene, edges_of, pick_device
-from .printed import Bar, WarnOnce, json_line
+from .options import Scene, edges_of, pick_device, refuse_input
+from .printed import Bar, WarnOnce, tell
 
 if TYPE_CHECKING:
     from .render import Render
@@ -40,36 +38,19 @@ _STRIPS = 16
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """An image and its depth, as read.
+    """An image and its depth, as read."""
 
-    Args:
-        name: Of the file that the depth is from.
-        picture: The image.
-        values: ``[1, 1, H, W]``, depth in metres (signed pixels for coc).
-        holes: How many holes were filled.
-        seconds: How long reading took.
-    """
-
-    name: str
+    name: str  # of the file that the depth is from
     picture: Picture
-    values: Tensor
-    holes: int
+    values: Tensor  # [1, 1, H, W], depth in metres, or signed pixels for coc
+    holes: int  # pixels that were filled
     seconds: float
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
-    """Reads an image and its depth.
+    """Reads an image, as :func:`torchdof.io.images.read_image` does, and its depth, which may be a channel of it.
 
-    Args:
-        image: Image file.
-        depth: Depth file; None takes the depth channel of the image.
-        scene: What the user said of lens and depth.
-        holes: Whether holes that nobody said how to fill stay NaN; otherwise they are an error.
-        **encoding: Of the image, as for :func:`torchdof.io.images.read_image`.
-
-    Raises:
-        ValueError: If input is wrong or missing.
-        OSError: If a file cannot be read.
+    With ``holes``, those that nobody said how to fill stay NaN; otherwise they are a ``ValueError``.
     """
     start, name, fill = time.perf_counter(), str(depth or image), scene.depth_map.fill_depth
     picture = read_image(image, **encoding)
@@ -81,16 +62,16 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
 
 def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> Tensor:
     """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes."""
-    said, lens, name = scene.depth_map, scene.lens, str(depth or image)
+    said, name, width = scene.depth_map, str(depth or image), picture.pixels.shape[-1]
     if depth is not None or said.depth_channel is not None:
         values = read_values(depth or image, said.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
-    (h, w), (ih, iw) = values.shape[-2:], picture.pixels.shape[-2:]
-    if said.depth_kind == "coc" and (h, w) != (ih, iw):
-        raise ValueError(f"{name}: coc is {w} x {h} pixels but the image is {iw} x {ih}; they must be the same")
+    is_coc, sizes = said.depth_kind == "coc", [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, picture.pixels)]
+    if is_coc and sizes[0] != sizes[1]:
+        raise ValueError(f"{name}: coc is {sizes[0]} pixels but the image is {sizes[1]}; they must be the same")
     try:
         same_aspect(picture.pixels, values)
         if said.depth_kind == "relative":
@@ -99,33 +80,21 @@ def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> 
             return at_size_of(picture.pixels, metres)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-    fov_x_deg = lens.fov_deg
-    if said.depth_kind == "distance" and fov_x_deg is None:
-        facts = camera_facts(picture.metadata, iw)
-        focal_mm = lens.focal_length_mm or facts.get("focal_length_mm")
-        sensor_mm = lens.sensor_width_mm or facts.get("sensor_width_mm")
-        if focal_mm is None or sensor_mm is None:
-            raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
-        fov_x_deg = 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
-    numbers = {"scale": said.depth_scale, "offset": said.depth_offset, "unknown": said.depth_unknown}
-    metres = depth_from_values(values, said.depth_kind, **numbers, fov_x_deg=fov_x_deg)  # type: ignore[arg-type]
-    return metres if said.depth_kind == "coc" else at_size_of(picture.pixels, metres)
+    metres = depth_from_values(
+        values,
+        said.depth_kind,
+        scale=said.depth_scale,
+        offset=said.depth_offset,
+        unknown=said.depth_unknown,
+        fov_x_deg=scene.lens.view_deg(picture.metadata, width) if said.depth_kind == "distance" else None,
+    )
+    return metres if is_coc else at_size_of(picture.pixels, metres)
 
 
 def coc_of(
     frame: Frame, scene: Scene, warned: WarnOnce, number: int = 0, median: bool = False
 ) -> tuple[Tensor, Camera | None, list[str]]:
-    """The circle of confusion of a frame, its camera and remarks on what was not stated.
-
-    Args:
-        frame: What was read.
-        scene: What the user said of lens and depth.
-        warned: What was warned of before.
-        number: Of the frame, for focus that moves.
-        median: Whether the focus is at the median depth where the user said nothing.
-
-    Returns:
-        Signed radius ``[1, 1, H, W]`` in pixels; the camera, None where the map held the radius itself; the remarks.
+    """Signed radius ``[1, 1, H, W]`` in pixels; the camera, None for ``--depth-kind coc``; remarks as it has them.
 
     Raises:
         ValueError: If the lens makes no sense, or something looks like a mistake and ``warned`` is strict.
@@ -141,22 +110,14 @@ def coc_of(
     return coc_px, camera, remarks
 
 
-def facts_of_camera(camera: Camera) -> dict[str, float]:
+def facts_of_camera(camera: Camera) -> dict[str, Any]:
     """Its numbers, for programs."""
     return {name: float(getattr(camera, name)) for name in CAMERA_NUMBERS}
 
 
 @dataclasses.dataclass(frozen=True)
 class Rendered:
-    """A picture to write, and what to tell of it.
-
-    Args:
-        out: The file to write.
-        picture: What to write.
-        words: For people.
-        facts: For programs.
-        seconds: Reading, rendering and writing together.
-    """
+    """A picture to write to a file, what to tell of it to people and to programs, and how long it took."""
 
     out: Path
     picture: Picture
@@ -164,35 +125,24 @@ class Rendered:
     facts: dict[str, Any]
     seconds: float
 
-    def told(self, as_json: bool) -> str:
-        """One line."""
-        if as_json:
-            return json_line({"out": str(self.out), **self.facts, "seconds": self.seconds})
-        remarks = ", ".join(self.facts["assumed"])
-        words = [*self.words, "{width} x {height}".format_map(self.facts)]
-        line = f"{self.out}: {'; '.join(words)}; {self.seconds:.2f} s on {self.facts['device']}"
-        return f"{line} [{remarks}]" if remarks else line
+    def tell(self, as_json: bool) -> None:
+        """Prints one line."""
+        facts = {"out": str(self.out), **self.facts, "seconds": self.seconds}
+        remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
+        words = [*self.words, f"{facts['width']} x {facts['height']}", f"{self.seconds:.2f} s on {facts['device']}"]
+        tell(as_json, facts, f"{self.out}: {'; '.join(words)}{remarks}")
 
 
 class Renderer:
-    """What ``torchdof render`` does with each frame: reads, renders and writes it.
-
-    Args:
-        command: What the user said.
-
-    Raises:
-        ValueError: If the table, the opening or the device makes no sense.
-        OSError: If a file of theirs cannot be read.
-    """
+    """What ``torchdof render`` does with each frame: reads, renders and writes it."""
 
     def __init__(self, command: "Render") -> None:
-        self.command, self.table = command, command.blur.table_of(command.blur.table)
+        self.command, self.table = command, command.blur.chosen()
         self.device, self.warned = pick_device(command.device), WarnOnce(command.scene.depth_map.strict)
 
     def read(self, image: Path, depth: Path | None, out: Path) -> Frame:
         """As :func:`read_frame`, unless the result would take the place of what is read."""
-        if any(os.path.realpath(source) == os.path.realpath(out) for source in (image, depth) if source is not None):
-            raise ValueError(f"{out}: is one of the inputs; write to another file")
+        refuse_input(out, image, depth)
         files = self.command.files
         return read_frame(image, depth, self.command.scene, transfer=files.transfer, layer=files.layer)
 
@@ -214,7 +164,7 @@ class Renderer:
                 if command.lights:
                     pixels = _with_lights(picture, pixels, command.lights)
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
-                    bar.expect(_seconds(blur, pixels, coc_px))
+                    bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 pixels = blur(pixels, coc_px, attention=command.attention)
         words, facts = self._told(camera, float(coc_px.abs().max()), frame.holes)
         facts |= {"assumed": remarks, "width": pixels.shape[-1], "height": pixels.shape[-2]}
@@ -222,19 +172,14 @@ class Renderer:
         return Rendered(out, dataclasses.replace(picture, pixels=pixels), words, facts, seconds)
 
     def write(self, rendered: Rendered) -> Rendered:
-        """Writes what was rendered, whole or not at all; its time is then that of writing, too.
-
-        Raises:
-            ValueError: If the type of file cannot hold the picture.
-            OSError: If the file cannot be written.
-        """
+        """Writes what was rendered, whole or not at all; its time is then that of writing, too."""
         start = time.perf_counter()
         write_image(rendered.out, rendered.picture, self.command.files.out_transfer, self.command.files.bits)
         return dataclasses.replace(rendered, seconds=rendered.seconds + time.perf_counter() - start)
 
     def _told(self, camera: Camera | None, largest_px: float, holes: int) -> tuple[list[str], dict[str, Any]]:
         """What was done to a frame, for people and for programs."""
-        command, accuracy, table, words = self.command, self.command.accuracy, self.table, list[str]()
+        command, table, words = self.command, self.table, list[str]()
         facts: dict[str, Any] = {"camera": None, "largest_coc_px": largest_px, "filled_px": holes}
         facts |= {"show_focus": command.show_focus, "device": str(self.device)}
         if camera is not None:
@@ -250,12 +195,12 @@ class Renderer:
             words.append("focus shown: near orange, sharp green, far blue")
         else:
             name, aperture = table.name or table.family, table.aperture
-            words.append(f"{name}, {accuracy.method}")
+            options = Options.of(**command.accuracy.options())
+            words.append(f"{name}, {options.method}")
             words += [] if aperture is None else [repr(aperture).removeprefix("Aperture(").removesuffix(")")]
-            words += ["no occlusion"] if accuracy.no_occlusion else []
-            options = Options.of(**accuracy.options())
+            words += [] if options.occlusion else ["no occlusion"]
             facts |= {"table": name, "aperture": None if aperture is None else aperture.to_dict()}
-            facts |= {"method": options.method, "occlusion": options.occlusion, "tolerance": options.tolerance}
+            facts |= {name: getattr(options, name) for name in ("method", "occlusion", "tolerance")}
             facts |= {"attention": command.attention, "lights": command.lights}
             words += [f"lights up to {command.lights:g} stops above white"] if command.lights else []
         words += [f"{holes} px of depth filled ({command.scene.depth_map.fill_depth})"] if holes else []

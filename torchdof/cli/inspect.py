@@ -3,11 +3,9 @@
 import dataclasses
 from pathlib import Path
 
-import click
-
 from .command import argument, option
-from .options import Scene, json_option
-from .printed import WarnOnce, json_line
+from .options import Scene, json_option, refuse_input
+from .printed import WarnOnce, tell
 
 __all__ = ["Inspect"]
 
@@ -38,8 +36,7 @@ class Inspect:
         if self.scene.depth_map.depth_kind == "coc":
             raise ValueError("--depth-kind coc is the blur itself: there is no depth to inspect")
         target = Path(f"{self.image.stem}.inspect.png") if self.out is None else self.out
-        if any(source is not None and source.resolve() == target.resolve() for source in (self.image, self.depth)):
-            raise ValueError(f"{target}: is one of the inputs; write to another file")
+        refuse_input(target, self.image, self.depth)
         from ..depth.inspect import inspect_depth, panels
         from ..depth.sanity import depth_mistakes
         from ..io.sheet import write_sheet
@@ -54,16 +51,13 @@ class Inspect:
         report = inspect_depth(light, metres, camera)
         write_sheet(target, panels(light, report))
         height, width = metres.shape[-2:]
-        if self.as_json:
-            facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
-            facts |= {"assumed": notes, **report.facts(), "filled_px": frame.holes, "picture": str(target)}
-            click.echo(json_line(facts))
-        else:
-            click.echo(f"image         {width} x {height} px, {', '.join(frame.picture.channels)}")
-            click.echo(f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""))
-            click.echo(str(report))
-            if frame.holes:
-                share = 100 * frame.holes / metres.numel()
-                click.echo(f"filled        {frame.holes} holes ({share:.1f} %), {said.fill_depth}")
-            click.echo(f"picture       {target}")
+        lines = [f"image         {width} x {height} px, {', '.join(frame.picture.channels)}"]
+        lines += [f"camera        {camera!r}" + (f" [{', '.join(notes)}]" if notes else ""), str(report)]
+        if frame.holes:
+            share = 100 * frame.holes / metres.numel()
+            lines.append(f"filled        {frame.holes} holes ({share:.1f} %), {said.fill_depth}")
+        lines.append(f"picture       {target}")
+        facts = {"image": str(self.image), "width": width, "height": height, "camera": facts_of_camera(camera)}
+        facts |= {"assumed": notes, **report.facts(), "filled_px": frame.holes, "picture": str(target)}
+        tell(self.as_json, facts, "\n".join(lines))
         WarnOnce(said.strict).warn(frame.name, depth_mistakes(metres, camera, said.depth_kind, said.depth_scale))

@@ -5,6 +5,7 @@ PyTorch is imported when the first of them is put to use, so that help and contr
 
 import contextlib
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ __all__ = [
     "edges_option",
     "json_option",
     "pick_device",
+    "refuse_input",
 ]
 
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
@@ -109,16 +111,23 @@ class Lens(Sensor):
         if len(self.focus_m or []) > 1:
             raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
 
+    def view_deg(self, metadata: Mapping[str, Any], width: int) -> float:
+        """Horizontal field of view, stated or by focal length and sensor, which the file may know."""
+        facts = camera_facts(metadata, width)
+        focal_mm = self.focal_length_mm or facts.get("focal_length_mm")
+        sensor_mm = self.sensor_width_mm or facts.get("sensor_width_mm")
+        if self.fov_deg is not None:
+            return self.fov_deg
+        if focal_mm is None or sensor_mm is None:
+            raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
+        return 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
+
     def camera(
         self, metadata: Mapping[str, Any], depth: "Tensor", frame: int = 0, median: bool = False
     ) -> "tuple[Camera, list[str]]":
         """The camera of one frame: what the user said, else the file's metadata, else 50 mm, f/2.8 and 36 mm.
 
-        Args:
-            metadata: As in ``Picture.metadata``.
-            depth: ``[1, 1, H, W]``, metres.
-            frame: Its number, for focus that moves.
-            median: Whether the focus is at the median depth where the user said nothing, whatever the file says.
+        With ``median``, the focus is at the median depth where the user said nothing, whatever the file says.
 
         Returns:
             The camera and remarks on what was not stated.
@@ -139,25 +148,23 @@ class Lens(Sensor):
                 raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
             focus_m = facts["focus_m"]
             remarks.append("focus from the file")
-        moved: dict[str, Any] = {"focus_range_m": self.focus_range, "tilt_deg": self.tilt, "swing_deg": self.swing}
-        if self.fov_deg is not None:
-            radius_m = self.aperture_radius_m
-            if radius_m is None and self.f_number is not None:  # on the equivalent sensor, 36 mm wide
-                radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * self.f_number)
-            if radius_m is None:
-                raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
-            with _by_option(self._names()):
-                camera = Camera.from_fov(self.fov_deg, radius_m, focus_m).replace(**moved)
-        else:
-            lens: dict[str, Any] = {}
-            for name, assumed in _ASSUMED.items():
-                stated = getattr(self, name)
-                lens[name] = facts.get(name, assumed) if stated is None else stated
-                if stated is None:
-                    words = name.rsplit("_", 1)[0].replace("_", " ") if name != "f_number" else "f-number"
-                    remarks.append(f"{words} {'from the file' if name in facts else 'assumed'}")
-            with _by_option(self._names()):
-                camera = Camera(**lens, focus_m=focus_m).replace(**moved)
+        if self.fov_deg is None:
+            lens = {name: getattr(self, name) for name in _ASSUMED}
+            for name in (name for name, stated in lens.items() if stated is None):
+                lens[name] = facts.get(name, _ASSUMED[name])
+                words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
+                remarks.append(f"{words} {'from the file' if name in facts else 'assumed'}")
+        elif self.aperture_radius_m is None and self.f_number is None:
+            raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
+        with _by_option(self._names()):
+            if self.fov_deg is None:
+                camera = Camera(**lens, focus_m=focus_m)
+            else:
+                radius_m = self.aperture_radius_m
+                if radius_m is None:  # on the equivalent sensor, 36 mm wide
+                    radius_m = 18.0 / math.tan(math.radians(self.fov_deg) / 2) / (2000.0 * (self.f_number or math.nan))
+                camera = Camera.from_fov(self.fov_deg, radius_m, focus_m)
+            camera = camera.replace(focus_range_m=self.focus_range, tilt_deg=self.tilt, swing_deg=self.swing)
         return camera if self.focus_at is None else camera.focus_at(depth, *self.focus_at), remarks
 
     def stated(self, camera: "Camera") -> dict[str, Any]:
@@ -264,18 +271,11 @@ class Opening:
             raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
 
     def opening(self) -> "Aperture | None":
-        """The opening that these options mean; None if they mean a round one.
-
-        Raises:
-            ValueError: If one is out of its range.
-            OSError: If the image cannot be read.
-        """
+        """The opening that these options mean; None if they mean a round one."""
         from ..io.images import read_image
         from ..optics.aperture import Aperture
 
-        mask = None
-        if self.aperture is not None:
-            mask = read_image(self.aperture).light[0].mean(0)
+        mask = None if self.aperture is None else read_image(self.aperture).light[0].mean(0)
         names = {name: f"--{name.removesuffix('_deg')}" for name in ("blades", "rotation_deg", "curvature", "squeeze")}
         with _by_option(names | {"vignetting": "--vignetting"}):
             aperture = Aperture(self.blades, self.rotation, self.curvature, self.squeeze, mask, self.vignetting)
@@ -285,9 +285,7 @@ class Opening:
         """A table by its name, or by the path of its JSON file, with this opening in place of its own.
 
         Raises:
-            ValueError: If it is not valid.
             FileNotFoundError: If there is no such table; the message lists those there are.
-            OSError: If a file cannot be read.
         """
         from ..optics.blur_table import BlurTable
         from ..optics.table_file import shipped
@@ -306,6 +304,10 @@ class Blur(Opening):
     """Blur."""
 
     table: str = option("disc, gaussian, a shipped table such as sato_j15, or a JSON file.", "disc", basic=True)
+
+    def chosen(self) -> "BlurTable":
+        """The table that these options mean, as :meth:`table_of`."""
+        return self.table_of(self.table)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -357,12 +359,14 @@ def _by_option(names: Mapping[str, str]) -> Iterator[None]:
         raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
 
 
-def pick_device(name: str) -> "torch.device":
-    """A device by name; "auto" is CUDA where there is one, else the CPU.
+def refuse_input(out: Path, *sources: Path | None) -> None:
+    """Refuse to write a file in the place of one that is read."""
+    if any(source is not None and os.path.realpath(source) == os.path.realpath(out) for source in sources):
+        raise ValueError(f"{out}: is one of the inputs; write to another file")
 
-    Raises:
-        ValueError: If there is no such device.
-    """
+
+def pick_device(name: str) -> "torch.device":
+    """A device by name; "auto" is CUDA where there is one, else the CPU."""
     import torch
 
     if name == "auto":

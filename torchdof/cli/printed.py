@@ -1,11 +1,10 @@
-"""What commands print: JSON for programs, warnings, and a bar while something takes long."""
+"""What commands print: a line for people or JSON for programs, warnings, and a bar while something takes long."""
 
 import json
 import math
 import os
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -15,9 +14,14 @@ import click
 if TYPE_CHECKING:
     from ..depth.sanity import Mistake
 
-__all__ = ["Bar", "WarnOnce", "json_line"]
+__all__ = ["Bar", "WarnOnce", "json_line", "tell"]
 
 _PATIENCE_S = 3.0
+
+
+def tell(as_json: bool, facts: Mapping[str, Any], line: str) -> None:
+    """Prints facts as JSON, or the line that says the same to people."""
+    click.echo(json_line(facts) if as_json else line)
 
 
 def json_line(facts: Mapping[str, Any]) -> str:
@@ -27,17 +31,17 @@ def json_line(facts: Mapping[str, Any]) -> str:
         >>> json_line({"focus_m": float("inf"), "size": (3, 2)})
         '{"focus_m": "inf", "size": [3, 2]}'
     """
-    return json.dumps(_finite(facts), allow_nan=False)
 
+    def finite(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {str(name): finite(part) for name, part in value.items()}
+        if hasattr(value, "tolist"):  # numpy's numbers and arrays
+            return finite(value.tolist())
+        if isinstance(value, list | tuple):
+            return [finite(part) for part in value]
+        return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(name): _finite(part) for name, part in value.items()}
-    if hasattr(value, "tolist"):  # numpy's numbers and arrays
-        return _finite(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+    return json.dumps(finite(facts), allow_nan=False)
 
 
 class WarnOnce:
@@ -77,66 +81,49 @@ def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:
     click.echo(f"warning: {message}", err=True)
 
 
+def _is_terminal() -> bool:
+    return sys.stderr.isatty()
+
+
 class Bar:
     """A bar with an estimate on standard error, from the third second on, where that is a terminal.
 
     Args:
         what: What is being done.
         total: How many steps there are; None where nobody knows.
-
-    Attributes:
-        what: What is being done now.
-        done: Steps done.
     """
 
     def __init__(self, what: str, total: float | None = None) -> None:
-        self.what, self.done, self.total = what, 0.0, total
-        self._start = self._expected_from = time.monotonic()
-        self._expected_s: float | None = None
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._show, name="bar", daemon=True)
+        self.is_seen = _is_terminal()
+        if self.is_seen:
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    @property
-    def is_seen(self) -> bool:
-        """Whether there is a terminal to show it on."""
-        return sys.stderr.isatty()
+            columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
+            self._progress = Progress(
+                *columns,
+                TimeRemainingColumn(),
+                console=Console(stderr=True),
+                transient=True,
+                redirect_stdout=sys.stdout.isatty(),  # lines go above the bar; to a file they go as ever
+            )
+            self._task = self._progress.add_task(what, total=total)
+            self._timer = threading.Timer(_PATIENCE_S, self._progress.start)
+            self._timer.daemon = True
 
-    def tell(self, what: str) -> None:
-        """Says what is done now."""
-        self.what = what
-
-    def step(self, done: int, total: int, what: str) -> None:
-        """Says how many steps are done, and what is done now."""
-        self.done, self.total, self.what = done, total, what
-
-    def expect(self, seconds: float) -> None:
-        """Says how long the step that begins now takes."""
-        self._expected_from, self._expected_s, self.total = time.monotonic(), seconds, self.total or 1.0
+    def update(self, what: str | None = None, done: float | None = None, total: float | None = None) -> None:
+        """Says what is done now, how many steps are done, and how many there are."""
+        if self.is_seen:
+            self._progress.update(self._task, description=what, completed=done, total=total)
 
     def __enter__(self) -> "Bar":
         if self.is_seen:
-            self._thread.start()
+            self._timer.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        if self._thread.is_alive():
-            self._thread.join()
-
-    def _show(self) -> None:
-        if self._ended.wait(_PATIENCE_S):
-            return
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        columns = TextColumn("{task.description}", markup=False), BarColumn(), TextColumn("{task.fields[told]}")
-        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task(self.what, total=None, told="")
-            while not self._ended.wait(0.1):
-                elapsed, done = time.monotonic() - self._start, self.done
-                if self._expected_s:
-                    done += min((time.monotonic() - self._expected_from) / self._expected_s, 0.98)
-                told = f"{elapsed:.0f} s"
-                if self.total and done:
-                    told += f", about {elapsed / done * (self.total - done):.0f} s left"
-                progress.update(task, description=self.what, total=self.total, completed=done, told=told)
+        if self.is_seen:
+            self._timer.cancel()
+            self._timer.join()
+            if self._progress.live.is_started:
+                self._progress.stop()

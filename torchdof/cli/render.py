@@ -3,11 +3,10 @@
 import dataclasses
 import itertools
 import math
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -28,15 +27,6 @@ _EACH_ITS_OWN = (
     "far have in all frames: --value-range LOW,HIGH"
 )
 Encoding = Literal["linear", "srgb"]
-
-
-class _Job(NamedTuple):
-    """One frame's number and files."""
-
-    number: int
-    image: Path
-    depth: Path | None
-    out: Path
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -142,33 +132,32 @@ class Render:
         with Bar(f"rendering {self.out.name}") as bar:
             frame = renderer.read(self.image, self.depth, self.out)
             rendered = renderer.write(renderer.render(frame, self.out, bar=bar))
-        self._tell(rendered)
+        rendered.tell(self.as_json)
 
     def _render_sequence(self) -> None:
         """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
-        source, target = FramePattern(self.image), FramePattern(self.out)
+        source, target, said = FramePattern(self.image), FramePattern(self.out), self.scene.depth_map
         depths = FramePattern(self.depth) if self.depth is not None and FramePattern.matches(self.depth) else None
         numbers = self._numbers(source, depths)
         todo = [n for n in numbers if not (self.files.resume and target.name(n).is_file())]
         if len(todo) < len(numbers):
             there = [target.name(n) for n in numbers if n not in set(todo)]
             self._tell_of_those_there(there, f"{len(there)} of {len(numbers)} frames are there already")
-        said = self.scene.depth_map
         if self.files.steady and said.depth_kind == "coc":
             raise ValueError("--steady filters depth in metres; --depth-kind coc has none")
         from ..depth.sanity import Mistake
         from .frame import Renderer
 
-        def job(n: int) -> _Job:
-            return _Job(n, source.name(n), depths.name(n) if depths else self.depth, target.name(n))
-
         renderer = Renderer(self)
         if said.depth_kind == "relative" and said.value_range is None and len(numbers) > 1:
             renderer.warned.warn(self.depth or self.image, [Mistake("range", _EACH_ITS_OWN)])
-        read: Callable[[_Job], Frame] = lambda job: renderer.read(job.image, job.depth, job.out)  # noqa: E731
-        if self.files.steady:
-            read = _steadied(read, [job(n) for n in source.frames() if depths is None or depths.name(n).is_file()])
-        self._render_each(renderer, [job(n) for n in todo], read)
+
+        def read(n: int) -> "Frame":
+            return renderer.read(source.name(n), depths.name(n) if depths else self.depth, target.name(n))
+
+        whole = [n for n in source.frames() if depths is None or depths.name(n).is_file()]
+        steadied = _steadied(read, whole) if self.files.steady else read
+        self._render_each(renderer, {n: target.name(n) for n in todo}, steadied)
 
     def _numbers(self, source: FramePattern, depths: FramePattern | None) -> Sequence[int]:
         """The numbers of the frames that are asked for, all of which are there."""
@@ -177,67 +166,58 @@ class Render:
             first, last = self.files.frames
             wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
             if len(existing) < len(wanted):
-                missing = source.name(next(n for n in wanted if n not in existing))
+                missing, absent = next(n for n in wanted if n not in existing), len(wanted) - len(existing)
                 raise FileNotFoundError(
-                    f"{missing}: there is no such file ({len(wanted) - len(existing)} of {len(wanted)} frames missing)"
+                    f"{source.name(missing)}: there is no such file ({absent} of {len(wanted)} frames missing)"
                 )
             numbers = wanted
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
-        absent = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
-        if absent:
-            raise FileNotFoundError(
-                f"{absent[0]}: there is no such file ({len(absent)} of {len(numbers)} depths missing)"
-            )
+        without = [path for n in numbers if depths is not None and not (path := depths.name(n)).is_file()]
+        if without:
+            told = f"{len(without)} of {len(numbers)} depths missing"
+            raise FileNotFoundError(f"{without[0]}: there is no such file ({told})")
         return numbers
 
-    def _render_each(self, renderer: "Renderer", jobs: Sequence[_Job], read: "Callable[[_Job], Frame]") -> None:
+    def _render_each(self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]") -> None:
         """Renders frames in order; while one is rendered, the next is read and the one before is written."""
-        read_ahead: deque[Future[Frame]] = deque()
-        written: Future[Rendered] | None = None
 
-        def finish() -> None:
-            nonlocal written
-            last, written = written, None
-            if last is not None:
-                self._tell(last.result())
-                bar.done += 1
+        def write(rendered: "Rendered") -> None:  # in a thread that no interrupt ends between a file and its name
+            renderer.write(rendered).tell(self.as_json)
 
-        with Bar("", len(jobs)) as bar, ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
-            coming = iter(jobs)
+        with Bar("", len(files)) as bar, ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
+            numbers, coming, written = iter(files), list["Future[Frame]"](), list[Future[None]]()
             try:
-                for k, job in enumerate(jobs):
-                    bar.what = f"frame {k + 1} of {len(jobs)}"
-                    read_ahead += [reader.submit(read, one) for one in itertools.islice(coming, 2 - len(read_ahead))]
-                    rendered = renderer.render(read_ahead.popleft().result(), job.out, job.number)
-                    finish()
-                    written = writer.submit(renderer.write, rendered)
+                for k, (n, out) in enumerate(files.items()):
+                    bar.update(f"frame {k + 1} of {len(files)}", k)
+                    coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
+                    rendered = renderer.render(coming.pop(0).result(), out, n)
+                    for last in written:
+                        last.result()
+                    written = [writer.submit(write, rendered)]
             finally:  # what was rendered is written, whatever happens to the next
-                finish()
-
-    def _tell(self, rendered: "Rendered") -> None:
-        click.echo(rendered.told(self.as_json))
+                for last in written:
+                    last.result()
 
     def _tell_of_those_there(self, files: Sequence[Path], line: str) -> None:
         lines = [json_line({"out": str(file), "is_there_already": True}) for file in files]
         click.echo("\n".join(lines) if self.as_json else line)
 
 
-def _steadied(read: "Callable[[_Job], Frame]", jobs: Sequence[_Job]) -> "Callable[[_Job], Frame]":
+def _steadied(read: "Callable[[int], Frame]", numbers: Sequence[int]) -> "Callable[[int], Frame]":
     """Reads frames with the depth that frames before them steadied, whichever of a sequence are asked for."""
     from ..depth.steady import SteadyFrames
 
-    places = {job.number: place for place, job in enumerate(jobs)}
     latest: list[Frame] = []
 
     def pixels_and_depth(place: int) -> "tuple[Tensor, Tensor]":
-        latest[:] = [read(jobs[place])]
+        latest[:] = [read(numbers[place])]
         return latest[0].picture.pixels, latest[0].values
 
-    frames = SteadyFrames(pixels_and_depth)
+    frames, places = SteadyFrames(pixels_and_depth), {n: place for place, n in enumerate(numbers)}
 
-    def steadied(job: _Job) -> "Frame":
-        values = frames.depth(places[job.number])
+    def steadied(n: int) -> "Frame":
+        values = frames.depth(places[n])
         return dataclasses.replace(latest[0], values=values)
 
     return steadied

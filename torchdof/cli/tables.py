@@ -9,7 +9,7 @@ import click
 
 from .command import argument, option
 from .options import Opening, json_option
-from .printed import json_line
+from .printed import tell
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -57,7 +57,7 @@ class Tables:
         for name in self.names or ["disc", "gaussian", *shipped()]:
             table = self.opening.table_of(name)
             facts = _facts(name, table)
-            click.echo(json_line(facts) if self.as_json else _line(facts))
+            tell(self.as_json, facts, _line(facts))
             if self.out is not None:
                 panels[Path(name).stem] = _column(table)
         if self.out is None:
@@ -91,12 +91,8 @@ def _line(facts: dict[str, Any]) -> str:
     if facts["unit"] != "relative":
         low, high = facts["coc"]
         parts.append(f"coc {low:.3g} to {high:.3g} {'mm' if facts['unit'] == 'mm' else 'of the width'}")
-    if facts["colours"] > 1:
-        parts.append(f"{facts['colours']} colours")
-    if facts["aperture"]:
-        parts.append(facts["aperture"])
-    if facts["field"]:
-        parts.append(facts["field"])
+    parts += [f"{facts['colours']} colours"] if facts["colours"] > 1 else []
+    parts += [facts[name] for name in ("aperture", "field") if facts[name]]
     return f"{facts['table']:24s} {'; '.join(parts)}" + (f" ({facts['source']})" if facts["source"] else "")
 
 

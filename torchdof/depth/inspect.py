@@ -9,8 +9,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.camera import Camera
+from ..render.edges import STEP_PX, judged
 from ..validation import image_and_map
-from .edges import STEP_PX, judged
 
 __all__ = ["EDGES", "DepthReport", "coc_colours", "inspect_depth", "panels", "tint_focus"]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from ..io.atomic import write_text
 from ..validation import whole
-from .shards import SUFFIXES, Format, Pair, RenderShards, samples_of, shard_rows
+from .shards import SUFFIXES, Format, Pair, RenderShards, name_of, samples_of, shard_rows
 
 __all__ = ["Summary", "make_dataset", "pairs_in", "summary_of"]
 
@@ -69,13 +69,17 @@ def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | No
 
 
 def _by_stem(folder: str | os.PathLike[str], suffixes: tuple[str, ...]) -> dict[str, list[Path]]:
-    if not Path(folder).is_dir():
-        raise FileNotFoundError(f"{folder}: there is no such folder")
     found: dict[str, list[Path]] = {}
-    for path in sorted(Path(folder).absolute().iterdir()):
+    for path in sorted(_there(folder).absolute().iterdir()):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
             found.setdefault(path.stem, []).append(path)
     return found
+
+
+def _there(folder: str | os.PathLike[str]) -> Path:
+    if not Path(folder).is_dir():
+        raise FileNotFoundError(f"{folder}: there is no such folder")
+    return Path(folder)
 
 
 def make_dataset(
@@ -121,12 +125,14 @@ def make_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     rows = shard_rows(pairs, per_shard, copies)
-    settings = RenderShards(out, blur, format=format, **render).settings()  # wrong ones are refused before Ray starts
-    listed = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
-    settings = {"images": len(pairs), "copies": copies, "per_shard": per_shard, "sha256_of_samples": listed, **settings}
+    settings = {
+        **{"images": len(pairs), "copies": copies, "per_shard": per_shard},
+        "sha256_of_samples": hashlib.sha256(json.dumps(rows).encode()).hexdigest(),
+        **RenderShards(out, blur, format=format, **render).settings(),  # wrong ones are refused before Ray starts
+    }
     settings = json.loads(json.dumps(settings))  # with lists for tuples
     _same_as_before(out / "plan.json", settings)
-    missing = [row for row in rows if samples_of(out / _name(row, format)) is None]
+    missing = [row for row in rows if samples_of(out / name_of(row["shard"], format)) is None]
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
     if missing:
         if not ray.is_initialized():
@@ -135,8 +141,6 @@ def make_dataset(
         if workers > cores:
             raise ValueError(f"workers must be at most the cores of the Ray cluster, {cores}, got {workers}")
         ray.data.DataContext.get_current().enable_progress_bars = False  # each shard is told instead
-        start, made = time.perf_counter(), 0
-        left = {row["shard"]: len(json.loads(row["samples"])) for row in missing}
         told = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
             RenderShards,
             fn_constructor_args=(str(out.resolve()), blur),
@@ -145,22 +149,21 @@ def make_dataset(
             compute=ray.data.ActorPoolStrategy(size=min(workers, len(missing))),
             num_cpus=1,
         )
+        start, made, left = time.perf_counter(), 0, {row["shard"]: len(json.loads(row["samples"])) for row in missing}
         for row in told.iter_rows():
             made += not row["error"]
             left[row["shard"]] -= 1
             if not left[row["shard"]]:
-                say(f"{_name(row, format)} is complete")
-        pace = made / (time.perf_counter() - start)
-        say(f"{made} samples in {made / pace:.1f} s: {pace:.2f} images/s, {pace / workers:.2f} a worker")
+                say(f"{name_of(row['shard'], format)} is complete")
+        seconds = time.perf_counter() - start
+        say(
+            f"{made} samples in {seconds:.1f} s: {made / seconds:.2f} images/s, {made / seconds / workers:.2f} a worker"
+        )
     summary = summary_of(out)
     _describe(out, summary, settings)
     for image, problem in summary.broken:
         say(f"left out: {problem}" if problem.startswith(image) else f"left out: {image}: {problem}")
     return summary
-
-
-def _name(row: dict[str, Any], format: Format) -> str:
-    return f"shard-{row['shard']:06d}{SUFFIXES[format]}"
 
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
@@ -169,9 +172,7 @@ def summary_of(out: str | os.PathLike[str]) -> Summary:
     Raises:
         FileNotFoundError: If there is no such folder.
     """
-    if not Path(out).is_dir():
-        raise FileNotFoundError(f"{out}: there is no such folder")
-    shards = [path for path in sorted(Path(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
+    shards = [path for path in sorted(_there(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
     noted = [samples for samples in map(samples_of, shards) if samples is not None]
     rows = [row for samples in noted for row in samples]
     broken = [(row["image"], row["error"]) for row in rows if row["error"]]

@@ -9,12 +9,11 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import inspect
-import io
 import json
 import os
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,14 +25,14 @@ from ..augmentation import RandomDepthOfField
 from ..depth.holes import resolve_holes
 from ..depth.reading import read_depth
 from ..depth.relative import from_relative
-from ..depth.size import at_size_of
 from ..io.atomic import whole_file, write_text
 from ..io.images import Picture, read_image, read_values, write_image
 from ..io.transfer import Transfer
 from ..module import depth_of_field
+from ..render.resample import at_size_of
 from ..validation import number, show, whole
 
-__all__ = ["SUFFIXES", "Format", "Pair", "RenderShards", "samples_of", "shard_rows"]
+__all__ = ["SUFFIXES", "Format", "Pair", "RenderShards", "name_of", "samples_of", "shard_rows"]
 
 Format = Literal["webdataset", "parquet"]
 
@@ -99,6 +98,11 @@ def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> l
     return [{"shard": number, "samples": json.dumps(part)} for number, part in enumerate(parts)]
 
 
+def name_of(shard: int, format: Format) -> str:
+    """The name of a shard's file."""
+    return f"shard-{int(shard):06d}{SUFFIXES[format]}"
+
+
 def samples_of(shard: Path) -> list[dict[str, Any]] | None:
     """What is noted of the samples of a shard; None if the shard is not there or not complete."""
     try:
@@ -159,7 +163,10 @@ class RenderShards:
         picture: Literal[".png", ".exr"] = ".png",
         threads: int | None = None,
     ) -> None:
-        self.out = Path(out)
+        self.out, self.depth = Path(out), dict(depth or {})
+        self.blur = RandomDepthOfField() if blur is None else blur
+        self.format, self.keep, self.transfer, self.picture = format, tuple(keep), transfer, picture
+        self.seed = whole("seed", seed, 0, 2**62)
         if not self.out.is_dir():
             raise FileNotFoundError(f"{out}: there is no such folder; make it first")
         if format not in SUFFIXES:
@@ -170,27 +177,19 @@ class RenderShards:
             raise ValueError(f"keep must be some of {', '.join(_KEPT)}, got {show(keep)}")
         if picture not in (".png", ".exr"):
             raise ValueError(f"picture must be '.png' or '.exr', got {show(picture)}")
-        self.blur = RandomDepthOfField() if blur is None else blur
         if not isinstance(self.blur, RandomDepthOfField):
             raise ValueError(f"blur must be a RandomDepthOfField, got {show(blur)}")
-        self.depth = dict(depth or {})
         self._read_depth = _read_relative if self.depth.get("kind") == "relative" else read_depth
         known = inspect.signature(self._read_depth)
         try:
             known.bind("", **self.depth)
         except TypeError as error:
             raise ValueError(f"depth must be some of {', '.join([*known.parameters][1:])}: {error}") from None
-        self.format: Format = format
-        self.keep, self.transfer, self.picture = tuple(keep), transfer, picture
-        self.seed = whole("seed", seed, 0, 2**62)
         if threads is not None:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Make the shards of a batch.
-
-        Args:
-            batch: Columns ``shard`` and ``samples``.
+        """Make the shards of a batch with the columns ``shard`` and ``samples``.
 
         Returns:
             Columns ``shard``, ``key``, ``image``, ``error`` ("" where there is none) and ``seconds`` of the processor:
@@ -201,9 +200,9 @@ class RenderShards:
         """
         rows: list[dict[str, Any]] = []
         for shard, samples in zip(batch["shard"], batch["samples"], strict=True):
-            path = self.out / f"shard-{int(shard):06d}{SUFFIXES[self.format]}"
-            for row in samples_of(path) or self._make(path, json.loads(str(samples))):
-                rows.append({"shard": int(shard), **row})
+            path = self.out / name_of(shard, self.format)
+            noted = samples_of(path) or self._make(path, json.loads(str(samples)))
+            rows += [{"shard": int(shard), **row} for row in noted]
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
     def settings(self) -> dict[str, Any]:
@@ -218,28 +217,26 @@ class RenderShards:
         }
 
     def _make(self, path: Path, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Render one shard and write it."""
+        """Render one shard and write it; the notes of its samples."""
         records, rows = [], []
         for sample in samples:
             start, error = time.process_time(), ""
             try:
-                records.append(self._sample(**sample))
+                records.append(self._record(**sample))
             except (OSError, ValueError, MemoryError, RuntimeError) as broken:  # torch's allocator raises the last
-                error = str(broken) or type(broken).__name__
-            seconds = round(time.process_time() - start, 4)
-            rows.append(
-                {"key": sample["key"], "image": _text(sample["image"]), "error": _text(error), "seconds": seconds}
-            )
+                error = _text(str(broken) or type(broken).__name__)
+            row = {"key": sample["key"], "image": _text(sample["image"]), "error": error}
+            rows.append({**row, "seconds": round(time.process_time() - start, 4)})
         with whole_file(path) as part:
             (_write_tar if self.format == "webdataset" else _write_parquet)(part, records)
             notes = {"bytes": part.stat().st_size, "samples": rows}
             write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # a shard that is there has its notes
         return rows
 
-    def _sample(
+    def _record(
         self, key: str, image: str, depth: str | None, focus_m: float | None, f_number: float | None
     ) -> dict[str, Any]:
-        """One sample by the names of its files, beside its parameters."""
+        """One sample: its key, the bytes of its files by their names, and its parameters as ``json``."""
         source = read_image(image, self.transfer)
         metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
         own = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
@@ -251,16 +248,12 @@ class RenderShards:
         options = self.blur.renderings[int(drawn["table"])]
         with torch.no_grad():
             blurred = depth_of_field(source.pixels, metres, camera, **options.arguments())
-        record: dict[str, Any] = {}
-        for name in self.keep:
-            if name == "depth":
-                file = io.BytesIO()
-                np.save(file, metres[0, 0].numpy())
-                record["depth.npy"] = file.getvalue()
-            else:
-                pixels = blurred if name == "blurred" else source.pixels
-                record[name + self.picture] = _encoded(Picture(pixels, source.channels), self.picture)
-        record["json"] = {
+        files = {
+            f"blurred{self.picture}": lambda path: write_image(path, Picture(blurred, source.channels)),
+            f"sharp{self.picture}": lambda path: write_image(path, Picture(source.pixels, source.channels)),
+            "depth.npy": lambda path: np.save(path, metres[0, 0].numpy()),
+        }
+        parameters = {
             **_plain(vars(camera)),
             **_plain(options.arguments()),
             "table": options.table.name or options.table.family,
@@ -274,7 +267,8 @@ class RenderShards:
             "seed": self.seed,
             "torchdof": importlib.metadata.version("torchdof"),
         }
-        return {"key": key, **record}
+        kept = {name: _bytes(name, write) for name, write in files.items() if name.partition(".")[0] in self.keep}
+        return {"key": key, **kept, "json": parameters}
 
 
 def _read_relative(
@@ -298,12 +292,11 @@ def _plain(arguments: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in numbers.items() if name != "table"}
 
 
-def _encoded(picture: Picture, suffix: str) -> bytes:
-    """The bytes of a picture's file."""
+def _bytes(name: str, write: Callable[[Path], object]) -> bytes:
+    """What a function writes to a file of some name."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"picture{suffix}"
-        write_image(path, picture)
-        return path.read_bytes()
+        write(Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
 
 
 def _write_tar(path: Path, records: Sequence[dict[str, Any]]) -> None:

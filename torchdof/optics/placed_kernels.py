@@ -16,14 +16,14 @@ already.
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Protocol
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .blur_table import BlurTable
 from .field import deviations
-from .kernel_bank import SPOT_MARGIN_PX
+from .kernel_bank import SPOT_MARGIN_PX, Lens
 from .kernel_cache import KernelCache
 
 __all__ = ["DISTANCES", "Shares", "layer_shares", "placed", "placed_between", "ray_shares"]
@@ -40,6 +40,13 @@ _LEAST = 1e-6  # of a kernel; where less passes it stays whole
 _LEAST_SIZE = 0.5  # of a spot, which is made smaller by what pixels add to it
 _RAY_STEP = 1.09  # between radii of highlights for which shares are told
 _shares = KernelCache(128 * 2**20)
+
+
+class PlacedLens(Lens, Protocol):
+    """What shares are made of: :class:`torchdof.BlurTable`."""
+
+    def reach_px(self, coc_px: float, width: float) -> float:
+        """Radius in pixels that holds the kernels at ``+-coc_px``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +74,7 @@ class Shares:
         )
 
 
-def layer_shares(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int]) -> Shares:
+def layer_shares(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> Shares:
     """Shares of a layer.
 
     Args:
@@ -81,7 +88,7 @@ def layer_shares(table: BlurTable, coc_px: float, scale: int, size: tuple[int, i
     return Shares(values, boxes, coc_px / scale, _squeeze(table))
 
 
-def ray_shares(table: BlurTable, coc_px: Sequence[float], size: tuple[int, int]) -> list[Shares]:
+def ray_shares(table: PlacedLens, coc_px: Sequence[float], size: tuple[int, int]) -> list[Shares]:
     """Shares for highlights of so many signed coc, by growing coc: those of two fixed radii around each of them."""
     steps = set()
     for coc in coc_px:
@@ -94,12 +101,12 @@ def ray_shares(table: BlurTable, coc_px: Sequence[float], size: tuple[int, int])
     return [Shares(values, boxes, radius, squeeze) for (values, boxes), radius in zip(made, radii, strict=True)]
 
 
-def _squeeze(table: BlurTable) -> float | Tensor:
+def _squeeze(table: PlacedLens) -> float | Tensor:
     return 1.0 if table.aperture is None else table.aperture.squeeze
 
 
 @torch.inference_mode(False)  # what is kept must serve autograd as well
-def _made(table: BlurTable, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _made(table: PlacedLens, coc_px: float, scale: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Values and boxes of :class:`Shares`, float64."""
     half_diagonal = 0.5 * math.hypot(*size)
     distance = torch.linspace(0.0, 1.0, DISTANCES, dtype=torch.float64)
@@ -139,7 +146,7 @@ def _overlaps(place: Tensor, ends: Tensor, width: Tensor) -> Tensor:
     return (torch.minimum(place + half, ends[:, None, 1:]) - low).clamp_min(0.0)
 
 
-def _through_rims(table: BlurTable, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
+def _through_rims(table: PlacedLens, coc_px: float, width: float, distance: Tensor) -> tuple[Tensor, Tensor]:
     """Distances in pixels from the edges of the aperture's rims, as shares."""
     if table.aperture is None:
         raise AssertionError("a table that depends on the place has a field or rims")

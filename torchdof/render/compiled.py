@@ -27,11 +27,13 @@ def picture(
     behind_light: Tensor | None = None,
     behind_coc: Tensor | None = None,
     cover: Tensor | None = None,
+    lens_width: int | None = None,
 ) -> Tensor | None:
     """The picture ``[B, C, H, W]`` that the plain engine would make, item by item; None where that one serves.
 
     The compiled engine serves eager inference on the CPU in float32, with layers. Arguments are those of the plain
-    engine's entry, ``torchdof.render.pipeline._render_item``.
+    engine's entry, ``torchdof.render.pipeline._render_item``, and the width of the image whose kernels are used, where
+    it is not the picture's own.
     """
     if options.table.is_differentiated:
         return None
@@ -41,12 +43,13 @@ def picture(
     if options.method != "layered" or is_traced() or not native.chosen() or not all(map(_is_plain, given)):
         return None
     height, width = int(light.shape[-2]), int(light.shape[-1])
-    lens_width, scales = plan.layer_sizes(options.table, (height, width), coarse=True)
-    spots = layer_spots(options.table, plan.coc_px, lens_width, scales, longest_px((height, width), scales))
+    lens_width = lens_width or width
+    kernels_width, scales = plan.layer_sizes(options.table, (height, lens_width), coarse=True)
+    spots = layer_spots(options.table, plan.coc_px, kernels_width, scales, longest_px((height, width), scales))
     if max(spots.half) > native.HALF_LARGEST:
         return None
     layers = list(zip(_kernels(options.table, spots), scales, strict=True))
-    render = functools.partial(_render, plan, options, layers)
+    render = functools.partial(_render, plan, options, layers, lens_width)
     if cover is not None:
         low, high = plan.coc_px[0], plan.coc_px[-1]
         coc = coc.clamp(low, high)
@@ -72,6 +75,7 @@ def _render(
     plan: Plan,
     options: Options,
     layers: Sequence[tuple[Tensor, int]],
+    lens_width: int,
     surfaces: Sequence[tuple[Tensor, Tensor, Tensor | None]],
     kind: native.Kind,
 ) -> Tensor:
@@ -84,7 +88,7 @@ def _render(
         kind=kind,
         nodes=plan.nodes,
         layers=layers,
-        psfs=functools.partial(_psfs, options.table, int(width), int(max(height, width))),
+        psfs=functools.partial(_psfs, options.table, lens_width, int(max(height, width))),
         occlusion=options.occlusion,
         normalize=options.normalize,
         masked=kind != "stack" and not options.check,

@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..exporting import where_needed
 from . import field
 from .convolution import CHANNELS
 from .downsampling import downsampled, upsampled
+from .ops import EAGER, Ops
 from .plan import Blur
 from .scatter import fold
 from .surfaces import Frame
@@ -30,7 +30,7 @@ _LEAST = 1e-6  # share of scattered weight below which nothing is known
 _KNOWN = 0.002  # share of scattered weight from which on a layer is known in full
 
 
-def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
+def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
     """Normalised "over" of soft layers.
 
     With ``m_k`` the weight of layer k, ``M_k`` the weight at or behind it and ``K_k`` its kernel:
@@ -44,6 +44,7 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
         frame: The surfaces seen in each pixel.
         blurs: Kernel and resolution of each layer.
         scatter: How a layer is scattered.
+        ops: How layers that nothing lies in are skipped.
 
     Reference:
         Ikoma, Nguyen, Metzler, Peng, Wetzstein, "Depth from defocus with learned optics", ICCP 2021.
@@ -66,13 +67,13 @@ def over(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
         share = left * share_behind if backed else torch.addcmul(share, left, share_behind)
         return torch.addcmul(light, left, light_behind), share
 
-    picture = _composite_layers(frame, blurs, scatter, composited, 1.0 if backed else 0.0, normalised)
+    picture = _composite_layers(frame, blurs, scatter, composited, ops, 1.0 if backed else 0.0, normalised)
     light, left = _parts(picture, colours)
     out = mean(picture, colours) if frame.behind is None else torch.addcmul(light, left, frame.behind)
     return out[..., : frame.size[0], : frame.size[1]]
 
 
-def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
+def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter, ops: Ops = EAGER) -> Tensor:
     """The paper's scatter: every pixel's light accumulates, whatever lies in front; after it come its weights.
 
     It is what :func:`mean` takes. Arguments are those of :func:`over`.
@@ -84,7 +85,7 @@ def accumulate(frame: Frame, blurs: Sequence[Blur], scatter: Scatter) -> Tensor:
     def added(front: Picture, behind: Picture) -> Picture:
         return front[0] + behind[0], front[1] + behind[1]
 
-    return _composite_layers(frame, blurs, scatter, added)[..., : frame.size[0], : frame.size[1]]
+    return _composite_layers(frame, blurs, scatter, added, ops)[..., : frame.size[0], : frame.size[1]]
 
 
 def accumulate_once(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
@@ -112,6 +113,7 @@ def _composite_layers(
     blurs: Sequence[Blur],
     scatter: Scatter,
     composited: Callable[[Picture, Picture], Picture],
+    ops: Ops,
     empty: float = 0.0,
     normalised: Callable[[Lights, Tensor, Tensor], Pictures] | None = None,
 ) -> Tensor:
@@ -157,14 +159,13 @@ def _composite_layers(
             front = _parts(part, colours)
             for layer in reversed(layers):
                 front = composited(layer, front)
-            part = where_needed(_needed(frame, blurs, group), torch.cat(front, 1), part)
+            part = ops.choose(_needed(frame, blurs, group), torch.cat(front, 1), part)
         if scale > 1:
             fine = upsampled(part, scale)
             fine = fine[..., scale : fine.shape[-2] - scale, scale : fine.shape[-1] - scale]
             needed = _needed(frame, blurs, [k for group in groups for k in group])
-            part = where_needed(
-                needed, torch.cat(composited(_parts(fine, colours), _parts(picture, colours)), 1), picture
-            )
+            together = torch.cat(composited(_parts(fine, colours), _parts(picture, colours)), 1)
+            part = ops.choose(needed, together, picture)
         picture = part
     return picture
 

@@ -5,31 +5,28 @@ with a weight so small that it speaks only where nothing visible does.
 """
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import pixels
-from ..exporting import exported_graph
 from .downsampling import downsampled
-from .matting import NEVER_PX
+from .matting import NEVER_PX, attribute_emitters, matte
+from .ops import EAGER, Level, Ops, Seen
+from .surfaces import HIDDEN_WEIGHT, Surface
+from .traced import is_compiled, one_operator
 
 __all__ = [
     "BEHIND_PX",
     "BEHIND_STEP",
-    "HIDDEN_WEIGHT",
-    "Level",
     "behind_pixels",
     "behind_size",
     "fill_hidden",
     "search",
+    "surfaces_of_image",
 ]
-
-HIDDEN_WEIGHT = 0.003
-"""Weight of a hidden sample against 1 of a visible one."""
 
 BEHIND_PX = 1.0  # a hidden surface lies about so much farther, in coc: from half a pixel less to half a pixel more
 _FALL = 0.35  # weight of a level of the pyramid against the finer one before
@@ -44,21 +41,49 @@ Samples = Iterable[tuple[Tensor, Tensor]]
 """Samples around places, ``[P, C + 2]`` or maps ``[B, C + 2, h, w]``, and their shares of the linear mean of them."""
 
 
-class Level(NamedTuple):
-    """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
+def surfaces_of_image(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int, ops: Ops = EAGER
+) -> tuple[list[Surface], Tensor]:
+    """What each pixel shows, and what is mixed into it or hidden behind it; and the light behind both.
 
-    ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
-    pixel looks so far, and wholly from twice of it.
+    Arguments and what is behind are those of :func:`fill_hidden`.
     """
+    if is_compiled():
+        maps = _operator(light, coc_px, valid, threshold, levels)
+    else:
+        maps = _matted_and_filled(light, coc_px, valid, threshold, levels, ops)
+    own_light, own_weight, other_light, other_coc, other_weight, behind = maps
+    return [Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)], behind
 
-    values: Tensor
-    step: int
-    vote: float | None
-    least_px: float
+
+def _matted_and_filled(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int, ops: Ops
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    matted = matte(light, coc_px, valid)
+    own, other, other_coc, weight = attribute_emitters(light, coc_px, threshold, valid, matted)
+    own_weight = 1.0 - weight
+    other, other_coc, weight, behind = fill_hidden(own, coc_px, other, other_coc, weight, valid, threshold, levels, ops)
+    if valid is not None:
+        own_weight, weight = own_weight * valid, weight * valid
+    return own, own_weight, other, other_coc, weight, behind
 
 
-Seen = Callable[..., tuple[Tensor, Tensor]]
-"""``(levels, coc_px, mask, step=1, farthest=False)`` to what levels show behind a map: light and coc, and votes."""
+def _empty(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
+    behind = light.new_empty(*light.shape[:2], *(behind_size(n, levels) for n in light.shape[-2:]))
+    return colour, single, torch.empty_like(colour), torch.empty_like(single), torch.empty_like(single), behind
+
+
+# How many pixels need work depends on the data, which compiled graphs do not allow for.
+@one_operator("torchdof::surfaces", _empty, differentiable=2)
+def _operator(
+    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    maps = (t.contiguous() for t in _matted_and_filled(light, coc_px, valid, threshold, levels, EAGER))
+    own, own_weight, other, other_coc, other_weight, behind = maps
+    return own, own_weight, other, other_coc, other_weight, behind
 
 
 def _is_behind(distance_px: Tensor) -> Tensor:
@@ -124,6 +149,7 @@ def fill_hidden(
     valid: Tensor | None,
     threshold: Tensor,
     levels: int,
+    ops: Ops = EAGER,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Light and coc of what lies behind blurred surfaces, from the farthest surfaces around them.
 
@@ -143,6 +169,7 @@ def fill_hidden(
         valid: ``[B, 1, H, W]``, 0 where a pixel is to be left out; None counts all.
         threshold: Largest light that is no highlight's, ``[B, 1, H, W]``; a highlight is nowhere else but in its place.
         levels: Levels of the pyramid, from 2; the widest look is ``2 ** levels`` pixels.
+        ops: How the levels are looked at.
 
     Returns:
         The second sample, mixed or hidden: light, coc and weight (0 where there is none); and light behind both, at
@@ -172,14 +199,12 @@ def fill_hidden(
     # what coarse levels show behind cells is one level of such cells; and the farthest of all is behind both surfaces
     size = (height, width)
     wanted = (coc_px.abs() > 0.5) & (other_weight < HIDDEN_WEIGHT)
-    # a graph looks at all pixels, others only where they may find something
-    graph = exported_graph()
-    may_hide = wanted if graph else _may_hide(coc_px, [far_coc for _, far_coc, _ in pyramid])
+    may_hide = wanted if ops.looks_everywhere else _may_hide(coc_px, [far_coc for _, far_coc, _ in pyramid])
     cell_rows, cell_columns = whole[0] // BEHIND_STEP, whole[1] // BEHIND_STEP
     nearest = -_largest(-coc_px, cell_rows, cell_columns, BEHIND_STEP)
     cells = torch.cat([may_hide, wanted], 1).to(coc_px.dtype)
     cells = _largest(cells, cell_rows, cell_columns, BEHIND_STEP).amin(1, keepdim=True) > 0
-    look = functools.partial(_seen, size=size) if graph is None else graph.seen
+    look = functools.partial(ops.seen, functools.partial(_seen, size))
     shown, total = look(searched, nearest, cells, step=BEHIND_STEP, farthest=True)
     behind = torch.where(total > 0, shown[:, :-1], pyramid[_FINE_LEVELS - 1][0])
     if len(searched) > _FINE_LEVELS:
@@ -251,13 +276,8 @@ def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
 
 
 def _seen(
-    levels: Sequence[Level],
-    coc_px: Tensor,
-    mask: Tensor,
-    size: tuple[int, int],
-    step: int = 1,
-    farthest: bool = False,
-) -> tuple[Tensor, Tensor]:
+    size: tuple[int, int], levels: Sequence[Level], coc_px: Tensor, mask: Tensor, step: int, farthest: bool
+) -> Seen:
     """What levels show behind the surfaces of a map: light and coc ``[B, C + 1, h, w]``, and the sum of their votes.
 
     The map, signed coc ``[B, 1, h, w]``, is that of an image of a size at every ``step``-th pixel; there is nothing

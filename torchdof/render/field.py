@@ -13,34 +13,10 @@ from torch import Tensor
 
 from ..optics.placed_kernels import Shares, placed
 
-__all__ = ["BLOCK", "of_pixels", "scattered"]
+__all__ = ["BLOCK", "scattered"]
 
 BLOCK = (8, 16)
 """Rows and columns of a layer whose pixels share a kernel."""
-
-
-def of_pixels(
-    kernel: Tensor, shares: Shares, first: tuple[int, int], count: tuple[int, int], size: tuple[int, int]
-) -> Tensor:
-    """Each pixel's own kernel, ``[n, 1 or C, k, k]``.
-
-    Args:
-        kernel: The table's own ``[1 or C, k, k]``, or several times those of C colours.
-        shares: At the frame's resolution.
-        first: Row and column of the first pixel.
-        count: Rows and columns of them.
-        size: Height and width of the frame.
-    """
-    half_diagonal = 0.5 * math.hypot(*size)
-    y, x = (
-        (torch.arange(n, dtype=kernel.dtype, device=kernel.device) + (start + 0.5 - side / 2)) / half_diagonal
-        for n, start, side in zip(count, first, size, strict=True)
-    )
-    y, x = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
-    each = kernel[: shares.values.shape[0]] if shares.values.shape[0] > 1 else kernel
-    return placed(each[None], [(shares.to(kernel), kernel.new_ones(()))], y, x).repeat(
-        1, len(kernel) // len(each), 1, 1
-    )
 
 
 def scattered(

@@ -13,22 +13,20 @@ is blurred, what stands before it and how many there are fade in.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import pixels
-from ..exporting import exported_graph, where_needed
 from ..optics.blur_table import BlurTable
 from ..optics.placed_kernels import Shares, placed_between, ray_shares
 from ..validation import is_traced
-from .disocclusion import HIDDEN_WEIGHT
+from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
-from .surfaces import Surface, going_on
+from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, going_on
 
-__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "Highlights", "extract", "obstacles", "splat", "threshold"]
+__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "extract", "splat", "threshold"]
 
 FACTOR = 8.0
 """Light above so many times what is around it is a highlight's."""
@@ -45,14 +43,6 @@ _LEAST_PX = 1.0  # blur from which on there are rays
 _WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, what counts of its rays
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
 _TAPS = 2**21  # rays splatted together
-
-
-class Highlights(NamedTuple):
-    """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.pixels`), and their coc."""
-
-    pixels: Tensor
-    light: Tensor
-    coc_px: Tensor
 
 
 def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
@@ -91,6 +81,7 @@ def extract(
     from_px: float = _LEAST_PX,
     beside: Surface | None = None,
     image_coc_px: Tensor | None = None,
+    ops: Ops = EAGER,
 ) -> tuple[Surface, Highlights | None]:
     """Take the light above a limit out of a surface of an image, to be splatted ray by ray.
 
@@ -105,6 +96,7 @@ def extract(
         from_px: Blur from which on there are rays; all of the light above the limit is theirs at 1 px more.
         beside: The other surface of each pixel.
         image_coc_px: Coc of the image, ``[B, 1, H, W]``; without it a highlight sends what its surface has.
+        ops: How a frame without highlights stays as it is.
 
     Returns:
         The surface with what is left of its light, and the highlights if there are any.
@@ -126,7 +118,7 @@ def extract(
     excess = taken_from * ((1.0 - ordinary) * fades)
     # not what the excess leaves: its rounding is brighter than a dark scene
     left = pixels.put(light, bright, taken_from * ((1.0 - fades) + fades * ordinary))
-    left = where_needed(lambda: is_bright.any(), left, light)
+    left = ops.choose(lambda: is_bright.any(), left, light)
     if weight is not None:
         cover = pixels.pick(weight, bright)
         if beside is not None and image_coc_px is not None:
@@ -169,21 +161,34 @@ def splat(
     table: BlurTable,
     occlusion: bool = True,
     kernels_per_px: int = KERNELS_PER_PX,
+    ops: Ops = EAGER,
 ) -> Tensor:
     """Scatter highlights to ``[B, C, H, W]``, each ray to where it lands but for what nearer surfaces take of it.
 
     These are the surfaces that an image shows, each pixel's own first; without occlusion all rays pass. Differentiable
     in the light and coc of the rays and in what is in their way.
     """
-    batch, _, height, width = shown[0].coc_px.shape
-    longest = max(height, width)
-    source, light, coc = (torch.cat(parts, -1) for parts in zip(*rays, strict=True))
-    graph = exported_graph()
-    if graph is not None:
-        in_the_way = obstacles(shown) if occlusion else []
-        splats = graph.splat(Highlights(source, light, coc), shown[0].coc_px, in_the_way)
-        nothing = coc.new_zeros(batch, len(light), 1, 1)  # wherever it is added, and it takes no memory
-        return where_needed(lambda: torch.ones_like(source).sum() > 0, splats, nothing)
+    together = Highlights(*(torch.cat(parts, -1) for parts in zip(*rays, strict=True)))
+    coc_px, in_the_way = shown[0].coc_px, _obstacles(shown) if occlusion else []
+
+    def splatted() -> Tensor:
+        return _splatted(together, coc_px, in_the_way, table, kernels_per_px, ops.lens_width)
+
+    return ops.splat(splatted, together, coc_px, in_the_way)
+
+
+def _splatted(
+    rays: Highlights,
+    coc_px: Tensor,
+    obstacles: Sequence[tuple[Tensor, Tensor]],
+    table: BlurTable,
+    kernels_per_px: int,
+    lens_width: int | None,
+) -> Tensor:
+    """Highlights to ``[B, C, H, W]``, so many together that their rays stay within bounds."""
+    batch, _, height, width = coc_px.shape
+    longest, lens_width = max(height, width), lens_width or int(width)
+    source, light, coc = rays
     order = torch.argsort(coc.detach().abs())
     item, row, column = pixels.places(source[order], height, width)
     light, coc = light[:, order], coc[order]
@@ -193,19 +198,20 @@ def splat(
     radii = coc.detach().tolist()
 
     def half_of(radius: float) -> int:
-        return min(math.ceil(table.reach_px(radius, width) + 0.5), longest - 1)
+        return min(math.ceil(table.reach_px(radius, lens_width) + 0.5), longest - 1)
 
     margin = max([half_of(radii[-1]), *(half_of(each.coc_px) for each in shares)])  # the widest need not be the last
     across = width + 2 * margin
     area = (height + 2 * margin) * across
     splats = light.new_zeros(len(light), batch * area)
-    hiding = _Hiding(shown) if occlusion else None
+    hiding = _Hiding(obstacles) if obstacles else None
     start = 0
     while start < len(radii):  # sources of increasing blur, as many as make a bounded number of taps
         stop = min(len(radii), start + max(1, _TAPS // (2 * half_of(radii[start]) + 1) ** 2))
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
-        kernels = kernels_for(table, coc[part], width, longest, kernels_per_px).to(light.dtype)  # [n, 1 or C, k, k]
+        kernels = kernels_for(table, coc[part], lens_width, longest, kernels_per_px)  # [n, 1 or C, k, k]
+        kernels = kernels.to(light.dtype)
         if shares:
             half_diagonal = 0.5 * math.hypot(height, width)
             y, x = ((row[part] + 0.5 - height / 2) / half_diagonal, (column[part] + 0.5 - width / 2) / half_diagonal)
@@ -224,7 +230,7 @@ def splat(
     return frame[..., margin : margin + height, margin : margin + width]
 
 
-def obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:
+def _obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:
     """Coc of surfaces and the part of each pixel that they cover, ``[B, 1, H, W]``: none where they are hidden."""
     covers = [torch.ones_like(s.coc_px) if s.weight is None else s.weight for s in surfaces]
     covers = [covers[0], *((c - HIDDEN_WEIGHT).clamp_min(0.0) for c in covers[1:])]
@@ -232,13 +238,13 @@ def obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:
 
 
 class _Hiding:
-    """What may stand in the way of rays: surfaces that an image shows, in bins of 1 px of their coc."""
+    """What may stand in the way of rays: coc and cover of surfaces, in bins of 1 px of their coc."""
 
-    def __init__(self, surfaces: Sequence[Surface]) -> None:
-        coc_px = surfaces[0].coc_px
+    def __init__(self, obstacles: Sequence[tuple[Tensor, Tensor]]) -> None:
+        coc_px = obstacles[0][0]
         self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
         self.low = float(coc_px.detach().min())
-        self.shown = [(coc - self.low, cover) for coc, cover in obstacles(surfaces)]  # a place in bins
+        self.shown = [(coc - self.low, cover) for coc, cover in obstacles]  # a place in bins
         occupied = torch.cat([place.detach()[cover > 0] for place, cover in self.shown])
         counts = torch.bincount(occupied.floor().long()).tolist()
         self.bins = sorted({k for i, count in enumerate(counts) if count for k in (i, i + 1)})

@@ -1,39 +1,81 @@
-"""The chain: an image's surfaces and its highlights, the layers they lie in, scattered and composited."""
+"""The chain, step by step: depth edges, a plan, surfaces and highlights, the layers they lie in, and the picture.
+
+Every step is given the same operations (:mod:`torchdof.render.ops`): those of eager code, or of an exported graph.
+"""
 
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..exporting import exported_graph, where_needed
-from ..options import NAMED, Options
-from ..validation import is_differentiated, is_traced
-from . import compiled, composite, headroom, highlights
+from ..options import Options
+from ..validation import NAMED_TOLERANCES, is_differentiated, is_traced
+from . import compiled, composite, edges, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
+from .disocclusion import behind_pixels, surfaces_of_image
 from .layer_weights import blur_axis
 from .matting import matte
-from .plan import Blur, Plan
+from .ops import EAGER, Ops
+from .plan import Plan
 from .scatter import fold
-from .surfaces import Frame, Surface, framed, surfaces_of_image
+from .surfaces import Frame, Surface, framed
 
-__all__ = ["blur", "blur_attended", "blur_stack"]
+__all__ = ["blur", "blur_stack"]
 
 _REACH = 4.0  # blur radii within which what lies around a pixel can change it: its light, and what is filled in behind
 _SAME_PX = 0.5  # a background whose coc differs by less is the surface that the image shows
 
 
 def blur(
-    image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options, behind: tuple[Tensor, Tensor] | None = None
+    image: Tensor,
+    coc_px: Tensor,
+    plan: Plan | None,
+    options: Options,
+    behind: tuple[Tensor, Tensor] | None = None,
+    attention: Attention | None = None,
+    ops: Ops = EAGER,
 ) -> Tensor:
-    """Depth of field of checked arguments, as :func:`torchdof.blur_by_coc` has them; ``behind`` is background and coc.
+    """Depth of field of checked arguments, as :func:`torchdof.blur_by_coc` has them.
 
-    Without a plan each item gets its own.
+    Args:
+        image: ``[B, C, H, W]``.
+        coc_px: ``[B or 1, 1, H, W]``, with edges as they are given.
+        plan: Layers; without a plan each item gets its own.
+        options: Of the rendering.
+        behind: Background and its coc.
+        attention: Where the tolerance is kept; elsewhere that of a draft is enough.
+        ops: The operations of all steps.
     """
+    coc_px = edges.mended(image, coc_px, options.depth_edges, ops)
+    if attention is None:
+        return _planned(image, coc_px, plan, options, behind, ops)
+    weight = weight_map(attention, image)
+    if options.table.depends_on_place:  # a part by itself would have another middle: all of it keeps the tolerance
+        return _planned(image, coc_px, plan, options, behind, ops)
+    loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED_TOLERANCES["draft"]))
+    known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
+    box = box_around(weight, _REACH * float(known.abs().amax()))
+    if box is None or loose.tolerance == options.tolerance:
+        return _planned(image, coc_px, None, loose, behind, ops)
+    part = (..., *box)
+    if image[part].shape == image.shape and bool((weight == 1).all()):
+        return _planned(image, coc_px, None, options, behind, ops)
+    around = _planned(image, coc_px, None, loose, behind, ops)
+    behind_part = None if behind is None else (behind[0][part], behind[1][part])
+    looked_at = _planned(image[part], coc_px[part], None, options, behind_part, ops)
+    rows, columns = box
+    ends = (columns.start, image.shape[-1] - columns.stop, rows.start, image.shape[-2] - rows.stop)
+    return torch.lerp(around, functional.pad(looked_at, ends), functional.pad(weight[part], ends).to(image.dtype))
+
+
+def _planned(
+    image: Tensor, coc_px: Tensor, plan: Plan | None, options: Options, behind: tuple[Tensor, Tensor] | None, ops: Ops
+) -> Tensor:
+    """The picture of an image whose edges are mended, with a plan, or one for each item."""
     if is_traced() and options.table.depends_on_place:
         raise ValueError(
             "a compiled or exported graph has one kernel a layer; take a table without vignetting or field"
@@ -44,49 +86,19 @@ def blur(
     if plan is None and is_traced():
         # numbers that the graph is made for: those that differ between two modules would be variables in it
         max_coc_px, tolerance = (float.fromhex(float(n).hex()) for n in (options.max_coc_px, options.tolerance))
-        plan = Plan.all(max_coc_px, tolerance, rays=exported_graph() is not None)
+        plan = Plan.all(max_coc_px, tolerance)
     elif plan is None and any(map(is_differentiated, maps[1::2])):
         plan = Plan.of_frame(torch.cat(maps[1::2]), options.tolerance, still=True)
     elif plan is not None and not is_traced():
         plan = plan.reaching(torch.cat(maps[1::2]))
     if plan is not None:
-        return _render_item(plan, options, *maps).to(image.dtype)
+        return _render_item(plan, options, ops, *maps).to(image.dtype)
     # each item has its own layers, as it would have alone
     items = []
     for item in zip(*(t.split(1) for t in maps), strict=True):
         cocs = item[1] if behind is None else torch.cat(item[1::2])
-        items.append(_render_item(Plan.of_frame(cocs, options.tolerance), options, *item))
+        items.append(_render_item(Plan.of_frame(cocs, options.tolerance), options, ops, *item))
     return (items[0] if len(items) == 1 else torch.cat(items)).to(image.dtype)
-
-
-def blur_attended(
-    image: Tensor,
-    coc_px: Tensor,
-    plan: Plan | None,
-    options: Options,
-    behind: tuple[Tensor, Tensor] | None,
-    attention: Attention | None,
-) -> Tensor:
-    """:func:`blur` that keeps the tolerance where the viewer looks; elsewhere that of a draft is enough."""
-    if attention is None:
-        return blur(image, coc_px, plan, options, behind)
-    weight = weight_map(attention, image)
-    if options.table.depends_on_place:  # a part by itself would have another middle: all of it keeps the tolerance
-        return blur(image, coc_px, plan, options, behind)
-    loose = dataclasses.replace(options, tolerance=max(options.tolerance, NAMED["draft"]))
-    known = torch.nan_to_num(coc_px.detach(), nan=0.0, posinf=0.0, neginf=0.0)
-    box = box_around(weight, _REACH * float(known.abs().amax()))
-    if box is None or loose.tolerance == options.tolerance:
-        return blur(image, coc_px, None, loose, behind)
-    part = (..., *box)
-    if image[part].shape == image.shape and bool((weight == 1).all()):
-        return blur(image, coc_px, None, options, behind)
-    around = blur(image, coc_px, None, loose, behind)
-    behind_part = None if behind is None else (behind[0][part], behind[1][part])
-    looked_at = blur(image[part], coc_px[part], None, options, behind_part)
-    rows, columns = box
-    ends = (columns.start, image.shape[-1] - columns.stop, rows.start, image.shape[-2] - rows.stop)
-    return torch.lerp(around, functional.pad(looked_at, ends), functional.pad(weight[part], ends).to(image.dtype))
 
 
 def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
@@ -102,12 +114,13 @@ def blur_stack(rgba: Tensor, coc_px: Tensor, options: Options) -> Tensor:
     plan = Plan.of_frame(coc.flatten(0, 1), options.tolerance, still=is_differentiated(coc))
     plan = Plan(plan.nodes, plan.tolerance, rays=False)
     light, coc, cover = (t.gather(1, order.expand_as(t)) for t in (light, coc, cover))
-    return (_render_item(plan, options, light, coc, cover=cover) / scale).to(rgba.dtype)
+    return (_render_item(plan, options, EAGER, light, coc, cover=cover) / scale).to(rgba.dtype)
 
 
 def _render_item(
     plan: Plan,
     options: Options,
+    ops: Ops,
     light: Tensor,
     coc: Tensor,
     behind_light: Tensor | None = None,
@@ -120,7 +133,7 @@ def _render_item(
     if that is known; or, with how much each covers ``[B, N, 1, H, W]``, a stack of layers ``[B, N, ...]``, near to far.
     """
     if plan.nodes != (0.0,):
-        picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover)
+        picture = compiled.picture(plan, options, light, coc, behind_light, behind_coc, cover, ops.lens_width)
         if picture is not None:
             return picture
     low, high = plan.coc_px[0], plan.coc_px[-1]  # beyond, blurs are alike, and differences of huge ones would cancel
@@ -129,7 +142,7 @@ def _render_item(
         stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
         # what no layer covers is seen through all of them
         stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], high)))
-        return _composite(stack, None, plan, options, stacked=True)
+        return _composite(stack, None, plan, options, ops, stacked=True)
     if plan.nodes == (0.0,):
         # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
@@ -158,7 +171,7 @@ def _render_item(
     elif options.occlusion and limit is not None and splatted:
         widest = max(2.0, *(abs(c) for c in plan.coc_px))
         levels = min(math.ceil(math.log2(widest)) + 1, 7)
-        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels)
+        surfaces, behind = surfaces_of_image(light, coc, weight, limit, levels, ops)
 
     # the highlights of these, ray by ray
     splats = None
@@ -167,16 +180,18 @@ def _render_item(
         from_px = 0.0 if options.occlusion else crisp_px - 1.0
         # a known background says itself what is behind a mixed pixel
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
-        extracted = [highlights.extract(s, limit, from_px, b, coc) for s, b in zip(surfaces, beside, strict=True)]
+        extracted = [highlights.extract(s, limit, from_px, b, coc, ops) for s, b in zip(surfaces, beside, strict=True)]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         # what may stand in their way, the image's own surface first; a known background is in nobody's
         shown = surfaces if behind_light is None else surfaces[1::-1]
-        splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px) if rays else None
+        if rays:
+            splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px, ops)
 
-    out = _composite(surfaces, behind, plan, options, behind_light is not None, limit, splats)
+    # and all of it in layers, each scattered, far to near
+    out = _composite(surfaces, behind, plan, options, ops, behind_light is not None, limit, splats)
     out = out if has_room else out / scale
     out = out if valid is None else torch.where(valid, out, image)
-    return where_needed(lambda: blur_axis(coc).abs().max() > 0, out, image)
+    return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
 
 
 def _before_background(
@@ -205,25 +220,30 @@ def _composite(
     behind: Tensor | None,
     plan: Plan,
     options: Options,
+    ops: Ops,
     stacked: bool,
     limit: Tensor | None = None,
     splats: Tensor | None = None,
 ) -> Tensor:
     """Surfaces, and the light of highlights, to a picture."""
-    light = surfaces[0].light
-    layered, graph = options.method == "layered", exported_graph()
-    blurs = plan.blurs(options.table, (light.shape[-2], light.shape[-1]), light.dtype, light.device, coarse=layered)
-    align = None if graph is None else graph.align
-    lit = options.occlusion or options.normalize
-    frame = framed(surfaces, behind, plan.nodes, blurs, options.occlusion, stacked, lit, limit, align)
+    light, layered = surfaces[0].light, options.method == "layered"
+    size = (light.shape[-2], light.shape[-1])
+    blurs = plan.blurs(options.table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
+    coarsest = max(blur.scale for blur in blurs)
+    margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
+    behind = None if behind is None else behind_pixels(behind, size)
+    lit, multiple = options.occlusion or options.normalize, ops.align(margin, coarsest)
+    frame = framed(surfaces, behind, plan.nodes, margin, multiple, options.occlusion, stacked, lit, limit)
+    scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
-    def scattered(frame: Frame, blurs: Sequence[Blur]) -> Tensor:
-        scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
+    def scattered(frame: Frame) -> Tensor:
         if options.occlusion:
-            return composite.over(frame, blurs, scatter)
-        return composite.accumulate(frame, blurs, scatter) if layered else composite.accumulate_once(frame, blurs)
+            return composite.over(frame, blurs, scatter, ops)
+        if layered:
+            return composite.accumulate(frame, blurs, scatter, ops)
+        return composite.accumulate_once(frame, blurs)
 
-    out = scattered(frame, blurs) if graph is None else graph.render(frame, blurs, scattered)
+    out = ops.render(frame, scattered)
     if options.occlusion:
         return out if splats is None else out + splats
     return composite.mean(out, frame.colours, options.normalize, splats)

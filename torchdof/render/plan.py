@@ -10,11 +10,9 @@ from torch import Tensor
 from .. import native
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import Spots, bank_of
-from ..optics.kernel_cache import KernelCache
 from ..optics.placed_kernels import Shares, layer_shares
-from ..options import tolerance_of
-from ..validation import is_differentiated, is_in_memory, is_traced, show
-from . import layer_cocs
+from ..validation import is_differentiated, is_in_memory, is_traced, show, tolerance_of
+from . import layer_cocs, traced
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind
 
@@ -193,22 +191,25 @@ class Plan:
         return max([0.0, *(abs(coc) for coc in self.coc_px if abs(coc) < min(coarse))])
 
     def blurs(
-        self, table: BlurTable, size: tuple[int, int], dtype: torch.dtype, device: torch.device, coarse: bool
+        self,
+        table: BlurTable,
+        size: tuple[int, int],
+        dtype: torch.dtype,
+        device: torch.device,
+        coarse: bool,
+        lens_width: int | None = None,
+        kept: Sequence[Tensor] | None = None,
     ) -> list[Blur]:
         """Kernel and resolution of each layer for a frame of ``size`` (height, width).
 
         Kernels are cut to what reaches from one pixel of the frame to another; those of up to 23 pixels of their layer
         to each side are left whole. Traced code holds them as constants, so a table that is tied to the width of the
-        image ties it as well.
+        image ties it as well. ``lens_width`` is the width of that image, if it is not the frame's own; ``kept`` are
+        the constants, if they are made already (:meth:`constants`).
         """
-        width, scales = self.layer_sizes(table, size, coarse)
-        if torch.compiler.is_dynamo_compiling():  # no names of this process's, as a cache's keys, in what is compiled
-            shapes = _constant_shapes(table, self.coc_px, width, scales)
-            flat = _constant_kernels(table, self.coc_px, width, scales).to(device, dtype)
-            parts = flat.split([math.prod(shape) for shape in shapes])
-            bank = [_masked(k.reshape(shape), size, s) for k, shape, s in zip(parts, shapes, scales, strict=True)]
-        elif is_traced():
-            whole = _constant_bank(table, self.coc_px, width, scales)
+        width, scales = self.layer_sizes(table, (size[0], lens_width or size[1]), coarse)
+        if kept is not None or is_traced():
+            whole = traced.constants(_layer_kernels, table, self.coc_px, width, scales) if kept is None else kept
             bank = [_masked(k.to(device, dtype), size, s) for k, s in zip(whole, scales, strict=True)]
         else:
             made = _layer_kernels(table, self.coc_px, width, scales, longest_px(size, scales))
@@ -218,9 +219,9 @@ class Plan:
         shares = self.shares(table, scales, (int(size[0]), int(size[1])))
         return [Blur(*each) for each in zip(bank, scales, shares, strict=True)]
 
-    def keep_constants(self, table: BlurTable, coarse: bool) -> None:
-        """Makes the kernels that a trace then takes as constants, none of them cut to a frame."""
-        _constant_bank(table, self.coc_px, *self.layer_sizes(table, (1, 1), coarse))
+    def constants(self, table: BlurTable, coarse: bool, lens_width: int) -> list[Tensor]:
+        """Kernels that a trace takes as constants, none of them cut to a frame."""
+        return _layer_kernels(table, self.coc_px, *self.layer_sizes(table, (1, lens_width), coarse))
 
     def shares(
         self, table: BlurTable, scales: Sequence[int], size: tuple[int, int], like: Tensor | None = None
@@ -295,30 +296,6 @@ def _layer_kernels(
     made = bank.of_spots(spots)
     spare = [made.shape[-1] // 2 - half for half in spots.half]
     return [k[:, n : k.shape[-1] - n, n : k.shape[-1] - n] for k, n in zip(made, spare, strict=True)]
-
-
-_constants = KernelCache(64 * 2**20)
-
-
-def _constant_bank(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> tuple[Tensor, ...]:
-    """Kernels of layers in what is traced, where they are constants: made before, and kept."""
-    key = (table.fingerprint(), tuple(coc_px), width, tuple(scales))
-    return _constants.get(key, lambda: tuple(_layer_kernels(table, coc_px, width, scales)))
-
-
-def _constant_shapes(
-    table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]
-) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(kernel.shape) for kernel in _constant_bank(table, coc_px, width, scales))
-
-
-def _constant_kernels(table: BlurTable, coc_px: Sequence[float], width: int, scales: Sequence[int]) -> Tensor:
-    return torch.cat([kernel.flatten() for kernel in _constant_bank(table, coc_px, width, scales)])
-
-
-for _constant in (_constant_shapes, _constant_kernels):  # one result each, for a compiled graph holds one of a function
-    # what torch.compiler.assume_constant_result does, without importing the whole compiler for it
-    _constant._dynamo_marked_constant = True  # type: ignore[union-attr]
 
 
 def _masked(kernel: Tensor, size: tuple[int, int], scale: int) -> Tensor:

@@ -3,16 +3,16 @@
 Light scattered over the frame's border is lost, nothing comes in.
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..optics.placed_kernels import Shares
+from ..optics.placed_kernels import Shares, placed
 from ..validation import is_traced
 from .convolution import DIRECT_TAPS, widest_float
-from .field import of_pixels
 
 __all__ = ["fold"]
 
@@ -59,7 +59,7 @@ def fold(
         else:
             taps = light.new_zeros(())
             for kernel, share, part in zip(kernels, shares, weight.flatten(2).unbind(1), strict=True):
-                each = of_pixels(
+                each = _of_pixels(
                     kernel, share, (top - halo, -halo), (strip.shape[-2], width), frame
                 )  # [pixels, C, k, k]
                 taps = taps + torch.einsum("bp,pct->bctp", part, each.flatten(2))
@@ -73,3 +73,27 @@ def fold(
             scattered[:, :, top : top + strip.shape[-2]] += strip
     inset = half + halo
     return scattered[:, :, inset : inset + height - 2 * halo, inset : inset + width - 2 * halo]
+
+
+def _of_pixels(
+    kernel: Tensor, shares: Shares, first: tuple[int, int], count: tuple[int, int], size: tuple[int, int]
+) -> Tensor:
+    """Each pixel's own kernel, ``[n, 1 or C, k, k]``.
+
+    Args:
+        kernel: The table's own ``[1 or C, k, k]``, or several times those of C colours.
+        shares: At the frame's resolution.
+        first: Row and column of the first pixel.
+        count: Rows and columns of them.
+        size: Height and width of the frame.
+    """
+    half_diagonal = 0.5 * math.hypot(*size)
+    y, x = (
+        (torch.arange(n, dtype=kernel.dtype, device=kernel.device) + (start + 0.5 - side / 2)) / half_diagonal
+        for n, start, side in zip(count, first, size, strict=True)
+    )
+    y, x = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
+    each = kernel[: shares.values.shape[0]] if shares.values.shape[0] > 1 else kernel
+    return placed(each[None], [(shares.to(kernel), kernel.new_ones(()))], y, x).repeat(
+        1, len(kernel) // len(each), 1, 1
+    )

@@ -1,8 +1,8 @@
-"""The surfaces that each pixel shows and hides, and the frame that they make, continued over its border."""
+"""Surfaces as the steps of the pipeline hand them on, and the frame that they make, continued over its border."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as functional
@@ -10,13 +10,12 @@ from torch import Tensor
 
 from ..validation import is_traced
 from .border import continued
-from .disocclusion import HIDDEN_WEIGHT, behind_pixels, behind_size, fill_hidden
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
-from .matting import attribute_emitters, matte
-from .plan import Blur
 
-__all__ = ["Frame", "Placed", "Surface", "framed", "going_on", "surfaces_of_image"]
+__all__ = ["HIDDEN_WEIGHT", "Frame", "Highlights", "Placed", "Surface", "framed", "going_on"]
 
+HIDDEN_WEIGHT = 0.003
+"""Weight of a hidden sample against 1 of a visible one."""
 
 _HAIR = 0.06
 """Share of a surface up to which, in a layer, it does not yet hide what is known behind it."""
@@ -33,6 +32,14 @@ class Surface(NamedTuple):
     light: Tensor
     coc_px: Tensor
     weight: Tensor | None = None
+
+
+class Highlights(NamedTuple):
+    """Light ``[C, n]`` extracted from one surface at pixels ``[n]`` (:mod:`torchdof.pixels`), and their coc."""
+
+    pixels: Tensor
+    light: Tensor
+    coc_px: Tensor
 
 
 class Placed(NamedTuple):
@@ -177,29 +184,26 @@ def framed(
     surfaces: Sequence[Surface],
     behind: Tensor | None,
     nodes: Sequence[float],
-    blurs: Sequence[Blur],
+    margin: int,
+    multiple: int,
     occlusion: bool,
     stacked: bool,
     lit: bool = True,
     limit: Tensor | None = None,
-    align: Callable[[int], int] | None = None,
 ) -> Frame:
     """Surfaces of an image as a frame: they go on beyond the border as they are at it (:mod:`torchdof.render.border`).
 
     Args:
         surfaces: Near to far if stacked; else one, or the two that share each pixel.
         nodes: As in :class:`Frame`; surfaces beyond the outermost ones belong to these.
-        behind: Light behind all of them, at every :data:`torchdof.render.disocclusion.BEHIND_STEP`-th pixel.
-        blurs: Kernel and resolution of each layer.
+        behind: Light behind all of them, ``[B, C, H, W]``; None: nothing is.
+        margin: As in :class:`Frame`.
+        multiple: What the sides of the area must be multiples of: of the coarsest layer's pixel at least.
         occlusion: As in :class:`Frame`.
         stacked: As in :class:`Frame`.
         lit: Light goes on beyond the border as well; False: nothing comes from there.
         limit: Largest light that is no highlight's, ``[B, 1, H, W]``; None: all of it goes on.
-        align: What the area must be a multiple of, given the margin; None: the coarsest layer's pixel.
     """
-    coarsest = max(blur.scale for blur in blurs)
-    margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
-    multiple = coarsest if align is None else align(margin)
     size = (surfaces[0].light.shape[-2], surfaces[0].light.shape[-1])
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
     beyond = (0, width - size[1], 0, height - size[0])  # right and below, to whole blocks
@@ -210,65 +214,5 @@ def framed(
         x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
     if behind is not None:
-        behind = functional.pad(behind_pixels(behind, size), beyond, mode="replicate")
+        behind = functional.pad(behind, beyond, mode="replicate")
     return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)
-
-
-def surfaces_of_image(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
-) -> tuple[list[Surface], Tensor]:
-    """What each pixel shows, and what is mixed into it or hidden behind it; and the light behind both.
-
-    Arguments and what is behind are those of :func:`torchdof.render.disocclusion.fill_hidden`.
-    """
-    compiling = torch.compiler.is_compiling() and not torch.compiler.is_exporting()
-    maps = (_operator if compiling else _matte_and_fill)(light, coc_px, valid, threshold, levels)
-    own_light, own_weight, other_light, other_coc, other_weight, behind = maps
-    return [Surface(own_light, coc_px, own_weight), Surface(other_light, other_coc, other_weight)], behind
-
-
-def _matte_and_fill(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
-) -> tuple[Tensor, ...]:
-    matted = matte(light, coc_px, valid)
-    own, other, other_coc, weight = attribute_emitters(light, coc_px, threshold, valid, matted)
-    own_weight = 1.0 - weight
-    other, other_coc, weight, behind = fill_hidden(own, coc_px, other, other_coc, weight, valid, threshold, levels)
-    if valid is not None:
-        own_weight, weight = own_weight * valid, weight * valid
-    return own, own_weight, other, other_coc, weight, behind
-
-
-# How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
-@torch.library.custom_op("torchdof::surfaces", mutates_args=())
-def _operator(
-    light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    maps = (t.contiguous() for t in _matte_and_fill(light, coc_px, valid, threshold, levels))
-    own, own_weight, other, other_coc, other_weight, behind = maps
-    return own, own_weight, other, other_coc, other_weight, behind
-
-
-@_operator.register_fake
-def _(light: Tensor, coc_px: Tensor, valid: Tensor | None, threshold: Tensor, levels: int) -> tuple[Tensor, ...]:
-    colour, single = light.new_empty(light.shape), coc_px.new_empty(coc_px.shape)
-    behind = light.new_empty(*light.shape[:2], *(behind_size(n, levels) for n in light.shape[-2:]))
-    return colour, single, *(torch.empty_like(t) for t in (colour, single, single)), behind
-
-
-def _remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:
-    *maps, context.levels = inputs
-    context.save_for_backward(*maps)
-
-
-def _backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-    light, coc_px, valid, threshold = context.saved_tensors
-    with torch.enable_grad():
-        light, coc_px = light.detach().requires_grad_(), coc_px.detach().requires_grad_()
-        outputs = _matte_and_fill(light, coc_px, valid, threshold, context.levels)
-        wanted = [(o, g) for o, g in zip(outputs, gradients, strict=True) if o.requires_grad]
-        back = torch.autograd.grad([o for o, _ in wanted], [light, coc_px], [g for _, g in wanted], allow_unused=True)
-    return (*back, None, None, None)
-
-
-_operator.register_autograd(_backward, setup_context=_remember)

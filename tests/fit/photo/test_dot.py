@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchdof.fit.photo.dot import find_dot, find_dots, radial_mean
+from torchdof.fit.photo.dot import find_dot, find_dots
 
 
 @pytest.mark.parametrize(("gain", "level"), [(1.0, 0.0), (300.0, 64.0)])
@@ -26,11 +26,3 @@ def test_a_ring_is_one_dot_dust_is_none_and_a_grid_gives_every_one(simulator):
     assert sorted((round(d.y - 29.5), round(d.x - 29.5)) for d in dots) == [
         (60 * row, 60 * column) for row in range(3) for column in range(4)
     ]
-
-
-def test_radial_mean_of_a_cone_is_the_cone():
-    rows, columns = np.indices((41, 41))
-    distance = np.hypot(rows - 20, columns - 20)
-    mean, count = radial_mean(distance, distance)
-    np.testing.assert_allclose(mean, np.arange(mean.size), atol=0.25)
-    assert count[0] == 1

@@ -161,14 +161,6 @@ def test_one_pixel_that_is_no_number_is_counted_and_refused(captured: Camera, ba
     assert caught.value.file == ("a.png", "b.png")[which] and caught.value.number == 1
 
 
-@pytest.mark.parametrize(
-    "empty", [[], [[]], np.zeros((0, 0)), np.zeros((0, 50)), np.zeros((1, 1)), None, "dot.png", 3.0]
-)
-def test_an_empty_picture_is_refused(captured: Camera, empty: Any) -> None:
-    with pytest.raises(FitError, match="blurred must be"):
-        fit_pair(captured()[0], empty)
-
-
 def test_a_pair_of_several_that_cannot_be_fitted_is_named(captured: Camera) -> None:
     sharp, blurred = captured(magnification=1.25)
     good = Capture(sharp, blurred, 0.8)
@@ -180,16 +172,11 @@ def test_a_pair_of_several_that_cannot_be_fitted_is_named(captured: Camera) -> N
 RADII = np.linspace(0.0, 8.0, 30)
 BELL = np.exp(-(RADII**2) / 8)  # sigma 2
 NOISE = np.random.default_rng(1).normal(size=30)
-# each with the sigma that is there, or None where no number would be right
+# what is refused by name: test_profile_fit.py; each with the sigma that is there, or None where no number is right
 PROFILES: dict[str, tuple[Any, Any, float | None]] = {
     "empty": ([], [], None),
     "one sample": ([1.0], [1.0], None),
-    "three samples": ([0.0, 1.0, 2.0], [1.0, 0.9, 0.5], None),
-    "one radius": (np.ones(30), BELL, None),
     "all zero": (RADII, np.zeros(30), None),
-    "constant": (RADII, np.ones(30), None),
-    "negative": (RADII, -BELL, None),
-    "noise alone": (RADII, 1 + 0.1 * NOISE, None),
     "buried in noise": (RADII, BELL + NOISE, 2.0),
     "noisy": (RADII, BELL + 0.05 * NOISE, 2.0),
     "a straight line down": (RADII, 8.1 - RADII, None),
@@ -197,8 +184,6 @@ PROFILES: dict[str, tuple[Any, Any, float | None]] = {
     "clipped at a half": (RADII, np.minimum(BELL, 0.5), None),
     "an outlier of 100": (RADII, np.where(np.arange(30) == 20, 100.0, BELL), None),
     "a second peak": (RADII, BELL + np.exp(-((RADII - 7) ** 2) / 0.5), None),
-    "one NaN": (RADII, np.where(np.arange(30) == 3, np.nan, BELL), None),
-    "one infinity": (np.where(np.arange(30) == 3, np.inf, RADII), BELL, None),
     "levels of 1e-300": (RADII, 1e-300 * BELL, 2.0),
     "levels of 1e300": (RADII, 1e300 * BELL, 2.0),
     "radii of 1e-300": (1e-300 * RADII, BELL, 2e-300),

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from torchdof.fit import fit_pair
-from torchdof.fit.photo.dot import find_dot
 from torchdof.fit.photo.noise import LAGS, correlate, correlation_of, independent_share, noise_beside, noise_of
 from torchdof.fit.photo.pair import prepared_pair
-from torchdof.fit.photo.source import soft_edge
 
 
 def test_independent_noise_is_found_to_be():
@@ -56,17 +54,6 @@ def test_the_noise_of_a_demosaiced_jpeg_is_not_taken_for_more_than_it_is(simulat
     fits = [fit_pair(*camera.pair("gaussian", {"sigma": 3.0}, s), "gaussian") for s in range(2)]
     # 0.28 where the light's fine noise was held to be as small a part of all as the dark's, which JPEG takes away
     assert 0.4 < np.mean([f.residual_over_noise for f in fits]) < 1.1
-
-
-def test_the_edge_of_a_demosaiced_dot_is_as_uncertain_as_its_mosaic_makes_it(simulator):
-    pulls = []
-    for place in np.random.default_rng(5).uniform(-1, 1, (12, 2)):
-        still = simulator.draw_dot(61, 12.0, tuple(place)) + np.random.default_rng(6).normal(0, 0.005, (61, 61))
-        picture = simulator.demosaiced(still)
-        edge = soft_edge(picture, find_dot(picture))
-        # of a disc blurred by the mosaic's filter, a variance of 5/12 px^2
-        pulls.append((edge.radius - np.sqrt(144 - 5 / 12)) / np.sqrt(edge.covariance[0, 0]))
-    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5
 
 
 def test_correlate_is_the_covariance_of_filtered_noise():

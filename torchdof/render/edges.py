@@ -11,18 +11,18 @@ Everything is computed in a measure of nearness that is linear in 1 / depth: the
 resampling and estimators do to an edge is an average.
 """
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import native, pixels, validation
+from ..options import DepthEdges
+from .ops import EAGER, Ops
+from .traced import is_compiled, one_operator
 
-__all__ = ["STEP_PX", "DepthEdges", "judged", "repair", "repair_edges"]
-
-DepthEdges = Literal["auto", "repair", "as given"]
-"""What is done to depth edges before rendering: repaired where the map proves inexact, or all of them, or nothing."""
+__all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 
 STEP_PX = 1.0
 """Difference in the circle of confusion from which on the edge between two surfaces is worth repair."""
@@ -109,12 +109,39 @@ def repair_edges(image: Tensor, depth: Tensor, edges: DepthEdges = "repair") -> 
     depth = depth.expand(image.shape[0], -1, -1, -1)
     nearness = torch.where(depth > 0, 1.0 / depth.detach(), torch.nan)
     high = _highest(torch.where(depth > 0, nearness, 0.0).float(), _REACH)
-    mended = repair(image, nearness, _STEP * high, edges == "auto")
-    changed = (mended != nearness) & (depth > 0)
-    return torch.where(changed, 1.0 / mended.clamp_min(0.0), depth)
+    repaired = repair(image, nearness, _STEP * high, edges == "auto")
+    changed = (repaired != nearness) & (depth > 0)
+    return torch.where(changed, 1.0 / repaired.clamp_min(0.0), depth)
 
 
-def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool = False) -> Tensor:
+def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -> Tensor:
+    """A map of the coc with its edges where the image has them: the first step of the pipeline.
+
+    Args:
+        image: ``[B, C, H, W]``, linear light.
+        coc_px: ``[B or 1, 1, H, W]``, signed.
+        edges: As :func:`repair_edges` has it.
+        ops: How a frame without edges is skipped, and lists of pixels are gone through.
+
+    Returns:
+        The map, ``[B, 1, H, W]`` where it is repaired. Gradients flow to it where it is unchanged.
+    """
+    if edges == "as given" or (not validation.is_traced() and not _has_steps(coc_px)):
+        return coc_px
+    repaired = repair(image, coc_px.detach(), STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
+    repaired = ops.choose(lambda: _has_steps(coc_px), repaired, coc_px)
+    return torch.where(repaired == coc_px, coc_px, repaired) if validation.is_differentiated(coc_px) else repaired
+
+
+def _has_steps(coc_px: Tensor) -> Tensor:
+    """Whether two pixels of a map are so far apart that a repair could change one: half a step, beside lamps."""
+    low, high = validation.ends(coc_px)
+    return ~(high - low < 0.5 * STEP_PX)  # holes tell nothing
+
+
+def repair(
+    image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of_coc: bool = False, ops: Ops = EAGER
+) -> Tensor:
     """Repairs a map of nearness, of any scale and offset; what is not finite, or above 1e15, stays and touches nothing.
 
     Args:
@@ -123,6 +150,7 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of
         step: Difference in nearness from which on neighbours are two surfaces, ``[B, 1, H, W]`` or a number.
         auto: Whether edges that prove exact are left alone.
         of_coc: Whether the map is of the coc instead, which is larger where it is farther.
+        ops: How lists of pixels are gone through.
 
     Returns:
         ``[B, 1, H, W]``, constant to autograd; where nothing is repaired, the given values themselves.
@@ -130,23 +158,23 @@ def repair(image: Tensor, nearness: Tensor, step: Tensor | float, auto: bool, of
     device = image.device.type
     if torch.is_autocast_enabled(device):  # it would convolve in half precision
         with torch.autocast(device, enabled=False):
-            return repair(image, nearness, step, auto, of_coc)
+            return repair(image, nearness, step, auto, of_coc, ops)
     compiled = not validation.is_traced() and all(map(validation.is_in_memory, (image, nearness))) and native.chosen()
     if of_coc and not compiled:
-        return -repair(image, -nearness, step, auto)
+        return -repair(image, -nearness, step, auto, ops=ops)
     light, given = image.detach().float(), nearness.detach().float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
-    if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
-        mended = _operator(light, given, step, auto)
+    if is_compiled():
+        repaired = _operator(light, given, step, auto)
     elif compiled:
         steps = step.expand(light.shape[0], 1, *given.shape[-2:]) if step.ndim else step.expand(light.shape[0], 1)
         items = [native.repair_edges(a, b[0], c[0], auto, of_coc) for a, b, c in zip(light, given, steps, strict=True)]
-        mended = (items[0][None] if len(items) == 1 else torch.stack(items))[:, None]
+        repaired = (items[0][None] if len(items) == 1 else torch.stack(items))[:, None]
     else:
-        mended = _repair(light, given, step, auto)
+        repaired = _repair(light, given, step, auto, ops)
     if nearness.dtype == torch.float32:
-        return mended
-    return torch.where(mended == given, nearness.detach(), mended.to(nearness.dtype))
+        return repaired
+    return torch.where(repaired == given, nearness.detach(), repaired.to(nearness.dtype))
 
 
 @torch.no_grad()
@@ -165,12 +193,12 @@ def judged(image: Tensor, nearness: Tensor, step: Tensor | float) -> tuple[Tenso
     valid = given.abs() <= _LARGEST
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     edges = _find(torch.where(valid, given, 0.0), valid, torch.maximum(step, _NOISES * _noise(given, valid)))
-    mended = repair(image, nearness, step, auto=True)
-    return edges.is_edge * (1 + edges.is_ramp.byte()), (mended != nearness) & valid
+    repaired = repair(image, nearness, step, auto=True)
+    return edges.is_edge * (1 + edges.is_ramp.byte()), (repaired != nearness) & valid
 
 
 @torch.no_grad()
-def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops = EAGER) -> Tensor:
     valid = nearness.abs() <= _LARGEST
     given = torch.where(valid, nearness, 0.0)
     step = torch.maximum(step, _NOISES * _noise(given, valid))
@@ -186,7 +214,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
     level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)
     kind = _kind(level, edges)
-    sampled_score = _judge(light, given, witness, edges, sampled)[0]
+    sampled_score = _judge(light, given, witness, edges, sampled, ops)[0]
     prior = _calibrate(kind, sampled, sampled_score, given.shape[0])[kind]
     wrong = torch.where(is_near, 1.0 - prior, prior)
     climb = _climb(given, valid, edges)
@@ -204,7 +232,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     if auto:
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
-    score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels)
+    score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # else steps that prove right are asked as well, and would be moved
         shows_near = shows_near + _LEAN * (score.abs() - 1.0).clamp(0.0, 1.0)
@@ -219,24 +247,23 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor
     label = torch.where(edges.is_edge, is_near, 2.0 * given > _highest(given, 6) - _highest(-given, 6))
     label = pixels.put(label.to(given.dtype), edge_pixels, shows_near.to(given.dtype))
     lost_px = torch.where(edges.is_edge, label - level, 0.0).sum((1, 2, 3), keepdim=True) / length
-    near, far = _unmix(given, edges, label, is_soft, sigma, lost_px, edge_pixels, near, far)
+    near, far = _unmix(given, edges, label, is_soft, sigma, lost_px, edge_pixels, near, far, ops)
 
     own = pixels.pick(given, edge_pixels)[0]
     is_ramp = pixels.pick(edges.is_ramp, edge_pixels)[0]
     moved = torch.where(is_ramp, evidence, (shows_near != pixels.pick(is_near, edge_pixels)[0]).to(given.dtype))
     out = pixels.put(given, edge_pixels, torch.lerp(own, torch.where(shows_near, near, far), moved))
-    return torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma, lost_px), nearness)
+    return torch.where(valid, _lift_lamps(light, given, out, step, is_soft, sigma, lost_px, ops), nearness)
 
 
-# How many pixels need work depends on the data, which compiled graphs do not allow for: to them it is one operator.
-@torch.library.custom_op("torchdof::repair_edges", mutates_args=())
+def _empty(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
+    return torch.empty_like(nearness, memory_format=torch.contiguous_format)
+
+
+# How many pixels need work depends on the data, which compiled graphs do not allow for.
+@one_operator("torchdof::repair_edges", _empty)
 def _operator(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
     return _repair(image, nearness, step, auto).clone()
-
-
-@_operator.register_fake
-def _(image: Tensor, nearness: Tensor, step: Tensor, auto: bool) -> Tensor:
-    return torch.empty_like(nearness, memory_format=torch.contiguous_format)
 
 
 def _from_border(size: int, device: torch.device) -> Tensor:
@@ -314,7 +341,7 @@ def _kind(level: Tensor, edges: _Edges) -> Tensor:
 
 
 def _judge(
-    light: Tensor, nearness: Tensor, witness: Tensor, edges: _Edges, edge_pixels: Tensor
+    light: Tensor, nearness: Tensor, witness: Tensor, edges: _Edges, edge_pixels: Tensor, ops: Ops
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Which of two surfaces pixels ``[P]`` show, by their colour.
 
@@ -364,7 +391,7 @@ def _judge(
             surfaces.append(torch.where(known, (share * values).sum(0) / share.sum(0).clamp_min(1e-12), end))
         return torch.stack([score.clamp(-8.0, 8.0), tells, *surfaces])
 
-    score, tells, near, far = pixels.by_parts(look, edge_pixels).unbind(0)
+    score, tells, near, far = ops.by_parts(look, edge_pixels).unbind(0)
 
     # neighbours of like colour decide together
     scores = pixels.put(torch.full_like(nearness, torch.nan), edge_pixels, score)
@@ -452,6 +479,7 @@ def _unmix(
     edge_pixels: Tensor,
     near: Tensor,
     far: Tensor,
+    ops: Ops,
 ) -> tuple[Tensor, Tensor]:
     """The surfaces at a soft map's edges where one is thin: as near and far as its blurred shape explains best."""
     blurred = _blurred(label, sigma)
@@ -464,7 +492,7 @@ def _unmix(
         thin = pixels.pick(edges.is_edge & is_soft & (shape > 0) & ~thick, edge_pixels)[0]
         chosen = thin.nonzero()[:, 0]
         at = edge_pixels[chosen]
-        least, difference, fit = _regress(nearness, label, blurred, at)
+        least, difference, fit = _regress(nearness, label, blurred, at, ops)
         fit = fit * _is_lost(lost_px if is_near else -lost_px)[item[chosen]]
         if is_near:
             most = far[chosen] + _MOST * gap[chosen]
@@ -486,6 +514,7 @@ def _lift_lamps(
     is_soft: Tensor,
     sigma: Tensor,
     lost_px: Tensor,
+    ops: Ops,
 ) -> Tensor:
     """Lamps of a few pixels, whose nearness a soft map spreads around them, as near as what is spread amounts to."""
     brightest = light.amax(1, keepdim=True)
@@ -495,7 +524,7 @@ def _lift_lamps(
     is_lamp = (brightest > 4.0 * usual) & (brightest > 0.1 * around) & (span > 0.5 * step) & is_soft
     cover = torch.where(brightest > 2.0 * usual, brightest / around.clamp_min(1e-30), 0.0)
     lamp_pixels = pixels.indices(is_lamp)
-    behind, difference, fit = _regress(nearness, cover, _blurred(cover, sigma), lamp_pixels)
+    behind, difference, fit = _regress(nearness, cover, _blurred(cover, sigma), lamp_pixels, ops)
     # the pixels of a lamp are one surface
     weight = fit * pixels.pick(cover, lamp_pixels)[0]
     window, none = pixels.around(lamp_pixels, nearness, 2), torch.zeros_like(nearness)
@@ -512,7 +541,9 @@ def _is_lost(lost_px: Tensor) -> Tensor:
     return (2.4 + 2.5 * lost_px).clamp(0.0, 1.0).flatten()
 
 
-def _regress(nearness: Tensor, shape: Tensor, blurred: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _regress(
+    nearness: Tensor, shape: Tensor, blurred: Tensor, chosen: Tensor, ops: Ops
+) -> tuple[Tensor, Tensor, Tensor]:
     """Nearness around pixels ``[P]`` as ``a + b blurred``: a, b, and how well that fits, 0 to 1.
 
     It must explain what the shape does not that is not blurred.
@@ -538,7 +569,7 @@ def _regress(nearness: Tensor, shape: Tensor, blurred: Tensor, chosen: Tensor) -
         fit = torch.where(xx > 0.004, ((explained - 0.5) / 0.3).clamp(0.0, 1.0) * better, 0.0)
         return torch.stack([mean_y - b * mean_x, b, fit])
 
-    a, b, fit = pixels.by_parts(look, chosen).unbind(0)
+    a, b, fit = ops.by_parts(look, chosen).unbind(0)
     return a, b, fit
 
 

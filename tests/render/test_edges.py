@@ -9,11 +9,12 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import Camera, DepthOfField, blur_by_coc, native
-from torchdof.depth import edges
-from torchdof.depth.edges import repair_edges
+from torchdof.depth import repair_edges
+from torchdof.options import DepthEdges
 from torchdof.reference import degraded
 from torchdof.reference.degraded import KINDS, degrade
 from torchdof.reference.scenes import Plane, Scene, plane_scene, posts, waves
+from torchdof.render import edges
 
 compiled = pytest.mark.skipif(not native.chosen(), reason="the compiled engine is not built here")
 
@@ -96,7 +97,7 @@ def test_means_over_edges_are_ramps_though_they_are_narrow(
     ],
 )
 @pytest.mark.parametrize("how", ["auto", "repair"])
-def test_edges_go_to_where_the_image_has_them(scene: Scene, kind: str, left: float, how: edges.DepthEdges) -> None:
+def test_edges_go_to_where_the_image_has_them(scene: Scene, kind: str, left: float, how: DepthEdges) -> None:
     depth = degrade(scene.depth, kind)
     assert wrong(repair_edges(scene.image, depth, how), scene.depth) < left * wrong(depth, scene.depth)
 
@@ -117,7 +118,7 @@ def test_noise_is_no_edge_and_edges_in_noise_are(scene: Scene) -> None:
 
 @pytest.mark.parametrize("steepness", [0.02, 0.3, 1.0])
 @pytest.mark.parametrize("how", ["auto", "repair"])
-def test_a_slope_stays_a_slope(steepness: float, how: edges.DepthEdges) -> None:
+def test_a_slope_stays_a_slope(steepness: float, how: DepthEdges) -> None:
     x, y = torch.meshgrid(torch.arange(96.0), torch.arange(64.0), indexing="xy")
     coc = (steepness * (x + 0.3 * y))[None, None]
     image = waves(5)(x.double(), y.double()).float()[None]
@@ -321,7 +322,7 @@ def test_the_renderer_repairs_as_its_option_says(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("value", ["Auto", None, True, 1])
-def test_another_treatment_is_refused(scene: Scene, value: edges.DepthEdges) -> None:
+def test_another_treatment_is_refused(scene: Scene, value: DepthEdges) -> None:
     refused = "must be 'auto', 'repair' or 'as given', got"
     for call in (
         lambda: repair_edges(scene.image, scene.depth, value),

@@ -1,4 +1,4 @@
-"""A depth map of another size than its image, at the image's."""
+"""Resampling of depth: a map of another size than its image, at the image's."""
 
 import torch
 import torch.nn.functional as functional

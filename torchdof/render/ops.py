@@ -1,0 +1,90 @@
+"""Operations that an exported graph does otherwise than eager code: an object that is passed down the pipeline.
+
+Eager code looks at numbers and then chooses its work. A graph cannot: it holds branches and loops instead. Each
+operation is given what eager code does as a function; :data:`EAGER` calls it, a graph may do something else to the same
+result (``export/operations.py``).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..validation import is_traced
+from .surfaces import Frame, Highlights
+
+__all__ = ["EAGER", "Level", "Ops", "Seen"]
+
+_PART = 40_000  # pixels that are looked at together
+
+
+class Level(NamedTuple):
+    """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
+
+    ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
+    pixel looks so far, and wholly from twice of it.
+    """
+
+    values: Tensor
+    step: int
+    vote: float | None
+    least_px: float
+
+
+Seen = tuple[Tensor, Tensor]
+"""What levels show behind a map: light and coc ``[B, C + 1, h, w]``, and the sum of their votes ``[B, 1, h, w]``."""
+
+
+class Ops:
+    """The operations of eager code."""
+
+    lens_width: int | None = None
+    """Width in pixels of the image whose kernels are used, for a table with lengths; None: the image's own."""
+
+    kernels: Sequence[Tensor] | None = None
+    """Kernels of all layers, made before; None: they are made for the frame at hand."""
+
+    looks_everywhere: bool = False
+    """Whether all pixels are looked at, where eager code first finds those that need it."""
+
+    def choose(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
+        """A result where it is needed, a bool ``[]``, else what is given, which then is the same.
+
+        A graph computes what only the result needs only then.
+        """
+        return result
+
+    def by_parts(self, look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
+        """What a function finds at pixels ``[P]``, so many at a time that what it needs stays small: ``[n, P]``."""
+        return look(pixels) if is_traced() else torch.cat([look(part) for part in pixels.split(_PART)], 1)
+
+    def seen(
+        self,
+        look: Callable[..., Seen],
+        levels: Sequence[Level],
+        coc_px: Tensor,
+        mask: Tensor,
+        step: int = 1,
+        farthest: bool = False,
+    ) -> Seen:
+        """What levels of a pyramid show behind a map, as :mod:`torchdof.render.disocclusion` looks for it."""
+        return look(levels, coc_px, mask, step, farthest)
+
+    def splat(
+        self, splat: Callable[[], Tensor], rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Tensor]]
+    ) -> Tensor:
+        """Highlights to ``[B, C, H, W]``, given the frame's coc and what may stand in their way: coc and cover."""
+        return splat()
+
+    def align(self, margin: int, coarsest: int) -> int:
+        """What a frame's sides must be multiples of, given the pixels around it and those of the coarsest layer's."""
+        return coarsest
+
+    def render(self, frame: Frame, render: Callable[[Frame], Tensor]) -> Tensor:
+        """The picture of a frame, given what renders a frame."""
+        return render(frame)
+
+
+EAGER = Ops()
+"""Those of all code but an exported graph's."""

@@ -1,0 +1,85 @@
+"""What ``torch.compile`` cannot look into: functions whose work depends on values, and what is made of a table.
+
+A function whose work depends on values is one operator in what is compiled. Kernels are constants in it.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["constants", "is_compiled", "one_operator"]
+
+_KEPT = 4  # lists of constants; a compiled graph asks for each of its own twice
+
+
+def is_compiled() -> bool:
+    """Whether this code is being compiled, and not exported."""
+    return torch.compiler.is_compiling() and not torch.compiler.is_exporting()
+
+
+def one_operator(
+    name: str, empty: Callable[..., Any], differentiable: int = 0
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Makes a function an operator of PyTorch, that a compiled graph calls as a whole.
+
+    Args:
+        name: Of the operator.
+        empty: Gives empty tensors like the function's results, from the same arguments.
+        differentiable: How many of the first arguments gradients are taken to; backwards, the function runs once more.
+
+    Returns:
+        A decorator. The function takes tensors, None and numbers, and gives new contiguous tensors.
+    """
+
+    def decorated(function: Callable[..., Any]) -> Callable[..., Any]:
+        operator = torch.library.custom_op(name, function, mutates_args=())
+        operator.register_fake(empty)
+
+        def remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:
+            context.others = [None if isinstance(value, Tensor) else value for value in inputs]
+            context.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
+
+        def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+            saved = zip(context.saved_tensors, context.others, strict=True)
+            inputs = [other if tensor is None else tensor.detach() for tensor, other in saved]
+            with torch.enable_grad():
+                moving = [value.requires_grad_() for value in inputs[:differentiable]]
+                outputs = function(*moving, *inputs[differentiable:])
+                wanted = [(o, g) for o, g in zip(outputs, gradients, strict=True) if o.requires_grad]
+                back = torch.autograd.grad([o for o, _ in wanted], moving, [g for _, g in wanted], allow_unused=True)
+            return (*back, *[None] * (len(inputs) - differentiable))
+
+        if differentiable:
+            operator.register_autograd(backward, setup_context=remember)
+        return operator
+
+    return decorated
+
+
+def constants(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> list[Tensor]:
+    """Tensors that a function makes of what a graph does not change, as constants of what is compiled."""
+    shapes = _shapes(make, *arguments)
+    parts = _numbers(make, *arguments).split([math.prod(shape) for shape in shapes])
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+@functools.lru_cache(_KEPT)
+def _made(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> list[Tensor]:
+    return list(make(*arguments))
+
+
+def _shapes(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(tensor.shape) for tensor in _made(make, *arguments))
+
+
+def _numbers(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> Tensor:
+    return torch.cat([tensor.flatten() for tensor in _made(make, *arguments)])
+
+
+for _constant in (_shapes, _numbers):  # one result each, for a compiled graph holds one of a function
+    # what torch.compiler.assume_constant_result does, without importing the whole compiler for it
+    _constant._dynamo_marked_constant = True  # type: ignore[union-attr]
