@@ -70,6 +70,8 @@ image.exr millimetres.npy --focus-m 3 --f-number 1.4 --strict | millimetres.npy:
 image.exr depth.npy --focus-m 2 --table nowhere       | no blur table 'nowhere': neither a file nor one of disc, gauss
 image.exr depth.npy --focus-m 2 --attention 3,4       | --attention expects X,Y,RADIUS
 image.exr depth.npy --focus-m 2 --attention 3,4,0     | (x, y, radius) in pixels, radius > 0
+image.exr depth.npy --focus-m 2 --lights 3            | --lights is for photographs of 8 or 16 bits
+image.exr depth.npy --focus-m 2 --lights -1           | --lights must be a finite number of stops from 0 on
 image.exr depth.npy --focus-m 2 --tolerance -1        | tolerance must be
 image.exr depth.npy --focus-m 2 --tolerance best      | --tolerance expects draft, preview, final or a number
 image.exr depth.npy --focus-m 2 --device warp         | --device warp: there is no such device

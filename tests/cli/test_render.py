@@ -19,6 +19,7 @@ from torch import Tensor
 
 import torchdof
 from torchdof.cli.main import app
+from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.optics.field import Field
 
@@ -98,6 +99,18 @@ def test_render_is_the_function_on_files(
     radius = float(camera.coc_px(depth, depth.shape[-1]).abs().max())
     assert line.startswith("out.exr: focus ") and f"; blur radius up to {radius:.1f} px; " in line
     assert "[" not in line and line.count("\n") == 1
+
+
+def test_lights_expand_the_clipped_lamps_of_a_photograph_and_keep_alpha(scene: Path, depth: Tensor, run: Run) -> None:
+    night = torch.full((1, 4, 16, 24), 0.01)
+    night[:, :3, 8, 18], night[:, 3] = 1.0, 1.0
+    write_image("night.png", Picture(night, ("R", "G", "B", "A"), sample="8", transfer="srgb"))
+    told = run(f"render night.png depth.npy -o out.exr --focus-m 2 --lights 3 --bits float {LENS}")
+    assert "lights up to 3 stops above white" in told
+    light = pixels("night.png")
+    light = torch.cat([expand_highlights(light[:, :3], 3.0), light[:, 3:]], 1)
+    torch.testing.assert_close(pixels("out.exr"), torchdof.depth_of_field(light, depth, CAMERA), rtol=0, atol=1e-5)
+    assert float(light.max()) > 2.0
 
 
 def test_the_line_tells_what_was_done(scene: Path, run: Run) -> None:
@@ -278,6 +291,7 @@ def test_json_says_for_programs_what_the_line_says(scene: Path, depth: Tensor, r
         "occlusion": True,
         "tolerance": 1 / 255,
         "attention": [18.0, 8.0, 4.0],
+        "lights": 0.0,
         "device": frames[0]["device"],
     }
     assert frames[0]["seconds"] > 0

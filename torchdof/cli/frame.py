@@ -16,6 +16,7 @@ from ..depth.inspect import tint_focus
 from ..depth.kinds import depth_from_values
 from ..depth.relative import from_relative
 from ..depth.sanity import coc_mistakes, depth_mistakes
+from ..io.highlights import expand_highlights
 from ..io.images import Picture, read_image, read_values, write_image
 from ..module import blur_by_coc
 from ..optics.blur_table import BlurTable
@@ -160,6 +161,8 @@ class Renderer:
                 blur_by_coc, table=table, depth_edges=edges_of(command.depth_edges), **command.accuracy.options()
             )
             with torch.no_grad():
+                if command.lights:
+                    pixels = _with_lights(picture, pixels, command.lights)
                 if bar is not None and bar.is_seen and coc_px.numel() > _LARGE_PX:
                     bar.update(f"rendering {out.name}, about {_seconds(blur, pixels, coc_px):.0f} s")
                 pixels = blur(pixels, coc_px, attention=command.attention)
@@ -198,7 +201,8 @@ class Renderer:
             words += [] if options.occlusion else ["no occlusion"]
             facts |= {"table": name, "aperture": None if aperture is None else aperture.to_dict()}
             facts |= {name: getattr(options, name) for name in ("method", "occlusion", "tolerance")}
-            facts["attention"] = command.attention
+            facts |= {"attention": command.attention, "lights": command.lights}
+            words += [f"lights up to {command.lights:g} stops above white"] if command.lights else []
         words += [f"{holes} px of depth filled ({command.scene.depth_map.fill_depth})"] if holes else []
         return words, facts
 
@@ -209,6 +213,17 @@ def _seconds(blur: Callable[..., Tensor], pixels: Tensor, coc_px: Tensor) -> flo
     strip = (..., slice(height // 2, height // 2 + math.ceil(height / _STRIPS)), slice(None))
     blur(pixels[strip], coc_px[strip])
     return _STRIPS * (time.perf_counter() - start)
+
+
+def _with_lights(picture: Picture, pixels: Tensor, stops: float) -> Tensor:
+    """Pixels whose clipped lamps have light again; alpha stays. Refuses scene-linear light, which clips nothing."""
+    if picture.sample in ("half", "float"):
+        raise ValueError(
+            f"--lights is for photographs of 8 or 16 bits, which clip at white; this image holds {picture.sample} "
+            "numbers, light above white included: leave --lights out"
+        )
+    colours = picture.light.shape[1]
+    return torch.cat([expand_highlights(pixels[:, :colours], stops), pixels[:, colours:]], 1)
 
 
 def _with_alpha(table: BlurTable) -> BlurTable:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -94,6 +95,12 @@ class Render:
         read=numbers(3, "--attention expects X,Y,RADIUS in pixels such as 320,200,80"),
         group="Blur",
     )
+    lights: float = option(
+        "Give small lamps that IMAGE, a photograph, clipped at white up to so many stops more light, such as 3.",
+        0.0,
+        metavar="STOPS",
+        group="Blur",
+    )
     show_focus: bool = option(
         "Don't blur: draw the outlines of what is near orange, in focus green, far blue.", False, group="Blur"
     )
@@ -101,6 +108,10 @@ class Render:
     depth_edges: Literal["auto", "repair", "as-given"] = edges_option("auto")
     files: _Files
     as_json: bool = json_option()
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lights < math.inf:
+            raise ValueError(f"--lights must be a finite number of stops from 0 on, got {self.lights:g}")
 
     def run(self) -> None:
         """Renders one image, or the frames of a sequence."""
