@@ -21,6 +21,7 @@ __all__ = [
     "finite_background",
     "floating",
     "is_differentiated",
+    "has_storage",
     "is_in_memory",
     "is_resizable",
     "image_and_coc",
@@ -68,9 +69,26 @@ def is_differentiated(values: Tensor) -> bool:
 
 
 def is_in_memory(values: Tensor) -> bool:
-    """Whether the compiled engine can read some numbers, and nobody asks for more than numbers."""
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(values)
-    return values.device.type == "cpu" and not wrapped and not is_differentiated(values)
+    """Whether the compiled engine can read some numbers, and nobody asks for more than numbers.
+
+    It cannot where a mode such as ``FakeTensorMode`` or a flop counter sees each operation.
+    """
+    if values.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(values):
+        return False
+    return torch._C._len_torch_dispatch_stack() == 0 and has_storage(values) and not is_differentiated(values)
+
+
+def has_storage(values: Tensor) -> bool:
+    """Whether a tensor's numbers lie in memory: not those of a fake, masked or other wrapper, or of a freed storage."""
+    try:
+        storage = values.untyped_storage()
+        last = values.storage_offset() + sum(
+            (n - 1) * step for n, step in zip(values.shape, values.stride(), strict=True)
+        )
+        whole = storage.device == values.device and storage.nbytes() >= (last + 1) * values.element_size()
+        return values.numel() == 0 or (whole and storage.data_ptr() != 0)
+    except (RuntimeError, NotImplementedError):  # a wrapper's storage may not be asked
+        return False
 
 
 def number(
@@ -172,6 +190,17 @@ def real_tensor(name: str, value: Any, what: str) -> Tensor:
         raise ValueError(f"{name} must be a dense tensor {what}, got {value.layout}; convert it with .to_dense()")
     if value.device.type == "meta":
         raise ValueError(f"{name} must be a tensor {what} that holds data, got one on the meta device")
+    if is_traced():
+        return value
+    if torch.jit.is_tracing():
+        raise ValueError(
+            f"{name} must not be recorded by torch.jit.trace; use torch.compile or torchdof.export.to_onnx"
+        )
+    if not torch._C._functorch.is_functorch_wrapped_tensor(value) and not has_storage(value):
+        kind = f"a {type(value).__name__} without memory of its own" if type(value) is not Tensor else "a freed storage"
+        raise ValueError(
+            f"{name} must be a tensor {what} that holds data, got {kind}; pass the tensor with its numbers"
+        )
     return value
 
 

@@ -497,12 +497,12 @@ def _unmix(
         if is_near:
             most = far[chosen] + _MOST * gap[chosen]
             gain = fit * (torch.minimum(least + difference, most) - near[chosen]).clamp_min(0.0)
-            near = near.index_add(0, chosen, gain)
+            near = near.index_add(0, chosen, gain.to(near.dtype))
         else:
             lowest = pixels.pick(-_highest(-nearness, 12), at)[0]
             bound = torch.maximum(near[chosen] - _MOST * gap[chosen], lowest)
             gain = fit * (torch.maximum(least, bound) - far[chosen]).clamp_max(0.0)
-            far = far.index_add(0, chosen, gain)
+            far = far.index_add(0, chosen, gain.to(far.dtype))
     return near, far
 
 

@@ -1,0 +1,94 @@
+"""Tensors without memory of their own are refused by name before the compiled engine could read it."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils.flop_counter import FlopCounterMode
+
+from torchdof import Camera, DepthOfField, blur_by_coc
+from torchdof.validation import has_storage
+
+
+class Wrapper(Tensor):
+    """A tensor whose numbers are another one's."""
+
+    @staticmethod
+    def __new__(cls) -> "Wrapper":
+        wrapper: Wrapper = torch.Tensor._make_wrapper_subclass(cls, (1, 1, 40, 50), dtype=torch.float32)
+        return wrapper
+
+    @classmethod
+    def __torch_dispatch__(cls, *_: object, **__: object) -> object:
+        raise NotImplementedError
+
+
+def freed() -> Tensor:
+    values = torch.ones(1, 1, 40, 50)
+    values.untyped_storage().resize_(0)
+    return values
+
+
+def cut() -> Tensor:
+    values = torch.ones(1, 1, 40, 50)
+    values.untyped_storage().resize_(100)
+    return values
+
+
+def fake() -> Tensor:
+    with FakeTensorMode():
+        return torch.ones(1, 1, 40, 50)
+
+
+@pytest.mark.parametrize("make", [freed, cut, fake, Wrapper])
+def test_what_has_no_memory_is_refused_by_name(make: type[Wrapper]) -> None:
+    image = torch.rand(1, 3, 40, 50)
+    with pytest.raises(ValueError, match=r"coc_px must be a tensor .* that holds data"):
+        blur_by_coc(image, make())
+    with pytest.raises(ValueError, match=r"depth must be a tensor .* that holds data"):
+        DepthOfField(Camera(focus_m=2.0))(image, make())
+    with pytest.raises(ValueError, match=r"image must be a tensor .* that holds data"):
+        blur_by_coc(make(), torch.ones(1, 1, 40, 50))
+
+
+def test_a_fake_mode_around_real_tensors_does_not_end_the_process() -> None:
+    script = (
+        "import torch, torchdof\nfrom torch._subclasses.fake_tensor import FakeTensorMode\n"
+        "image, coc = torch.rand(1, 3, 300, 300), 9 * torch.rand(1, 1, 300, 300)\n"
+        "try:\n    with FakeTensorMode(allow_non_fake_inputs=True): torchdof.blur_by_coc(image, coc)\n"
+        "except Exception as error: print(type(error).__name__)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_views_have_their_memory_and_empty_tensors_need_none() -> None:
+    values = torch.ones(4, 5, 6)
+    assert all(map(has_storage, (values[2:, ::2], values.permute(2, 0, 1), values[:1].expand(9, 5, 6), values[:0])))
+
+
+def test_a_mode_that_counts_operations_sees_them() -> None:
+    image, coc_px = torch.rand(1, 3, 30, 40), torch.full((1, 1, 30, 40), 3.0)
+    with FlopCounterMode(display=False) as counter:
+        picture = blur_by_coc(image, coc_px)
+    assert counter.get_total_flops() > 0
+    torch.testing.assert_close(picture, blur_by_coc(image, coc_px), rtol=0, atol=1e-5)
+
+
+def test_torch_jit_trace_is_refused() -> None:
+    image, coc_px = torch.rand(1, 3, 30, 40), torch.full((1, 1, 30, 40), 3.0)
+    with pytest.raises(ValueError, match=r"torch\.jit\.trace; use torch\.compile or torchdof\.export\.to_onnx"):
+        torch.jit.trace(blur_by_coc, (image, coc_px))
+
+
+def test_a_default_of_float64_leaves_gradients_of_float32_alone() -> None:
+    image, coc_px = torch.rand(1, 3, 60, 60).requires_grad_(), 9 * torch.rand(1, 1, 60, 60)
+    torch.set_default_dtype(torch.float64)
+    try:
+        blur_by_coc(image, coc_px).sum().backward()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert image.grad is not None and image.grad.dtype == torch.float32
