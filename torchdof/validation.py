@@ -71,11 +71,12 @@ def is_differentiated(values: Tensor) -> bool:
 def is_in_memory(values: Tensor) -> bool:
     """Whether the compiled engine can read some numbers, and nobody asks for more than numbers.
 
-    It cannot where a mode such as ``FakeTensorMode`` or a flop counter sees each operation.
+    It cannot under ``FakeTensorMode``, where a new tensor has no memory.
     """
     if values.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(values):
         return False
-    return torch._C._len_torch_dispatch_stack() == 0 and has_storage(values) and not is_differentiated(values)
+    is_fake = torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.FAKE) is not None
+    return not is_fake and has_storage(values) and not is_differentiated(values)
 
 
 def has_storage(values: Tensor) -> bool:
