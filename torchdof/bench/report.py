@@ -31,7 +31,7 @@ LEGEND = (
 )
 
 
-def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float]], float]) -> list[Row]:
+def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float]], float]) -> list[dict[str, Any]]:
     """A row for each combination of what stands under the keys: means of what its rows hold as fractions.
 
     Example:
@@ -51,7 +51,7 @@ def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float
         if len(columns.get("new_ms", ())) > 1:
             low, _, high = statistics.quantiles(columns["new_ms"], n=4, method="inclusive")
             found[-1]["spread_ms"] = high - low
-    return [*found]
+    return found
 
 
 def publish(

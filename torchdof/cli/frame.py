@@ -117,7 +117,7 @@ def facts_of_camera(camera: Camera) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Rendered:
-    """A picture to write to a file, what to tell of it to people and to programs, and how long it took."""
+    """A picture, the file it goes to, its report as words for people and facts for programs, and its seconds."""
 
     out: Path
     picture: Picture
@@ -172,7 +172,7 @@ class Renderer:
         return Rendered(out, dataclasses.replace(picture, pixels=pixels), words, facts, seconds)
 
     def write(self, rendered: Rendered) -> Rendered:
-        """Writes what was rendered, whole or not at all; its time is then that of writing, too."""
+        """Writes the picture, whole or not at all, and adds the seconds that this took."""
         start = time.perf_counter()
         write_image(rendered.out, rendered.picture, self.command.files.out_transfer, self.command.files.bits)
         return dataclasses.replace(rendered, seconds=rendered.seconds + time.perf_counter() - start)

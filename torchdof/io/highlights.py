@@ -10,12 +10,15 @@ from ..validation import real_tensor, show
 
 __all__ = ["expand_highlights"]
 
-_NEAR_WHITE = (0.87, 0.97)  # linear light from which on, and up to which, a channel counts as clipped: codes 240 to 252
+_NEAR_WHITE = (
+    0.87,
+    0.97,
+)  # linear light: below the first a channel is unclipped, above the second clipped (8-bit codes 240, 252)
 _SHARE = (0.05, 0.2)  # of clipped pixels around one: from a lamp to a sky
 _SURROUNDINGS = 0.04  # of the image's longer side, 31 pixels at least: the window of that share
 _RIM = 0.007  # of the longer side: the window, 5 pixels at least, in which the rim's colour is looked for
-_ELSEWHERE = 1e-3  # weight of what is as far as the surroundings, where the near window has no rim
-_LITTLE = 1e-4  # weight of white where nothing tells the colour
+_ELSEWHERE = 1e-3  # weight of the wide window in the hue; it decides where the narrow window holds no rim
+_LITTLE = 1e-4  # weight of white in the hue; it decides where no light is unclipped
 
 
 def expand_highlights(light: Tensor, stops: float = 3.0) -> Tensor:
@@ -57,7 +60,7 @@ def expand_highlights(light: Tensor, stops: float = 3.0) -> Tensor:
     is_lamp = 1.0 - _rise(_mean(any_clipped, max(31.0, _SURROUNDINGS * longer)), *_SHARE)
     hue = _hue_of_rim(light, 1.0 - any_clipped, longer)
 
-    told = (1.0 - clipped) * hue  # the channels that still tell how bright it is, by least squares
+    told = (1.0 - clipped) * hue  # weights of the unclipped channels: strength is their least-squares fit to the hue
     strength = ((told * light).sum(1, keepdim=True) + _LITTLE) / ((told * hue).sum(1, keepdim=True) + _LITTLE)
     strength = strength.clamp_max(most).lerp(torch.full_like(strength, most), clipped.amin(1, keepdim=True))
     risen = light + clipped * is_lamp * (strength * hue - light).clamp_min(0.0)
@@ -75,7 +78,7 @@ def _hue_of_rim(light: Tensor, unclipped: Tensor, longer: int) -> Tensor:
 
 
 def _mean(values: Tensor, width: float) -> Tensor:
-    """Mean over a square window about so many pixels wide, of what of it lies in the frame."""
+    """Mean over a square window about ``width`` pixels wide; pixels outside of the frame do not count."""
     side = 2 * int(width / 2) + 1
     rows = functional.avg_pool2d(values, (side, 1), 1, (side // 2, 0), count_include_pad=False)
     return functional.avg_pool2d(rows, (1, side), 1, (0, side // 2), count_include_pad=False)

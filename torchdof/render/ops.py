@@ -22,8 +22,8 @@ _PART = 40_000  # pixels that are looked at together
 class Level(NamedTuple):
     """Farthest surfaces at every ``step``-th pixel: light, coc and weight ``[B, C + 2, H, W]``.
 
-    ``vote`` is its weight against other levels, None if that is in the weights; ``least_px`` the blur from which on a
-    pixel looks so far, and wholly from twice of it.
+    ``vote`` is the level's weight against other levels; None means that ``values`` hold it in their weights. A pixel
+    uses the level where its blur exceeds ``least_px`` pixels, and fully above twice that blur.
     """
 
     values: Tensor
@@ -49,14 +49,14 @@ class Ops:
     """Whether all pixels are looked at, where eager code first finds those that need it."""
 
     def choose(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
-        """A result where it is needed, a bool ``[]``, else what is given, which then is the same.
+        """``result`` where ``needed()``, a bool ``[]``, is true; else ``given``, which then equals it.
 
         A graph computes what only the result needs only then.
         """
         return result
 
     def by_parts(self, look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
-        """What a function finds at pixels ``[P]``, so many at a time that what it needs stays small: ``[n, P]``."""
+        """``look(pixels)``, ``[n, P]``, of pixels ``[P]``: by parts of the list, to bound the memory."""
         return look(pixels) if is_traced() else torch.cat([look(part) for part in pixels.split(_PART)], 1)
 
     def seen(

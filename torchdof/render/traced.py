@@ -1,6 +1,6 @@
-"""What ``torch.compile`` cannot look into: functions whose work depends on values, and what is made of a table.
+"""Code that ``torch.compile`` does not trace: functions whose work depends on values, and kernels of a table.
 
-A function whose work depends on values is one operator in what is compiled. Kernels are constants in it.
+A compiled graph calls such a function as one operator and holds the kernels as constants.
 """
 
 import functools
@@ -61,7 +61,7 @@ def one_operator(
 
 
 def constants(make: Callable[..., Sequence[Tensor]], *arguments: Any) -> list[Tensor]:
-    """Tensors that a function makes of what a graph does not change, as constants of what is compiled."""
+    """The tensors of ``make(*arguments)`` as constants of the compiled graph, whose arguments never change."""
     shapes = _shapes(make, *arguments)
     parts = _numbers(make, *arguments).split([math.prod(shape) for shape in shapes])
     return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
