@@ -21,12 +21,12 @@ from torch import Tensor
 from .. import pixels
 from ..optics.blur_table import BlurTable
 from ..optics.placed_kernels import Shares, placed_between, ray_shares
-from ..validation import is_traced
+from ..tensors import is_traced
 from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, going_on
 
-__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "extract", "splat", "threshold"]
+__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "affordable_taps", "extract", "splat", "threshold"]
 
 FACTOR = 8.0
 """Light above so many times what is around it is a highlight's."""
@@ -42,6 +42,8 @@ _CELL = 11  # of them over which it is decided
 _LEAST_PX = 1.0  # blur from which on there are rays
 _WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, what counts of its rays
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
+_BLOCK = 16  # pixels a side, in which it is seen how many surfaces may stand in the way of a ray:
+_FREE_RANGE_PX = 2.5  # difference in coc within one from which on each ray looks at so many that fewer are affordable
 _TAPS = 2**21  # rays splatted together
 
 
@@ -81,6 +83,7 @@ def extract(
     from_px: float = _LEAST_PX,
     beside: Surface | None = None,
     image_coc_px: Tensor | None = None,
+    most_taps: Tensor | float | None = None,
     ops: Ops = EAGER,
 ) -> tuple[Surface, Highlights | None]:
     """Take the light above a limit out of a surface of an image, to be splatted ray by ray.
@@ -96,6 +99,7 @@ def extract(
         from_px: Blur from which on there are rays; all of the light above the limit is theirs at 1 px more.
         beside: The other surface of each pixel.
         image_coc_px: Coc of the image, ``[B, 1, H, W]``; without it a highlight sends what its surface has.
+        most_taps: Number of rays that are affordable, as :func:`affordable_taps` gives it; None: 16 a pixel.
         ops: How a frame without highlights stays as it is.
 
     Returns:
@@ -109,7 +113,8 @@ def extract(
     peak, coc, most = (pixels.pick(t, bright)[0] for t in (brightest, coc_px, limit))
     fades = (coc.abs() - from_px).clamp(max=1.0)
     # where they are too many, the brightest of them, and only what they are brighter by
-    least = _least_peak(peak.detach(), coc.detach(), ((1.0 - most / peak) * fades).detach(), math.prod(coc_px.shape))
+    most_taps = _TAPS_PER_PIXEL * math.prod(coc_px.shape) if most_taps is None else most_taps
+    least = _least_peak(peak.detach(), coc.detach(), ((1.0 - most / peak) * fades).detach(), most_taps)
     kept = (peak.detach() > least).nonzero()[:, 0]
     if not is_traced() and len(kept) == 0:
         return surface, None
@@ -135,7 +140,19 @@ def extract(
     return surface._replace(light=left), highlights
 
 
-def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, area: int) -> Tensor:
+def affordable_taps(coc_px: Tensor) -> Tensor:
+    """Number of rays ``[]`` that are splatted in a frame ``[B, 1, H, W]`` with occlusion: 16 a pixel.
+
+    A ray looks at each surface that may stand in its way. Where the coc differs by more than 2.5 px within 16 x 16
+    pixels on average, as in a depth map of noise, the number falls in proportion.
+    """
+    coc = coc_px.detach()
+    high, low = (functional.max_pool2d(values, _BLOCK, ceil_mode=True) for values in (coc, -coc))
+    crowd = ((high + low).mean() / _FREE_RANGE_PX).clamp_min(1.0)
+    return _TAPS_PER_PIXEL * math.prod(coc_px.shape) / crowd
+
+
+def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | float) -> Tensor:
     """Light ``[1]`` up to which highlights ``[n]`` are left to the layers of a frame, lest there be too many rays.
 
     It is the ``L`` at which the rays of those with a peak ``p`` above it, weighted by ``1 - L / (2 p)``, are as many as
@@ -146,7 +163,7 @@ def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, area: int) -> Tensor:
     values, order = functional.pad(peak.double(), (0, 1)).sort(descending=True)  # and one of no light, the last
     count = functional.pad(taps.double(), (0, 1)).index_select(0, order)
     slope = torch.where(values > 0, 0.5 * count / values, 0.0).cumsum(0)
-    budget = torch.scalar_tensor(_TAPS_PER_PIXEL * area, dtype=count.dtype, device=count.device)
+    budget = torch.as_tensor(most_taps, dtype=count.dtype, device=count.device)
     count = count.cumsum(0) - budget  # how many of them are beyond what there may be
     at_next = count - functional.pad(values[1:], (0, 1)) * slope  # how many there are at the next peak
     last = (at_next[:-1] < 0).sum(0, keepdim=True)

@@ -12,7 +12,8 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..options import Options
-from ..validation import NAMED_TOLERANCES, is_differentiated, is_traced
+from ..tensors import is_differentiated, is_traced
+from ..validation import NAMED_TOLERANCES
 from . import compiled, composite, edges, headroom, highlights
 from .attention import Attention, box_around, weight_map
 from .convolution import convolve
@@ -180,7 +181,10 @@ def _render_item(
         from_px = 0.0 if options.occlusion else crisp_px - 1.0
         # a known background says itself what is behind a mixed pixel
         beside = surfaces[::-1] if len(surfaces) == 2 else [None] * len(surfaces)
-        extracted = [highlights.extract(s, limit, from_px, b, coc, ops) for s, b in zip(surfaces, beside, strict=True)]
+        most = highlights.affordable_taps(coc) if options.occlusion else None
+        extracted = [
+            highlights.extract(s, limit, from_px, b, coc, most, ops) for s, b in zip(surfaces, beside, strict=True)
+        ]
         surfaces, rays = [s for s, _ in extracted], [r for _, r in extracted if r is not None]
         # what may stand in their way, the image's own surface first; a known background is in nobody's
         shown = surfaces if behind_light is None else surfaces[1::-1]
