@@ -27,6 +27,7 @@ _TRUST = 4.0  # how much texture discredits the contrast of the two surfaces
 _ALIKE = 1.0 / 255.0  # contrast, as a share of the brightest light around, that is worth as much as none
 _UNBOUNDED = 1e6  # times the brightest pixel around: so bright is neither part of a pixel
 _EMITTER_REACH = 3  # pixels around a highlight that tell on which surface it lies
+_TOUCHING = 2  # pixels around an emitter into which a soft picture spreads its light
 _DIM = 0.1  # times the light of a highlight's pixel: what is darker is as sure to be none of it
 _MOST_WEIGHT = 0.98  # of a highlight's pixel that an emitter of another surface may have
 
@@ -160,7 +161,7 @@ def attribute_emitters(
     excess = (own_peak / limit - 1.0).clamp(0.0, 1.0)
     window_coc, near_by = pixels.pick(coc_px, window)[0], _falloff(light, _EMITTER_REACH)
     counted = torch.ones_like(peaks) if valid is None else pixels.pick(valid, window)[0]
-    touches = counted * (near_by > _FALLOFF**3)  # of the window the middle 3 x 3
+    touches = counted * (near_by > _FALLOFF ** (2 * _TOUCHING**2 + 1))
     nearest = window_coc.amin(0)
 
     def beyond(coc: Tensor, side: float, share: float) -> tuple[Tensor, ...]:

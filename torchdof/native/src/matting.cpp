@@ -12,6 +12,7 @@ constexpr float TRUST = 4.0f;     // how much texture discredits the contrast of
 constexpr float ALIKE = 1.0f / 255;  // contrast, as a share of the brightest light around, that is worth as much as none
 constexpr float UNBOUNDED = 1e6f;  // times the brightest pixel around: so bright is neither part of a pixel
 constexpr int EMITTER_REACH = 3;  // pixels around a highlight that tell on which surface it lies
+constexpr int TOUCHING = 2;       // pixels around an emitter into which a soft picture spreads its light
 constexpr float DIM = 0.1f;         // times the light of a highlight's pixel: what is darker is as sure to be none of it
 constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that an emitter of another surface may have
 constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is the surface that the image shows
@@ -270,7 +271,7 @@ class Around {
 
  private:
   static constexpr int ACROSS = 2 * EMITTER_REACH + 1, COUNT = ACROSS * ACROSS;
-  static bool touches(int i) { return std::abs(i / ACROSS - EMITTER_REACH) <= 1 && std::abs(i % ACROSS - EMITTER_REACH) <= 1; }
+  static bool touches(int i) { return std::abs(i / ACROSS - EMITTER_REACH) <= TOUCHING && std::abs(i % ACROSS - EMITTER_REACH) <= TOUCHING; }
   const Surfaces &s_;
   const float *falloff_;
   size_t at_[COUNT];
