@@ -60,19 +60,25 @@ std::vector<double> border_nodes(std::vector<float> places) {
 }
 
 // 1 / s - 1 / z, exactly 0 at z = s.
-float dioptres_behind(float z, float s) { return std::isfinite(z) && std::isfinite(s) ? (z - s) / z / s : 1 / s - 1 / z; }
+vec dioptres_behind(vec z, float s) {
+  const vec apart = 1 / s - 1 / z;
+  return std::isfinite(s) ? (z < all(INFINITY) ? (z - s) / z / s : apart) : apart;
+}
 
 }  // namespace
 
 void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out) {
   constexpr int64_t PART = 1 << 15;
   torchdof::parallel(threads, (int)((count + PART - 1) / PART), nullptr, [&](int part, int) {
-    for (int64_t i = part * PART; i < std::min(count, (part + 1) * PART); i++) {
-      const float z = depth[i];
-      float dioptres = dioptres_behind(z, nearest);
-      if (nearest != farthest) dioptres = std::min(dioptres, 0.0f) + std::max(dioptres_behind(z, farthest), 0.0f);
-      out[i] = z > 0 ? scale * dioptres : NAN;
-    }
+    const auto coc_at = [&](vec z) {
+      vec dioptres = dioptres_behind(z, nearest);
+      if (nearest != farthest) dioptres = least(dioptres, vec{}) + most(dioptres_behind(z, farthest), vec{});
+      return z > vec{} ? scale * dioptres : all(NAN);
+    };
+    int64_t i = part * PART;
+    const int64_t end = std::min(count, i + PART);
+    for (; i + LANES <= end; i += LANES) store(out + i, coc_at(load<vec>(depth + i)));
+    for (; i < end; i++) out[i] = coc_at(all(depth[i]))[0];
   });
 }
 
