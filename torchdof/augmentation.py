@@ -22,7 +22,8 @@ from .module import depth_of_field
 from .optics.blur_table import BlurTable
 from .optics.camera import Camera
 from .options import OptionArguments, Options, spells_options
-from .validation import floating, image_and_map, number, show
+from .tensors import floating
+from .validation import image_and_map, number, show
 
 __all__ = ["DepthAugmentationSequential", "RandomDepthOfField"]
 

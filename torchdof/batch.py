@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .validation import is_traced, show
+from .tensors import is_traced
+from .validation import show
 
 __all__ = ["flattened", "leading_axes", "numbers", "restored"]
 

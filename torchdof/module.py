@@ -19,6 +19,7 @@ from .render.attention import Attention
 from .render.ops import EAGER, Ops
 from .render.plan import Plan
 from .render.resample import at_size_of
+from .tensors import is_traced
 
 __all__ = ["DepthOfField", "blur_by_coc", "depth_of_field"]
 
@@ -197,7 +198,7 @@ class DepthOfField(nn.Module):
             name: Of the depth, in messages.
         """
         check = self.options.check
-        if not validation.is_traced() and validation.is_resizable(image, depth):
+        if not is_traced() and validation.is_resizable(image, depth):
             depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check, name=name)
         changes = {"focus_m": focus_m, "f_number": f_number}
@@ -376,7 +377,7 @@ def blur(
 
 def _engine(light: Tensor) -> contextlib.AbstractContextManager[Any]:
     """What the pipeline runs in: with autocast off, for it would convolve in half precision."""
-    if not validation.is_traced():
+    if not is_traced():
         _has_rendered.set()
     device = light.device.type
     return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else contextlib.nullcontext()
@@ -410,5 +411,5 @@ def _check_attention(attention: Attention | None, plan: Plan | None, options: Op
         return
     if plan is not None:
         raise ValueError("attention plans for two tolerances; leave plan out, or attention")
-    if validation.is_traced():
+    if is_traced():
         raise ValueError("attention chooses its work by where the viewer looks; a compiled or exported graph cannot")

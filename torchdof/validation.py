@@ -6,9 +6,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from . import native
+from .tensors import floating, has_storage, is_in_memory, is_traced
 
 __all__ = [
     "NAMED_TOLERANCES",
@@ -19,15 +19,10 @@ __all__ = [
     "depth_edges",
     "ends",
     "finite_background",
-    "floating",
-    "is_differentiated",
-    "has_storage",
-    "is_in_memory",
     "is_resizable",
     "image_and_coc",
     "image_and_depth",
     "image_and_map",
-    "is_traced",
     "number",
     "pixels_wide",
     "real_tensor",
@@ -39,9 +34,6 @@ __all__ = [
 ]
 
 
-_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-"""Types of number that PyTorch computes with; of smaller ones it only stores."""
-
 NAMED_TOLERANCES = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
 """For looking around, for judging a picture, and one that differs by less than a display shows."""
 
@@ -49,47 +41,6 @@ WHOLE_NUMBERS = (
     *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
     *(torch.int8, torch.int16, torch.int32, torch.int64),
 )
-
-
-def is_traced() -> bool:
-    """Whether this code is being compiled or exported: tensors then have no numbers that could be looked at."""
-    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
-
-
-def is_differentiated(values: Tensor) -> bool:
-    """Whether derivatives are taken with respect to some numbers: backwards, forwards, or by torch.func."""
-    if is_traced():
-        return torch.is_grad_enabled() and values.requires_grad
-    while True:
-        if (torch.is_grad_enabled() and values.requires_grad) or forward_ad.unpack_dual(values).tangent is not None:
-            return True
-        if not torch._C._functorch.is_functorch_wrapped_tensor(values):
-            return False
-        values = torch._C._functorch.get_unwrapped(values)
-
-
-def is_in_memory(values: Tensor) -> bool:
-    """Whether the compiled engine can read some numbers, and nobody asks for more than numbers.
-
-    It cannot under ``FakeTensorMode``, where a new tensor has no memory.
-    """
-    if values.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(values):
-        return False
-    is_fake = torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.FAKE) is not None
-    return not is_fake and has_storage(values) and not is_differentiated(values)
-
-
-def has_storage(values: Tensor) -> bool:
-    """Whether a tensor's numbers lie in memory: not those of a fake, masked or other wrapper, or of a freed storage."""
-    try:
-        storage = values.untyped_storage()
-        last = values.storage_offset() + sum(
-            (n - 1) * step for n, step in zip(values.shape, values.stride(), strict=True)
-        )
-        whole = storage.device == values.device and storage.nbytes() >= (last + 1) * values.element_size()
-        return values.numel() == 0 or (whole and storage.data_ptr() != 0)
-    except (RuntimeError, NotImplementedError):  # a wrapper's storage may not be asked
-        return False
 
 
 def number(
@@ -132,11 +83,6 @@ def broadcast_shapes(*shapes: Sequence[int]) -> torch.Size:
     return torch.broadcast_tensors(*(torch.zeros(()).expand(tuple(shape)) for shape in shapes))[0].shape
 
 
-def floating(value: Any) -> bool:
-    """Whether something is a tensor of floating-point numbers that can be computed with: not of 8 bits or fewer."""
-    return isinstance(value, Tensor) and value.dtype in _FLOATS
-
-
 def whole(name: str, value: Any, low: int, high: int) -> int:
     """A whole number from ``low`` to ``high``.
 
@@ -148,13 +94,14 @@ def whole(name: str, value: Any, low: int, high: int) -> int:
     return value
 
 
-def ends(values: Tensor) -> Tensor:
-    """Least and largest of some numbers, ``[2]``; NaN if one of them is NaN. One look at each value."""
-    if not is_traced() and values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
-        return torch.tensor(native.ends(values))
+def ends(values: Tensor) -> tuple[float, float]:
+    """Least and largest of some numbers; both NaN if one of them is NaN. One look at each value."""
+    if values.dtype == torch.float32 and is_in_memory(values) and native.chosen():
+        return native.ends(values)
     # not as half precision, of which autocast knows only one kind at a time
     exact = torch.float64 if values.dtype == torch.float64 else torch.float32
-    return torch.stack([end.to(exact) for end in torch.aminmax(values.detach())])
+    low, high = torch.stack([end.to(exact) for end in torch.aminmax(values.detach())]).tolist()
+    return low, high
 
 
 def pixels_wide(width: Any) -> None:
@@ -389,7 +336,7 @@ def coc_of_lens(coc_px: Tensor, depth: Tensor, lens: Mapping[str, Any]) -> None:
     Raises:
         ValueError: Naming the nearest depth and all numbers of the lens.
     """
-    if not is_traced() and not bool(torch.isfinite(ends(coc_px)).all()):
+    if not is_traced() and not all(map(math.isfinite, ends(coc_px))):
         stated = ", ".join(f"{name} {_number(value)}" for name, value in lens.items())
         raise ValueError(
             f"depth and lens must blur by some number of pixels, got a blur beyond any: this lens ({stated}) "
@@ -405,7 +352,7 @@ def _number(value: Any) -> str:
 
 def _finite(name: str, values: Tensor) -> None:
     """Refuse numbers that are NaN or infinite."""
-    if not bool(torch.isfinite(ends(values)).all()):
+    if not all(map(math.isfinite, ends(values))):
         bad = values.numel() - int(torch.isfinite(values).sum())
         raise ValueError(
             f"{name} must be finite, got {bad} of {values.numel()} values that are NaN or infinite; "

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from torchdof import Camera, DepthOfField, blur_by_coc
-from torchdof.validation import has_storage
+from torchdof.tensors import has_storage
 
 
 class Wrapper(Tensor):

@@ -8,7 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ..validation import is_traced, number, show
+from ..tensors import is_traced
+from ..validation import number, show
 from .kinds import depth_from_values, number_map
 
 __all__ = ["RELATIVE_KINDS", "RelativeKind", "Scale", "from_relative", "solve_scale"]

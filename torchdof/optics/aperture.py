@@ -19,7 +19,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import broadcast_shapes, is_differentiated, real_tensor, show, whole
+from ..tensors import is_differentiated
+from ..validation import broadcast_shapes, real_tensor, show, whole
 
 __all__ = ["Aperture"]
 

@@ -10,7 +10,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import WHOLE_NUMBERS, floating, number, pixels_wide, real_tensor, show
+from ..tensors import floating
+from ..validation import WHOLE_NUMBERS, number, pixels_wide, real_tensor, show
 from . import psf, table_file
 from .aperture import Aperture, Number
 from .field import Field

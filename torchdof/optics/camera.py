@@ -28,7 +28,8 @@ import torch
 from torch import Tensor
 
 from .. import native
-from ..validation import floating, is_in_memory, is_traced, pixels_wide, real_tensor, show, whole
+from ..tensors import floating, is_in_memory, is_traced
+from ..validation import pixels_wide, real_tensor, show, whole
 
 __all__ = ["CAMERA_NUMBERS", "Camera"]
 

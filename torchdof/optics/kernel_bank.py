@@ -25,7 +25,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..validation import is_differentiated
+from ..tensors import is_differentiated
 from . import psf
 from .aperture import Aperture
 from .field import Field

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..validation import floating, show
+from ..tensors import floating
+from ..validation import show
 
 __all__ = ["Attention", "box_around", "weight_map"]
 

@@ -12,7 +12,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import Spots, bank_of
 from ..optics.placed_kernels import Shares, ray_shares
 from ..options import Options
-from ..validation import is_in_memory, is_traced
+from ..tensors import is_in_memory, is_traced
 from . import headroom
 from .plan import KERNELS_PER_PX, Plan, layer_spots, longest_px
 

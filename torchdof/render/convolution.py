@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import is_traced
+from ..tensors import is_traced
 
 __all__ = ["CHANNELS", "DIRECT_TAPS", "convolve", "widest_float"]
 

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from .. import native, pixels, validation
 from ..options import DepthEdges
+from ..tensors import is_differentiated, is_in_memory, is_traced
+from ..validation import ends
 from .ops import EAGER, Ops
 from .traced import is_compiled, one_operator
 
@@ -27,9 +29,10 @@ __all__ = ["STEP_PX", "judged", "mended", "repair", "repair_edges"]
 STEP_PX = 1.0
 """Difference in the circle of confusion from which on the edge between two surfaces is worth repair."""
 
+_LEAST_STEP_PX = 0.5 * STEP_PX  # beside lamps; in a map whose pixels differ by less a repair changes nothing
 _STEP = 0.1  # part of its nearness by which a surface stands before another one, for :func:`repair_edges`
 _NOISES = 12.0  # standard deviations of a map's noise that a step stands out at least
-_NOISE_SAMPLED = 2**15  # pixels of a frame among which noise is looked for, half along rows and half along columns
+_NOISE_SAMPLED = 2**13  # pixels of a frame among which noise is looked for, half along rows and half along columns
 _RINGS = 3  # pixels beside a step that may be on its wrong side
 _REACH = 5  # pixels around one that tell what the two surfaces look like
 _FALLOFF_PX = 2.5
@@ -57,8 +60,9 @@ _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map coun
 _WIDE = 1.5  # so wide in pixels, or
 _MIXED = 0.5  # to such a part far from both surfaces: compression leaves narrow ones near one of them
 _RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
-_SAMPLED = 2**17  # pixels of a frame among which a map is calibrated, in blocks
-_BLOCK = 32
+_SAMPLED = 2**14  # pixels of a frame among which a map is calibrated, in blocks,
+_SPARSEST = 32  # or one of so many blocks of a large frame
+_BLOCK = 8
 _NEVER = 1e30
 _LARGEST = 1e15  # nearness, and light, whose squares are numbers too: beyond it the one is none, the other no brighter
 _BRIGHTEST = 1e30
@@ -126,17 +130,21 @@ def mended(image: Tensor, coc_px: Tensor, edges: DepthEdges, ops: Ops = EAGER) -
     Returns:
         The map, ``[B, 1, H, W]`` where it is repaired. Gradients flow to it where it is unchanged.
     """
-    if edges == "as given" or (not validation.is_traced() and not _has_steps(coc_px)):
+    if edges == "as given":
         return coc_px
+    if not is_traced():
+        low, high = ends(coc_px)
+        if high - low < _LEAST_STEP_PX:
+            return coc_px
     repaired = repair(image, coc_px.detach(), STEP_PX, auto=edges == "auto", of_coc=True, ops=ops)
     repaired = ops.choose(lambda: _has_steps(coc_px), repaired, coc_px)
-    return torch.where(repaired == coc_px, coc_px, repaired) if validation.is_differentiated(coc_px) else repaired
+    return torch.where(repaired == coc_px, coc_px, repaired) if is_differentiated(coc_px) else repaired
 
 
 def _has_steps(coc_px: Tensor) -> Tensor:
-    """Whether two pixels of a map are so far apart that a repair could change one: half a step, beside lamps."""
-    low, high = validation.ends(coc_px)
-    return ~(high - low < 0.5 * STEP_PX)  # holes tell nothing
+    """Whether two pixels of a map, or of one with NaN, may differ by the least step: a bool ``[]``."""
+    low, high = torch.aminmax(coc_px)
+    return ~(high - low < _LEAST_STEP_PX)
 
 
 def repair(
@@ -159,7 +167,7 @@ def repair(
     if torch.is_autocast_enabled(device):  # it would convolve in half precision
         with torch.autocast(device, enabled=False):
             return repair(image, nearness, step, auto, of_coc, ops)
-    compiled = not validation.is_traced() and all(map(validation.is_in_memory, (image, nearness))) and native.chosen()
+    compiled = not is_traced() and all(map(is_in_memory, (image, nearness))) and native.chosen()
     if of_coc and not compiled:
         return -repair(image, -nearness, step, auto, ops=ops)
     light, given = image.detach().float(), nearness.detach().float().expand(image.shape[0], -1, -1, -1)
@@ -209,7 +217,7 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
 
     # how far the map can be trusted, at each kind of place on an edge: from part of the frame
     height, width = given.shape[-2:]
-    every = (height * width + _SAMPLED - 1) // _SAMPLED
+    every = min((height * width + _SAMPLED - 1) // _SAMPLED, _SPARSEST)
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
     level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)

@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor
 
-from ..validation import is_traced
+from ..tensors import is_traced
 
 __all__ = ["factor", "has_room"]
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .. import validation
+from ..validation import ends
 from .layer_weights import blur_axis
 
 __all__ = ["DENSE", "border_nodes", "extent", "finest", "on_axis", "slid", "spaced_nodes", "spacing"]
@@ -70,10 +70,11 @@ def slid(node: float, fixed: Sequence[float], tolerance: float) -> float:
 
 def extent(coc_px: Tensor) -> tuple[float, float]:
     """Nearest and farthest place of the pixels ``[B, 1, H, W]``."""
-    both = validation.ends(coc_px)
-    if bool(both.isnan().any()):
-        both = validation.ends(torch.where(coc_px.isnan(), 0.0, coc_px))
-    low, high = on_axis(both, max(coc_px.shape[-2:])).tolist()
+    both = ends(coc_px)
+    if math.isnan(both[0]):
+        both = ends(torch.where(coc_px.isnan(), 0.0, coc_px))
+    exact = torch.promote_types(coc_px.dtype, torch.float32)
+    low, high = on_axis(torch.tensor(both, dtype=exact), max(coc_px.shape[-2:])).tolist()
     return low, high
 
 

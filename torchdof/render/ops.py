@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..validation import is_traced
+from ..tensors import is_traced
 from .surfaces import Frame, Highlights
 
 __all__ = ["EAGER", "Level", "Ops", "Seen"]

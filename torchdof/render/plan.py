@@ -11,7 +11,8 @@ from .. import native
 from ..optics.blur_table import BlurTable
 from ..optics.kernel_bank import Spots, bank_of
 from ..optics.placed_kernels import Shares, layer_shares
-from ..validation import is_differentiated, is_in_memory, is_traced, show, tolerance_of
+from ..tensors import is_differentiated, is_in_memory, is_traced
+from ..validation import show, tolerance_of
 from . import layer_cocs, traced
 from .downsampling import shrink
 from .layer_weights import blur_axis, from_blur_axis, ramps, weights_at_or_behind

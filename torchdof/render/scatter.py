@@ -11,7 +11,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from ..optics.placed_kernels import Shares, placed
-from ..validation import is_traced
+from ..tensors import is_traced
 from .convolution import DIRECT_TAPS, widest_float
 
 __all__ = ["fold"]

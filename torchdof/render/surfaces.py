@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from ..validation import is_traced
+from ..tensors import is_traced
 from .border import continued
 from .layer_weights import blur_axis, eased, ramps, weights_at_or_behind
 
