@@ -107,6 +107,26 @@ def rays_of(z_m: float, size: tuple[int, int], samples: int) -> Any:
     return rays
 
 
+def test_rays_traced_from_pixels_back_through_the_lens_see_the_spot() -> None:
+    z_m, half, samples = 1e5, 8, 900
+    row, column = (
+        round(n / 2 + 14.0 * WIDTH / SENSOR_MM * turn - 0.5) for n, turn in ((HEIGHT, -0.516), (WIDTH, -0.857))
+    )
+    dy, dx = row + 0.5 - HEIGHT / 2, column + 0.5 - WIDTH / 2
+    spot = traced_spot(z_m, math.hypot(dy, dx) * SENSOR_MM / WIDTH, math.atan2(dy, dx), half, WIDTH)
+
+    def light(x: Tensor, y: Tensor) -> Tensor:
+        away = (x - column - 0.5) ** 2 + (y - row - 0.5) ** 2
+        return torch.exp(-0.5 * away / POINT_PX**2)[None] / (2.0 * math.pi * POINT_PX**2)
+
+    window = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
+    rays = rays_of(z_m, (HEIGHT, WIDTH), samples)
+    seen = plane_views([Plane(z_m, light)], rays, (HEIGHT, WIDTH), window, samples)[0, 0].double().numpy()
+    straight, turned = (-10.0 * np.log10(((s - spot) ** 2).mean() / spot.max() ** 2) for s in (seen, seen[::-1, ::-1]))
+    assert seen.sum() == pytest.approx(1.0, abs=0.01)
+    assert straight > 36.0 and turned < 28.0  # of so many rays; and it does not lie inwards
+
+
 def test_a_picture_across_the_field_is_what_rays_through_the_lens_make(table: BlurTable) -> None:
     size, samples, plane = (240, 360), 100, Plane(0.9, waves(11))
 
