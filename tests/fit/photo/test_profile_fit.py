@@ -96,7 +96,7 @@ def test_another_family_is_refused(family):
 def test_strength_is_sampled_every_pixel_of_36_spokes_and_is_the_pictures_ratio(simulator):
     sharp, _ = simulator.Simulator(snr_db=None).pair("gaussian", {"sigma": 1.0})
     rows, columns = np.indices(sharp.shape) - 50.0
-    r, strength, spoke = blur_strength(sharp, sharp * (1 + 0.02 * columns - 0.01 * rows))
+    r, strength, spoke = blur_strength(sharp, 0.05 + sharp * (1 + 0.02 * columns - 0.01 * rows))
     assert len(np.unique(spoke)) == 36 and sorted(np.unique(r)) == list(range(12))
     theta = np.deg2rad(10 * spoke)
     expected = 1 + r * (0.02 * np.cos(theta) - 0.01 * np.sin(theta))  # bilinear between pixels, as a plane is
