@@ -7,8 +7,7 @@ from .photo.captures import Capture, Captures
 from .photo.family_choice import highlight_psnr, natural_psnr
 from .photo.manifest import read_captures
 from .photo.pair import fit_pair
-from .photo.profile_fit import fit_profile
-from .photo.ratio import blur_strength
+from .photo.profile_fit import blur_strength, fit_profile
 from .photo.table import TableFit, fit_captures, fit_table
 from .problems import FitError, FitWarning
 from .result import BlurFit

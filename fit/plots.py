@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["picture_of_fit", "picture_of_quad", "picture_of_table", "picture_of_texture"]
 
 DATA, MODEL = "#7a7a7a", "#c2410c"
 

@@ -1,15 +1,11 @@
 """What can be wrong with a capture or a fit: an error where no honest number can be given, else a warning."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
-
-__all__ = ["FitError", "FitWarning", "Kind", "unheard", "warn"]
 
 Kind = Literal[
     "argument",  # an argument of a function is not what it must be

@@ -1,7 +1,5 @@
 """What a fit returns: parameters with calibrated errors, and how well they explain the data."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
@@ -13,8 +11,6 @@ from torchdof.optics.aperture import Aperture
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
-
-__all__ = ["Array", "BlurFit", "Indices", "Mask"]
 
 
 @dataclass(frozen=True)

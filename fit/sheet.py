@@ -10,15 +10,13 @@ import torch
 
 from torchdof.optics.blur_table import BlurTable
 
-from .photo.photographs import Photograph, Photographs
+from .photo.photographs import Photographs
 from .photo.table import TableFit
 from .plots import DATA, MODEL, model_line, new_figure, show
 from .result import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["sheet_of_photographs"]
 
 
 def sheet_of_photographs(
@@ -42,7 +40,12 @@ def sheet_of_photographs(
     for i, (pair, fit, coc) in enumerate(zip(captures, result.fits, result.coc_px, strict=True)):
         found, window, profile, residual, kernel = axes[i]
         picture = by_distance[pair.distance_m]
-        small, corners = _thumbnail(picture)
+        step = max(1, picture.light.shape[1] // 300)
+        height, width = (n // step for n in picture.light.shape)
+        small = picture.light[: height * step, : width * step].reshape(height, step, width, step).mean((1, 3))
+        target, half = picture.target, picture.target.side_px / 2
+        around = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
+        corners = [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in around]
         show(found, small, f"{picture.file}, {pair.distance_m:.3f} m", box=corners)
         show(window, pair.blurred, "")
         profile.plot(*fit.samples, ".", color=DATA, markersize=1.5)
@@ -71,16 +74,6 @@ def sheet_of_photographs(
     show(figure.add_subplot(grid[rows, 3]), window, f"{sharp.file}, in focus")
     show(figure.add_subplot(grid[rows, 4]), photograph, f"with this table, as at {blurrest.distance_m:.3f} m")
     return figure
-
-
-def _thumbnail(picture: Photograph) -> tuple[Array, list[tuple[float, float]]]:
-    """The photograph made small, and the corners of the square that was found in it."""
-    step = max(1, picture.light.shape[1] // 300)
-    rows, columns = (n // step for n in picture.light.shape)
-    small = picture.light[: rows * step, : columns * step].reshape(rows, step, columns, step).mean((1, 3))
-    target, half = picture.target, picture.target.side_px / 2
-    corners = [(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]
-    return small, [((target.x + i * half) / step, (target.y + j * half) / step) for i, j in corners]
 
 
 def _rendered(

@@ -1,16 +1,14 @@
 """Least squares by SciPy from several starts, and what is told of a solution; silent failures become named errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 
 import numpy as np
+from scipy.optimize import least_squares
+from threadpoolctl import threadpool_limits
 
 from .problems import FitError
 from .result import Array
-
-__all__ = ["best_of", "information_criterion", "inverse", "one_thread"]
 
 _ROUGH = 1e-3
 _LAST = 1e-5
@@ -20,16 +18,13 @@ _ATTEMPTS = 400
 
 def one_thread() -> AbstractContextManager[object]:
     """In which numpy, SciPy and PyTorch compute in one thread: a fit's steps are small, and threads cost more."""
-    import scipy.linalg  # noqa: F401  # only what is loaded can be limited
-    from threadpoolctl import threadpool_limits
-
     return threadpool_limits(limits=1)
 
 
 def best_of(
     model: Callable[[Array], Array],
     data: Array,
-    starts: Sequence[Sequence[float]],
+    starts: Sequence[Sequence[float] | Array],
     bounds: tuple[Sequence[float], Sequence[float]],
     *,
     jacobian: Callable[[Array], Array] | None = None,
@@ -50,8 +45,6 @@ def best_of(
     Raises:
         FitError: of kind "not converged" when no start did.
     """
-    from scipy.optimize import least_squares
-
     low, high = (np.asarray(side, dtype=np.float64) for side in bounds)
     # keep starts off the bounds, where the trust region cannot move
     margin = np.where(np.isfinite(high - low), 1e-6 * (high - low), 1e-9)

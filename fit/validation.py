@@ -1,7 +1,5 @@
 """Arguments as the fits need them, or a refusal that says what was expected and what came."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,8 +10,6 @@ from torchdof.validation import number, show, whole
 
 from .problems import FitError
 from .result import Array
-
-__all__ = ["a_choice", "a_count", "a_number", "a_picture"]
 
 _BRIGHTEST, _DARKEST = 1e30, 1e-30  # squares of levels, and their squares, are summed
 

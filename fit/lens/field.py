@@ -1,7 +1,5 @@
 """A lens's spots across the field: traced at distances from the axis and in depth, gathered in boxes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 
@@ -13,8 +11,6 @@ from torchdof.optics.field import Field
 from ..result import Array
 from .lens import Lens
 from .spot import Reference, point_spread
-
-__all__ = ["chief_ray_mm", "coc_nodes", "field_height_mm", "spot_of_place", "trace_field"]
 
 _CELLS = (128, 64)  # of half a spot, along and across
 _GROWING = 1.5  # power of the number of a node that its coc grows with
@@ -71,10 +67,8 @@ def _gathered(u: Array, v: Array, weight: Array) -> Array:
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
         share = (1.0 - np.abs(along - row - down)) * (1.0 - np.abs(across - column - right))
         # half a spot: what lies beside its axis, in column -1, is mirrored
-        place = np.clip(row + down, 0, rows - 1) * columns + np.clip(
-            np.abs(column + right + 0.5) - 0.5, 0, columns - 1
-        ).astype(int)
-        cells += np.bincount(place, weight * share, cells.size)
+        mirrored = np.clip(np.abs(column + right + 0.5) - 0.5, 0, columns - 1).astype(int)
+        cells += np.bincount(np.clip(row + down, 0, rows - 1) * columns + mirrored, weight * share, cells.size)
     return cells.reshape(rows, columns)
 
 

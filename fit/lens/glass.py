@@ -19,8 +19,6 @@ import numpy as np
 
 from torchdof.validation import number, show
 
-__all__ = ["AIR", "C_UM", "D_UM", "F_UM", "G_UM", "Glass", "catalogue"]
-
 D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
 _LARGEST = 1e100  # coefficient, whose products are numbers too
 _CATALOGUE = Path(__file__).parent / "glasses" / "schott.txt"

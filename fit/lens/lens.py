@@ -20,8 +20,6 @@ from . import prescription, zmx
 from .glass import AIR, C_UM, D_UM, F_UM
 from .surface import Surface
 
-__all__ = ["RGB_UM", "Lens", "Paraxial"]
-
 RGB_UM = (C_UM, 0.54607, F_UM)
 """Wavelengths that stand for red, green and blue, in micrometres: the lines C, e and F."""
 

@@ -9,26 +9,23 @@ outermost ray. So the fit is a convex problem without branches to jump between, 
 against spots at the nodes *and between them*, where the table will interpolate.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import least_squares, nnls
+from scipy.optimize import nnls
 from scipy.special import j0, j1
 
 from torchdof.optics.psf import FAMILIES, LENGTHS, profile
 
 from ..result import Array
+from ..solve import best_of
 from .spot import Spot
-
-__all__ = ["NodeEquations", "Tracer", "fit_radial", "fit_shapes", "place_nodes"]
 
 _FINEST = 3.0  # cycles a pixel; kernels are sampled on the pixel grid, so frequencies beyond it fold back
 _BETWEEN = (0.25, 0.5, 0.75)  # where between two nodes spots are traced for the joint fit
@@ -40,11 +37,10 @@ _CONTRAST = 0.22  # standard deviation of natural images over their peak
 # of named shapes: where parameters may lie, lengths relative to the outermost ray; the profile's samples, up to so many
 # times that ray; the weight of staying like the neighbour, so that parameters that hardly matter do not jump
 _RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
-_STEPS, _REACH, _KEEP, _TRIES = 400, 2.0, 1e-3, 100
+_STEPS, _REACH, _KEEP = 400, 2.0, 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class NodeEquations:
+class NodeEquations(NamedTuple):
     """A traced spot as a quadratic form: values v miss it, squared, by ``v @ gram @ v - 2 pull @ v + constant``."""
 
     radius: float
@@ -152,11 +148,8 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
     spots: list[list[tuple[NodeEquations, float, int]]] = [[(node, 1.0, i)] for i, node in enumerate(nodes)]
     for i, (left, right) in enumerate(pairwise(zip(places, nodes, strict=True))):
         for share in _BETWEEN:
-            coc, radius = (
-                (1 - share) * left[0] + share * right[0],
-                (1 - share) * left[1].radius + share * right[1].radius,
-            )
-            equations = tracer.equations(coc, radius)
+            coc = (1 - share) * left[0] + share * right[0]
+            equations = tracer.equations(coc, (1 - share) * left[1].radius + share * right[1].radius)
             spots[i].append((equations, 1 - share, i + 1))
             spots[i + 1].append((equations, share, i))
     for order in (_to_focus(places), _to_focus(places)[::-1]) * (_SWEEPS // 2):
@@ -171,15 +164,12 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
 def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
     """A named shape at each node, each started from its neighbour, from both ends to the focus."""
     names = FAMILIES[family]
-    params, residual = np.zeros((len(names), len(places))), np.zeros(len(places))
-    before = None
+    params, residual, before = np.zeros((len(names), len(places))), np.zeros(len(places)), None
     for i in _to_focus(places):
         r, light, transfer = tracer.traced(places[i])
         outermost, rms = float(r.max()), math.sqrt(float(light @ (r * r)))
-        if i == len(places) - 1:  # the other side begins
-            before = None
-        frequency = tracer.frequency * outermost
-        before, error = _fit_shape(family, frequency, tracer.weight, transfer, rms / outermost, before)
+        before = None if i == len(places) - 1 else before  # there the other side begins
+        before, error = _fit_shape(family, tracer, outermost, transfer, rms / outermost, before)
         params[:, i] = before * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
         residual[i] = tracer.relative(error)
     return dict(zip(names, params, strict=True)), residual
@@ -192,26 +182,22 @@ def _to_focus(places: Sequence[float]) -> list[int]:
 
 
 def _fit_shape(
-    family: str, frequency: Array, weight: Array, spot_transfer: Array, rms: float, before: Array | None
+    family: str, tracer: Tracer, outermost: float, spot_transfer: Array, rms: float, before: Array | None
 ) -> tuple[Array, float]:
     """Parameters of a shape whose transfer function is nearest to a spot's, and the weighted squared error.
 
-    Lengths, and 1 / frequency, are relative to the spot's outermost ray. A neighbour's parameters are a start and a
-    weak pull.
+    Lengths are relative to the spot's outermost ray. A neighbour's parameters are a start and a weak pull.
     """
-    names = FAMILIES[family]
+    names, weight, frequency = FAMILIES[family], tracer.weight, tracer.frequency * outermost
     low, high = np.array([_RANGES[name] for name in names]).T
     if family == "softm":  # a small radius with a wide edge and a large tilt would be a second branch
         low[0] = 0.5
     sigma = {"gaussian": 0.5**0.5, "ring": 0.5}.get(family, 0.05) * rms
     geometry = {"radius": 2.0**0.5 * rms, "sigma": sigma, "r_c": 0.7 * rms, "b": 0.0, "m": 2.0}
-    starts = [np.array([geometry[name] for name in names])]
-    if before is not None:
-        starts.insert(0, before)
     r = (np.arange(_STEPS) + 0.5) * (_REACH / _STEPS)
     waves = j0(2.0 * np.pi * np.outer(frequency, r))
 
-    def misfit(values: Array) -> Array:
+    def seen(values: Array) -> Array:
         params = dict(zip(names, values, strict=True))
         if family == "gaussian":
             transfer = np.exp(-2.0 * (np.pi * params["sigma"] * frequency) ** 2)
@@ -221,13 +207,15 @@ def _fit_shape(
         else:
             light = profile(family, torch.from_numpy(r), params).numpy() * r
             transfer = waves @ (light / light.sum())
-        return np.asarray(weight * (transfer - spot_transfer))
+        return np.asarray(weight * transfer)
 
-    def pulled(values: Array) -> Array:
-        return misfit(values) if before is None else np.concatenate([misfit(values), _KEEP * (values - before)])
-
-    margin = 1e-6 * (high - low)
-    inside = [np.clip(start, low + margin, high - margin) for start in starts]
-    fits = [least_squares(pulled, start, bounds=(low, high), max_nfev=_TRIES) for start in inside]
-    best = min(fits, key=lambda fit: fit.cost).x
-    return best, float((misfit(best) ** 2).sum())
+    start, keep = np.array([geometry[name] for name in names]), 0.0 if before is None else _KEEP
+    near = start if before is None else before
+    best = best_of(
+        lambda values: np.concatenate([seen(values), keep * values]),
+        np.concatenate([weight * spot_transfer, keep * near]),
+        [near, start] if keep else [start],
+        (low, high),
+        tolerance=1e-8,
+    )
+    return best, float(((seen(best) - weight * spot_transfer) ** 2).sum())

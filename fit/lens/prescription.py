@@ -17,15 +17,11 @@ of an index there may be the name of a glass: one of SCHOTT's (``N-BK7``), or on
 coefficients of Sellmeier's formula, ``glass NAME B1 B2 B3 C1 C2 C3``. ``#`` starts a comment; ``# source:`` is kept.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
 from .glass import AIR, Glass, catalogue
 from .surface import Surface
-
-__all__ = ["parse", "lines"]
 
 _COLUMNS = "radius thickness index diameter"
 _MOST_SURFACES = 1000

@@ -1,15 +1,11 @@
 """Real rays through a lens: where they cross each surface, and Snell's law there."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 
 from ..result import Array, Mask
 from .lens import Lens
-
-__all__ = ["Rays", "trace_rays"]
 
 _CHUNK = 1 << 14  # rays that stay in the processor's cache on their way through the lens
 _SLACK_MM = 1e-9  # by which rounding may put a surface behind the one before it

@@ -12,21 +12,18 @@ The focus distance and the object distances of one call always share the referen
 the four are up to 7 cm apart, and the blur of an object at 1 m differs by 10 % between them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
-from torchdof.validation import number, show, whole
+from torchdof.validation import number, whole
 
 from ..result import Array
+from ..validation import a_choice
 from .lens import Lens
 from .rays import Rays, trace_rays
-
-__all__ = ["Focus", "Reference", "Spot", "focus_sensor", "one_of", "point_spread", "vertex_distance_mm"]
 
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
@@ -106,7 +103,7 @@ def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Re
         >>> round(focus_sensor(lens, float("inf"), kind="paraxial"), 4)
         36.1059
     """
-    one_of("focus", kind, get_args(Focus))
+    a_choice("focus", kind, get_args(Focus))
     first = lens.paraxial()
     sensor = first.back_focal
     for _ in range(100 if reference == "sensor" else 1):
@@ -175,7 +172,7 @@ def point_spread(
 
 def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: float) -> float:
     """Distance of an object in front of the first vertex, in mm."""
-    one_of("reference", reference, get_args(Reference))
+    a_choice("reference", reference, get_args(Reference))
     first = lens.paraxial()
     places = first.front_principal, first.entrance_pupil, 0.0, float(lens.vertices[-1]) + sensor_mm
     behind_vertex = dict(zip(get_args(Reference), places, strict=True))[reference]
@@ -187,12 +184,6 @@ def vertex_distance_mm(lens: Lens, z_m: float, reference: Reference, sensor_mm: 
             f"{reference}, got {z_m} m"
         )
     return 1000.0 * z_m - behind_vertex
-
-
-def one_of(name: str, value: Any, known: tuple[str, ...]) -> None:
-    """Refuse what is none of some words."""
-    if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{name} must be one of {', '.join(known)}, got {show(value)}")
 
 
 def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:

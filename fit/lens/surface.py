@@ -20,8 +20,6 @@ from torchdof.validation import show
 from ..result import Array, Mask
 from .glass import Glass
 
-__all__ = ["Surface"]
-
 _SMALLEST_MM, _LARGEST_MM, _MOST_CONIC, _DEEPEST_MM = 1e-3, 1e7, 1e6, 1e15  # beyond, sums of lengths overflow
 _STEPS = 50  # of Newton's method; four do for most aspheres
 _CLOSE_MM = 1e-10

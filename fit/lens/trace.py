@@ -1,7 +1,5 @@
 """A lens prescription to a blur table: spots traced at many distances, kernels fitted to them, smooth over depth."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from collections.abc import Sequence
@@ -17,12 +15,11 @@ from torchdof.validation import number, show, whole
 
 from ..result import Array
 from ..solve import one_thread
+from ..validation import a_choice
 from .field import coc_nodes, trace_field
 from .lens import Lens
 from .nodes import Tracer, fit_radial, fit_shapes, place_nodes
-from .spot import Focus, Reference, Spot, focus_sensor, one_of, point_spread
-
-__all__ = ["signed_coc_mm", "trace_table"]
+from .spot import Focus, Reference, Spot, focus_sensor, point_spread
 
 
 def trace_table(
@@ -104,8 +101,7 @@ def trace_table(
         nearest_m = focus_m / 3.0 if math.isfinite(focus_m) else 0.025 * focal
     if not 0 < number("nearest_m", nearest_m, unit="metres") < focus_m:
         raise ValueError(f"nearest_m must be nearer than the focus at {focus_m} m, got {nearest_m}")
-    if rays is None:
-        rays = 50_000 if field_mm else 2_000
+    rays = (50_000 if field_mm else 2_000) if rays is None else rays
     near, far = (signed_coc_mm(z, focal, f_number, focus_m) for z in (nearest_m, math.inf))
 
     def distance(coc: float) -> float:
@@ -164,17 +160,17 @@ def _check(given: dict[str, Any]) -> None:
     lens, focus_m, wavelengths, field = (given[key] for key in ("lens", "focus_m", "wavelengths_um", "field"))
     if not isinstance(lens, Lens):
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
-    one_of("family", given["family"], tuple(FAMILIES))
+    a_choice("family", given["family"], tuple(FAMILIES))
     number("focus_m", focus_m, 0, unit="metres", infinite=True)
     number("field_mm", given["field_mm"], -1e6, 1e6)
     number("sensor_width_mm", given["sensor_width_mm"], 0, 1e9)
     number("width_px", given["width_px"], 0, 1e9, unit="pixels")
-    if given["nodes"] is not None:
-        whole("nodes", given["nodes"], 5 if math.isfinite(focus_m) else 3, 1000)
-    whole("points", given["points"], 3, 1000)
-    whole("field_nodes", given["field_nodes"], 2, 100)
-    whole("field_rays", given["field_rays"], 1000, 10**7)
-    if given["name"] is not None and not isinstance(given["name"], str):
+    least_nodes = 5 if math.isfinite(focus_m) else 3
+    counts = ("nodes", least_nodes, 1000), ("points", 3, 1000), ("field_nodes", 2, 100), ("field_rays", 1000, 10**7)
+    for name, least, most in counts:
+        if name != "nodes" or given[name] is not None:
+            whole(name, given[name], least, most)
+    if not isinstance(given["name"], str | None):
         raise ValueError(f"name must be a text, got {show(given['name'])}")
     if wavelengths is not None:
         if not isinstance(wavelengths, list | tuple) or not wavelengths:

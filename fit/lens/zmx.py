@@ -6,15 +6,11 @@ air other than the stop are left out. Glasses are SCHOTT's by name, or else have
 gives them. Mirrors, tilts, other kinds of surfaces and apertures, and several configurations are refused by name.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 from .glass import AIR, Glass, catalogue
 from .surface import Surface
-
-__all__ = ["parse"]
 
 _UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
 _APERTURES = {"SQAP", "ELAP", "OBSC", "SQOB", "ELOB", "SPID", "UDAD", "UDOB"}

@@ -1,7 +1,5 @@
 """The dots of a grid to one table whose blur depends on the place in the frame."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -17,8 +15,6 @@ from ..problems import FitError
 from ..result import Array
 from .captures import Captures
 from .table import TableFit
-
-__all__ = ["field_of_dots", "table_of_dots"]
 
 _CELLS = (96, 48)  # of half a spot, along and across
 _FINE = 64  # pixels of the picture of a dot's kernel on each side of its middle

@@ -5,8 +5,6 @@ that was measured. Any number that was misread makes the two differ, and how the
 And a table that was measured at one focus and f-number reaches only so far.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from itertools import combinations
@@ -22,8 +20,6 @@ from ..problems import FitError, warn
 from ..result import Array, Mask
 from ..validation import a_number
 from .captures import CAMERA, Captures
-
-__all__ = ["check_agreement", "check_reach"]
 
 _TELLING_PX = 2.0  # smaller blurs are the lens's aberrations as much as its defocus
 _WARNED, _REFUSED = math.log(1.15), math.log(1.35)  # a thick lens close by differs by a tenth; one stop is 1.41

@@ -1,7 +1,5 @@
 """Pictures of a dot, in focus and at other distances, and the camera that took them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,8 +13,6 @@ from torchdof.validation import show
 from ..problems import FitError
 from ..result import Array
 from ..validation import a_number
-
-__all__ = ["CAMERA", "RANGES", "Capture", "Captures", "check_distances"]
 
 RANGES = {  # beyond any camera's
     "focus_m": (1e-5, 1e6),

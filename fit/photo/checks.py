@@ -1,9 +1,8 @@
 """What makes a capture or its fit less than it looks: levels, focus, residual, roundness, window, bounds."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 
 from torchdof.io.transfer import decode, encode
 
@@ -14,8 +13,6 @@ from .dot import Dot, inner_pixels
 from .forward import Forward, Solution
 from .noise import fine_variance, independent_share, noise_of, rounding_of
 from .source import UNFOCUSED_PX, Edge, soft_edge
-
-__all__ = ["EXPLAINED", "FAR_ABOVE", "check_fit", "check_focus", "check_levels", "check_linearity"]
 
 EXPLAINED = 1.15
 """Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
@@ -161,7 +158,11 @@ def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None,
     """
     if not fit.gain > 0:
         raise FitError("the blurred picture has nothing in common with the sharp one", file=file, number=fit.gain)
-    outside = _outside(pair, solution)
+    # of what the kernel, as wide as the window, holds of the light
+    source = pair.moved_source(solution.moves)
+    total = float(source[0, 0].real)
+    held = float(pair.convolve(source, pair.kernel(solution)[None], whole=True)[0].sum())
+    outside = 1 - held / total if total > 0 else 1.0
     size = f"{pair.data.shape[1]}x{pair.data.shape[0]} px"
     if outside > _OUTSIDE_REFUSED:
         text = f"the window cuts the blur: {100 * outside:.0f} % of its light falls outside {size}; cut a larger one"
@@ -189,14 +190,6 @@ def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None,
         _check_parameters(pair, solution, file)
 
 
-def _outside(pair: Forward, solution: Solution) -> float:
-    """Share of the blur's light that falls outside the window, of what its kernel, as wide as the window, holds."""
-    source = pair.moved_source(solution.moves)
-    inside = float(pair.convolve(source, pair.kernel(solution)[None], whole=True)[0].sum())
-    total = float(source[0, 0].real)
-    return 1 - inside / total if total > 0 else 1.0
-
-
 def _check_residual(fit: BlurFit, freest: BlurFit, file: str | None) -> None:
     """Warn about a residual far above the noise: that of the freest fit, and what a cheaper family adds to it."""
     ratio = freest.residual_over_noise
@@ -221,8 +214,6 @@ def _check_residual(fit: BlurFit, freest: BlurFit, file: str | None) -> None:
 
 def _check_spots(pair: Forward, solution: Solution, file: str | None) -> None:
     """Warn about light beyond the dot's blur, which no family has: too little of it shows in the residual."""
-    from scipy.ndimage import gaussian_filter
-
     beyond = (pair.distance > pair.dot.reach + 4) & pair.used
     if not beyond.any():
         return

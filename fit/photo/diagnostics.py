@@ -1,27 +1,13 @@
 """A solution of the forward model judged: what it leaves, how large its blur is, how likely it is; as a `BlurFit`."""
 
-from __future__ import annotations
-
 import numpy as np
+from scipy.special import chdtrc
 
 from ..result import Array, BlurFit
 from ..solve import information_criterion
 from .forward import OPENINGS, SHAPES, Forward, Solution, without_level
 from .noise import fine_variance, independent_share, noise_of
 from .radial import size_of_profile
-
-__all__ = [
-    "CHANCE",
-    "UNEVEN",
-    "asymmetry_of",
-    "bic_of",
-    "describe",
-    "left_open",
-    "noise_near",
-    "rms_left",
-    "size_of_blur",
-    "unexplained",
-]
 
 UNEVEN = 0.02
 """Share of a blur's light that depends on the angle, from which on it is said not to be round."""
@@ -77,8 +63,6 @@ def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
     Returns:
         Norm of what depends on the angle, without noise's own share, over the norm of the light; and the chance.
     """
-    from scipy.stats import chi2
-
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
     rows, columns = pair.pixels
     reach = max(pair.dot.reach, 2.0)
@@ -93,7 +77,7 @@ def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
     left, values, _ = np.linalg.svd(basis, full_matrices=False)
     left = left[:, values > 1e-6 * values.max()]
     found, spread = unexplained(pair, solution, left)
-    chance = float(chi2.sf(found @ np.linalg.solve(spread, found), found.size)) if np.trace(spread) > 0 else 0.0
+    chance = float(chdtrc(found.size, found @ np.linalg.solve(spread, found))) if np.trace(spread) > 0 else 0.0
     light = float(np.sum((pair.data[near] - solution.background) ** 2))
     share = np.sqrt(max(float(found @ found) - float(np.trace(spread)), 0.0) / light) if light > 0 else np.inf
     return float(share), chance
@@ -113,8 +97,13 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     index = [solution.names.index(n) for n in shape]
     covariance = solution.covariance[np.ix_(index, index)]
     if np.isfinite(np.diag(covariance)).all():
-        variance = max(float(slope @ covariance @ slope), 0.0)
-        return rms, float(np.sqrt(variance + _error_of_moment(pair, solution, rms) ** 2))
+        variance, of_moment = max(float(slope @ covariance @ slope), 0.0), 0.0
+        if solution.family == "image":  # its shape is free: only the picture's second moment fixes its size
+            squared, light = pair.distance[pair.lit] ** 2, pair.data[pair.lit] - solution.background
+            away = squared - float(light @ squared / light.sum())
+            noise = noise_near(pair, solution) / np.sqrt(independent_share(pair.noise_correlation))
+            of_moment = float(noise * np.linalg.norm(away) / abs(light.sum()) / (2 * max(rms, 1e-9)))
+        return rms, float(np.sqrt(variance + of_moment**2))
     # parameters trade with each other without limit; their size may be known all the same
     _, values, right = np.linalg.svd(solution.slopes[:, index], full_matrices=False)
     seen = values > 1e-6 * values.max()
@@ -122,17 +111,6 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     if not seen.any() or np.abs(along[~seen]).sum() > 0.1 * np.abs(along).sum():
         return rms, np.inf
     return rms, float(np.sqrt(solution.squares / pair.values.size) * np.linalg.norm(along[seen] / values[seen]))
-
-
-def _error_of_moment(pair: Forward, solution: Solution, rms: float) -> float:
-    """What noise does to the rms radius of a kernel whose shape is free: only the picture's second moment fixes it."""
-    if solution.family != "image":
-        return 0.0
-    squared = pair.distance[pair.lit] ** 2
-    light = pair.data[pair.lit] - solution.background
-    away = squared - float(light @ squared / light.sum())
-    noise = noise_near(pair, solution) / np.sqrt(independent_share(pair.noise_correlation))
-    return float(noise * np.linalg.norm(away) / abs(light.sum()) / (2 * max(rms, 1e-9)))
 
 
 def bic_of(pair: Forward, solution: Solution) -> float:

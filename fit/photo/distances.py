@@ -1,7 +1,5 @@
 """The distances of one capture, fitted so that each informs its neighbours, and its colours one by one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +17,6 @@ from .dot import find_dot
 from .opening import common_opening, turned
 from .pair import fit_pair
 from .source import soft_edge
-
-__all__ = ["Colour", "counted", "fit_colours", "fit_distances", "fit_one", "fit_openings"]
 
 _KNOTS = 33  # values of a free profile, the same at all distances
 _SWEEPS = 2

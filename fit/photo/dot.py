@@ -1,26 +1,15 @@
 """The dot in a picture: where it is, how large, on what background, in how much noise, and which pixels are clipped."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
+from scipy.ndimage import uniform_filter
 
 from ..problems import FitError, warn
 from ..result import Array, Mask
 from ..validation import a_picture
 from .noise import fine_variance, noise_of
-
-__all__ = [
-    "Dot",
-    "check_blacks",
-    "distance_from",
-    "find_dot",
-    "find_dots",
-    "fine_share_inside",
-    "inner_pixels",
-    "used_pixels",
-]
 
 _THRESHOLD = 0.15  # of the peak: low enough to keep an uneven ring in one piece
 _SMALLEST_PX = 9
@@ -73,8 +62,6 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
         FitError: of kind "no dot" where nothing stands out from the noise; of kind "window" where the brightest dot
             touches the edge of the picture.
     """
-    from scipy import ndimage
-
     height, width = a_picture("a picture of a dot", picture, _SMALLEST_PX, file).shape
     noise = noise_of(picture)
     frame = max(1, min(height, width) // 20)
@@ -174,8 +161,6 @@ def used_pixels(
     With `refuse` it warns of pixels that are left out, and raises a `FitError`, both of kind "saturated", where too
     little of the dot is left. `white` None looks for a plateau.
     """
-    from scipy.ndimage import uniform_filter
-
     level = white if white is not None else _plateau(picture, dot)
     clipped = picture >= (np.inf if level is None else level * (1 - 1e-6))
     count = int(clipped.sum())

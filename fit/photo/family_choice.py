@@ -1,7 +1,5 @@
 """Which family a blur needs: the cheapest whose picture a viewer could not tell from the exact one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,8 +8,6 @@ from numpy.typing import ArrayLike
 from ..problems import FitError
 from ..result import Array
 from ..validation import a_picture
-
-__all__ = ["COST", "choose", "highlight_psnr", "looks_alike", "natural_psnr"]
 
 COST = ("gaussian", "disc", "ring", "softm", "radial")
 """Families by growing number of parameters."""
@@ -115,7 +111,7 @@ def choose(
     natural = {f: natural_psnr(kernels[f], kernels[likeliest]) for f in kernels}
     look = {f: highlight_psnr(kernels[f], kernels[likeliest]) for f in kernels}
     wanted = f"{accuracy_db:g} dB on a natural image and {accuracy_db - _LOOK_BELOW:g} dB on a highlight"
-    enough = [f for f in kernels if looks_alike(kernels[f], kernels[likeliest], accuracy_db)]
+    enough = [f for f in kernels if natural[f] >= accuracy_db and look[f] >= accuracy_db - _LOOK_BELOW]
     family = min([*enough, likeliest], key=COST.index)
     others = ", ".join(
         f"{f} {natural[f]:.1f} and {look[f]:.1f} dB, BIC {bic[f] - bic[likeliest]:+.0f}"

@@ -5,14 +5,13 @@ not bias the kernel. Gain and background enter linearly and are solved inside (v
 parameters, the displacement and the magnification are searched.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.fft import irfft2, next_fast_len, rfft2
 
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.psf import FAMILIES, LENGTHS, pixel_kernels, support
@@ -22,8 +21,6 @@ from ..solve import best_of, inverse
 from .dot import Dot, distance_from
 from .noise import correlate, correlation_of, noise_beside, noise_of
 from .source import Source
-
-__all__ = ["ALL_MOVES", "OPENINGS", "SHAPES", "Forward", "Solution", "without_level"]
 
 ALL_MOVES = ("dx", "dy", "magnification")
 OPENINGS = {"polygon": ("radius", "rotation_deg", "curvature"), "image": ("radius",)}
@@ -78,8 +75,6 @@ class Forward:
 
     def __post_init__(self) -> None:
         """Prepare what is the same for all families."""
-        from scipy.fft import next_fast_len
-
         self.pixels = np.indices(self.data.shape).astype(np.float64)  # rows and columns [2, H, W]
         self.half = min(self.data.shape) // 2  # of the window, px: the widest kernel
         self.grid = tuple(next_fast_len(n + self.half + 1, real=True) for n in self.data.shape)  # of Fourier transforms
@@ -99,7 +94,7 @@ class Forward:
 
     def moved_source(self, moves: Mapping[str, float]) -> Array:
         """The source displaced and magnified, Fourier transformed on the padded grid."""
-        return self._transformed(self._drawn(moves))
+        return rfft2(self._drawn(moves), self.grid)
 
     def _drawn(self, moves: Mapping[str, float]) -> Array:
         rows, columns = self.pixels[(slice(None), *self.box)]
@@ -108,29 +103,20 @@ class Forward:
         picture[self.box] = self.source.draw(rows, columns, x, y, moves["magnification"])
         return picture
 
-    def _transformed(self, pictures: Array) -> Array:
-        from scipy.fft import rfft2
-
-        return rfft2(pictures, self.grid)
-
     def convolve(self, source: Array, kernels: Array, whole: bool = False) -> Array:
         """Transformed source `[h, w]` (or `[n, h, w]`) with kernels `[n, k, k]`: `[n, pixels used]`, or all pixels."""
-        from scipy.fft import irfft2
-
         size = kernels.shape[-1]
         padded = np.zeros((*kernels.shape[:-2], *self.grid))
         padded[..., :size, :size] = kernels
         # the kernel's centre goes to pixel (0, 0) of the cyclic grid
         wrapped = np.roll(padded, (-(size // 2), -(size // 2)), (-2, -1))
-        blurred = irfft2(source * self._transformed(wrapped), self.grid)
+        blurred = irfft2(source * rfft2(wrapped, self.grid), self.grid)
         flat = blurred[..., : self.data.shape[0], : self.data.shape[1]].reshape(*blurred.shape[:-2], -1)
         return np.asarray(flat if whole else flat[..., self.flat])
 
     def correlate(self, source: Array, picture: Array, size: int) -> Array:
         """The adjoint of `convolve` for one kernel `[size, size]`: what the used pixels say of each of its pixels."""
-        from scipy.fft import irfft2
-
-        spread = irfft2(np.conj(source) * self._transformed(self.picture(picture, 0.0)), self.grid)
+        spread = irfft2(np.conj(source) * rfft2(self.picture(picture, 0.0), self.grid), self.grid)
         return np.asarray(np.roll(spread, (size // 2, size // 2), (0, 1))[:size, :size])
 
     def picture(self, values: Array, elsewhere: float) -> Array:
@@ -239,7 +225,7 @@ class Forward:
         own = max(variance - through * float(np.sum(kernel**2)), 0.1 * variance)
         meat = own * (slopes.T @ self.together(slopes, correlation) + (penalty if of_prior else 0.0))
         if through > 0:  # by (K' J)' (K' J) over the pixels of the source that carry noise
-            pictures = self._transformed(self.picture(slopes.T, 0.0))
+            pictures = rfft2(self.picture(slopes.T, 0.0), self.grid)
             carrying = (self.distance <= self.source.reach * self.magnification).ravel()
             spread = np.where(carrying, self.convolve(pictures, kernel[None], whole=True), 0.0)
             alike = correlate(spread.reshape(-1, *self.data.shape), self.noise_correlation)
@@ -292,7 +278,7 @@ class Forward:
         for n in names:
             moved = self.moves(params)
             moved[n] += _STEP[n]
-            change = self._transformed((self._drawn(moved) - unmoved) / _STEP[n])
+            change = rfft2((self._drawn(moved) - unmoved) / _STEP[n], self.grid)
             columns.append(self.convolve(change, kernel[None])[0])
         return columns
 

@@ -1,7 +1,5 @@
 """A whole picture as the camera took it, in linear light, and the windows around its dots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import convolve
 
 from torchdof.io.images import read_image
 from torchdof.io.metadata import camera_facts
@@ -18,8 +17,6 @@ from ..problems import FitError
 from ..result import Array
 from .captures import Capture
 from .dot import Dot, find_dot, find_dots
-
-__all__ = ["PATTERNS", "Dots", "Frame", "cut_pairs", "demosaiced", "read_frame", "size_of"]
 
 Dots = Literal["one", "centre", "each", "field"]
 
@@ -106,8 +103,6 @@ def demosaiced(mosaic: Array, pattern: str) -> Array:
 
     It is linear, alike in the sharp and the blurred picture, and adds no colour that is not there: all that a fit asks.
     """
-    from scipy.ndimage import convolve
-
     colours = []
     for colour, kernel in (("R", _SQUARE), ("G", _CROSS), ("B", _SQUARE)):
         sampled = np.zeros_like(mosaic)

@@ -1,7 +1,5 @@
 """A folder of photographs of a dot, described by its `capture.toml`: read, and cut into windows around the dot."""
 
-from __future__ import annotations
-
 import math
 import os
 import tomllib
@@ -27,10 +25,7 @@ _CHOICES: Mapping[str, tuple[str, ...]] = {
     "colours": get_args(Colours),
     "bayer": PATTERNS,
 }
-_FIELDS = (
-    *("shot", "crop", "focus_m", "exposure_s", "full_width_px", *CAMERA, "sharp", "dark", "name"),
-    *_CHOICES,
-)
+_FIELDS = (*("shot", "crop", "focus_m", "exposure_s", "full_width_px", *CAMERA, "sharp", "dark", "name"), *_CHOICES)
 _OF_A_SHOT = ("file", "distance_m", "exposure_s")
 _NEEDED = ("focus_m", "sharp", "file", "distance_m")
 

@@ -4,22 +4,11 @@ Demosaicing, denoising and JPEG make noise smooth. It then averages out more slo
 second differences, which see only what changes from pixel to pixel, take it for less than it is.
 """
 
-from __future__ import annotations
-
 import numpy as np
+from scipy.ndimage import convolve
+from scipy.signal import correlate as correlated
 
 from ..result import Array, Mask
-
-__all__ = [
-    "LAGS",
-    "correlate",
-    "correlation_of",
-    "fine_variance",
-    "independent_share",
-    "noise_beside",
-    "noise_of",
-    "rounding_of",
-]
 
 LAGS = 6
 """Pixels up to which noise may go together; demosaicing reaches 2, a JPEG's blocks 7."""
@@ -72,8 +61,6 @@ def correlation_of(values: Array, used: Mask) -> Array:
     It is `[2 LAGS + 1, 2 LAGS + 1]`, 1 in the middle; 0 at lags where chance would explain what there is. Its spectrum
     is nowhere negative.
     """
-    from scipy.signal import correlate as correlated
-
     size = 2 * LAGS + 1
     white = np.zeros((size, size))
     white[LAGS, LAGS] = 1.0
@@ -100,8 +87,6 @@ def correlation_of(values: Array, used: Mask) -> Array:
 
 def correlate(pictures: Array, correlation: Array) -> Array:
     """Pictures `[n, H, W]` convolved with a correlation: its product with each, as a matrix over the pixels."""
-    from scipy.ndimage import convolve
-
     if np.count_nonzero(correlation) == 1:
         return pictures
     reach = int(np.abs(np.argwhere(correlation) - LAGS).max())

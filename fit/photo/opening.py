@@ -6,14 +6,13 @@ estimate has next to none (it would be noise that could not be negative). The sm
 that were kept back are foretold best.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.ndimage import binary_dilation, center_of_mass, gaussian_filter, laplace, map_coordinates
 
 from torchdof.optics.aperture import Aperture
 
@@ -21,8 +20,6 @@ from ..result import Array, BlurFit, Mask
 from .diagnostics import CHANCE, UNEVEN, asymmetry_of, bic_of, noise_near, rms_left, size_of_blur, unexplained
 from .forward import Forward, Solution
 from .noise import independent_share
-
-__all__ = ["common_opening", "solve_image", "solve_opening", "solve_polygon", "turned"]
 
 _BLADES = range(3, 10)
 _SHOWN = 25.0  # chi squared of a polygon's harmonic, of two degrees of freedom, from which on it is tried
@@ -78,7 +75,14 @@ def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
 
 def solve_image(pair: Forward, before: Solution, kernel: Array | None = None) -> tuple[Forward, Solution]:
     """The opening as a picture, of a kernel if that is known; the moves begin from those of a solution before."""
-    opening, half = _opening_of_kernel(_deconvolved(pair, before)[0] if kernel is None else kernel)
+    kernel = _deconvolved(pair, before)[0] if kernel is None else kernel
+    y, x = center_of_mass(kernel)
+    rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
+    half = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0  # of the opening's square, px
+    side = int(min(_MOST_SIDE, round(2 * half * _FINEST)))
+    places = ((np.arange(side) + 0.5) / side * 2 - 1) * half
+    fine = map_coordinates(kernel, np.meshgrid(places + y, places + x, indexing="ij"), order=3, mode="constant")
+    opening = Aperture(mask=torch.from_numpy(np.maximum(fine, 0.0)))
     return _solved(pair, before, opening, "image", {"radius": half})
 
 
@@ -120,20 +124,6 @@ def _harmonic(pair: Forward, round_one: Solution) -> tuple[int, float, float]:
     return _BLADES[best], scores[best], angles[best]
 
 
-def _opening_of_kernel(kernel: Array) -> tuple[Aperture, float]:
-    """A kernel `[k, k]` as an opening, its centre of mass in the middle, and half the side of its square in px."""
-    from scipy.ndimage import center_of_mass, map_coordinates
-
-    y, x = center_of_mass(kernel)
-    rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
-    half = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0
-    side = int(min(_MOST_SIDE, round(2 * half * _FINEST)))
-    places = ((np.arange(side) + 0.5) / side * 2 - 1) * half
-    where = np.meshgrid(places + y, places + x, indexing="ij")
-    fine = map_coordinates(kernel, where, order=3, mode="constant")
-    return Aperture(mask=torch.from_numpy(np.maximum(fine, 0.0))), half
-
-
 def turned(opening: Aperture) -> Aperture:
     """The same opening turned by half: as it shows on the other side of the focus plane."""
     if opening.mask is not None:
@@ -146,8 +136,6 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
 
     The fits are all "polygon", or all "image"; nearer than the focus an opening shows turned by half.
     """
-    from scipy.ndimage import map_coordinates
-
     found = [f.aperture if not near else turned(f.aperture) for f, near in zip(fits, nearer, strict=True) if f.aperture]
     weight = np.array([f.radius**2 for f in fits])
     if found[0].mask is None:
@@ -175,8 +163,6 @@ def _deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
         The kernel `[k, k]`, k odd, not negative, summing to 1; and twice the log likelihood of pixels that were kept
         back, over that of the solution it began from.
     """
-    from scipy.ndimage import binary_dilation, gaussian_filter
-
     source = pair.moved_source(shape.moves)
     half = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1)
     # a fifth of the pixels is kept back; the smoothing under which they are foretold best is taken
@@ -208,8 +194,6 @@ def _descend(
     Reference:
         Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.
     """
-    from scipy.ndimage import laplace
-
     level = float(pair.values.mean())
     shaped = pair.convolve(source, start[None])[0]
     gain = max(float((shaped - shaped.mean()) @ (pair.values - level)) / float(np.var(shaped) * shaped.size), 1e-12)

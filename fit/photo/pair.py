@@ -1,7 +1,5 @@
 """One pair of pictures, sharp and defocused, to one fitted kernel."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, get_args
@@ -23,11 +21,9 @@ from .family_choice import COST, choose, looks_alike
 from .forward import ALL_MOVES, OPENINGS, SHAPES, Forward, Solution
 from .noise import independent_share
 from .opening import solve_image, solve_opening, solve_polygon
+from .profile_fit import fit_ratio
 from .radial import solve_radial, solve_round
-from .ratio import fit_ratio
 from .source import Edge, ideal_dot, picture_of_dot, point_source, soft_edge
-
-__all__ = ["fit_pair", "prepared_pair"]
 
 Model = Literal["forward", "ratio"]
 SourceKind = Literal["auto", "image", "dot"]
@@ -161,7 +157,11 @@ def fit_pair(
             unheld = replace(pair, fit_moves=ALL_MOVES)
             radius = float(solution.params["radius"]) if free_profile else 0.0
             free = solve_radial(unheld, solution.moves, radius, knots) if free_profile else unheld.solve(family)
-            if _improves(pair, solution, free):
+            # the scale of chi squared: what remains, or the rounding of a spline where there is no noise; and noise
+            # that goes together in neighbours does not average out over them
+            floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
+            gained = (solution.squares - free.squares) / floor * independent_share(pair.noise_correlation)
+            if gained > _SIGNIFICANT:
                 pair.fit_moves, freest, solution = ALL_MOVES, free, free
         why, psnr = "", dict[str, float]()
         if free_profile:
@@ -231,7 +231,13 @@ def prepared_pair(
             "for it"
         )
         warn(text, "saturated", file=files[0], number=float(clipped))
-    ideal = clipped or source == "dot" or (source == "auto" and _explained(edge, magnification))
+    # an ideal dot explains a sharp picture as well as its own pixels would: a spline between the pixels of a hard edge
+    # is itself off by a few thousandths once it is magnified, and so is the sensor's softness, which does not grow
+    unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
+    magnified = edge.softness**2 * abs(1 - magnification**2) > _GROWN
+    close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
+    explained = (close or (magnified and unexplained < _ALMOST)) and edge.radius > 2 * edge.softness
+    ideal = clipped or source == "dot" or (source == "auto" and explained)
     pair = Forward(
         ideal_dot(edge) if ideal else picture_of_dot(still, dot),
         data,
@@ -242,26 +248,6 @@ def prepared_pair(
         fine_share_of_light=fine_share_inside(still, dot),
     )
     return pair, edge, linear
-
-
-def _explained(edge: Edge, magnification: float) -> bool:
-    """Whether an ideal dot explains a sharp picture as well as its own pixels would.
-
-    A spline between the pixels of a hard edge is itself off by a few thousandths once it is magnified, and so is the
-    sensor's softness, which does not grow with the dot.
-    """
-    unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
-    magnified = edge.softness**2 * abs(1 - magnification**2) > _GROWN
-    close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
-    return bool((close or (magnified and unexplained < _ALMOST)) and edge.radius > 2 * edge.softness)
-
-
-def _improves(pair: Forward, held: Solution, free: Solution) -> bool:
-    """Whether a fitted magnification explains the pictures significantly better than the expected one."""
-    # the scale of chi squared: what remains, or the rounding of a spline where there is no noise
-    floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
-    # noise that goes together in neighbours does not average out over them
-    return (held.squares - free.squares) / floor * independent_share(pair.noise_correlation) > _SIGNIFICANT
 
 
 def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:

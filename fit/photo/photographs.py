@@ -4,14 +4,13 @@ The square's size gives each distance, the sharpest picture is the one in focus,
 itself away (`tone`) and is undone.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import gaussian_gradient_magnitude
 
 from torchdof.io import foreign
 from torchdof.io.images import read_image
@@ -24,8 +23,6 @@ from .captures import CAMERA, Capture, Captures
 from .manifest import MANIFEST, Colours, inside
 from .target import DOT_MM, SQUARE_MM, Target, find_target
 from .tone import WINDOW, Tone, tone_curve, untoned
-
-__all__ = ["Photograph", "Photographs", "read_photographs"]
 
 _READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 _SAME_PLACE = 0.03  # as a share of the distance
@@ -122,7 +119,10 @@ def read_photographs(
         whole = picture.sample in ("8", "16")
         integers = integers and whole
         clipped = whole and target.white > 0.98
-        pictures.append(Photograph(path.name, light, target, 0.0, _sharpness(light, target), clipped))
+        half, y, x = int(0.06 * target.side_px) + 4, round(target.y), round(target.x)
+        slope = gaussian_gradient_magnitude(light[y - half : y + half + 1, x - half : x + half + 1], 0.7).max()
+        sharpness = float(slope / (target.white - target.black))
+        pictures.append(Photograph(path.name, light, target, 0.0, sharpness, clipped))
     if len(pictures) < 2:
         raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=where)
     missing = [name for name in CAMERA if name not in facts]
@@ -202,14 +202,6 @@ def _pair(
         colours=(colours_of(sharp), colours_of(blurred)) if each else None,
         uncertain=tuple((untoned(raw[0], bend), untoned(raw[1], bend)) for bend in others),
     )
-
-
-def _sharpness(light: Array, target: Target) -> float:
-    from scipy.ndimage import gaussian_gradient_magnitude
-
-    half, y, x = int(0.06 * target.side_px) + 4, round(target.y), round(target.x)
-    around = light[y - half : y + half + 1, x - half : x + half + 1]
-    return float(gaussian_gradient_magnitude(around, 0.7).max() / (target.white - target.black))
 
 
 def _advice(

@@ -1,20 +1,21 @@
-"""Eq. (1) of the paper, and other smooth profiles, fitted to samples of blur strength over radius."""
+"""The paper's procedure: blur strength along spokes around a dot, and eq. (1) or another profile fitted to it."""
 
-from __future__ import annotations
+from dataclasses import replace
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from scipy.ndimage import map_coordinates
+from scipy.optimize import approx_fprime
 
 from torchdof.optics.psf import LENGTHS, profile
 from torchdof.validation import show
 
 from ..problems import FitError, warn
-from ..result import Array, BlurFit
+from ..result import Array, BlurFit, Indices
 from ..solve import best_of, information_criterion, inverse
-from ..validation import a_choice
-
-__all__ = ["evaluate", "fit_profile"]
+from ..validation import a_choice, a_picture
+from .dot import find_dot
 
 _NAMES = {"gaussian": ("N", "sigma"), "ring": ("N", "r_c", "sigma"), "softm": ("N", "radius", "sigma", "b", "m")}
 # in units of the largest r; N in units of the largest strength
@@ -33,15 +34,11 @@ _STARTS = {
 }
 _BENT = 8.0
 _SMALLEST, _LARGEST = 1e-60, 1e60  # their squares enter the covariance
+_SMALLEST_PX = 5  # noise is taken from second differences of second differences
+_STEP_DEG = 10
 
 
-def fit_profile(
-    r: ArrayLike,
-    strength: ArrayLike,
-    family: str = "ring",
-    *,
-    groups: ArrayLike | None = None,
-) -> BlurFit:
+def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, groups: ArrayLike | None = None) -> BlurFit:
     """Fit `f(r) = N exp(-(r - r_c)^2 / (2 sigma^2))`, or another profile times N, to samples of blur strength.
 
     Radii may be in any unit (the paper's are metres on the paper): they are normalised inside, and the lengths among
@@ -178,8 +175,6 @@ def _refuse_flat(x: Array, y: Array, noise: float) -> None:
 
 def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Array, Array, Array]:
     """Parameters, their covariance (errors may be correlated within groups: a sandwich) and the fitted curve."""
-    from scipy.optimize import approx_fprime
-
     names = _NAMES[family]
 
     def model(p: Array) -> Array:
@@ -197,3 +192,52 @@ def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Arra
     count = int(label.max()) + 1
     scores = np.stack([np.bincount(label, column, count) for column in (jacobian * residual[:, None]).T], axis=1)
     return params, bread @ (scores.T @ scores) @ bread * count / max(count - 1, 1), curve
+
+
+def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
+    """`I_b(r, theta) / I(r, theta)` from the dot's centre to its circumference, every pixel of r and 10 degrees.
+
+    The centre is the dot's in the sharp picture, as in the paper: a displaced defocused dot is not followed. What is
+    measured is the dot convolved with the kernel, not the kernel, and it ends at the dot's circumference: use it to
+    compare with the paper, and the forward model to render.
+
+    Args:
+        sharp: `[H, W]`, linear light, the dot in focus.
+        blurred: `[H, W]`, linear light, the same dot out of focus.
+
+    Returns:
+        Radii in px, strengths (levels are bilinear between pixels) and the number of the spoke of each sample, all
+        `[n]`.
+
+    Raises:
+        FitError: no usable dot.
+
+    Reference:
+        Sato, Dobashi, Yamamoto, section 2.
+
+    Example:
+        >>> from torchdof.optics import psf
+        >>> dot = psf.disc(6.0, size=31).numpy()
+        >>> r, strength, spoke = blur_strength(dot, 0.5 * dot)
+        >>> round(float(r.max())), round(float(strength.mean()), 3), len(set(spoke.tolist()))
+        (5, 0.5, 36)
+    """
+    still, moved = a_picture("sharp", sharp, _SMALLEST_PX), a_picture("blurred", blurred, _SMALLEST_PX)
+    dot, soft = find_dot(still), find_dot(moved)
+    # the last pixel of the dot is half paper
+    r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)
+    theta = np.deg2rad(np.arange(0, 360, _STEP_DEG))[:, None]
+    where = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
+    below, above = (map_coordinates(p, where, order=1, mode="nearest") for p in (still, moved))
+    below, above = below - dot.background, above - soft.background
+    used = below > 0.2 * dot.peak
+    spokes, rays = np.nonzero(used)
+    return r[rays], above[used] / below[used], spokes
+
+
+def fit_ratio(sharp: Array | None, blurred: Array, family: str) -> BlurFit:
+    """The paper's procedure: a profile fitted to the blur strength, errors that a spoke has in common allowed for."""
+    if sharp is None:
+        raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
+    r, strength, spokes = blur_strength(sharp, blurred)
+    return replace(fit_profile(r, strength, family, groups=spokes), model="ratio")

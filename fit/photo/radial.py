@@ -1,16 +1,13 @@
 """The `radial` family: a table over r found by non-negative least squares, as smooth as the data ask for."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
+from scipy.optimize import nnls
 
 from torchdof.optics.psf import pixel_kernels
 
 from ..result import Array
 from .forward import Forward, Solution, without_level
-
-__all__ = ["size_of_profile", "solve_radial", "solve_round"]
 
 # plain cross-validation (1) follows the noise now and then; 3 costs nothing without noise and up to 12 dB less with it
 _CAUTION = 3.0
@@ -78,8 +75,6 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
 
 def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
     """Weights `[knots]`, and the matrix of the penalty under which they were found."""
-    from scipy.optimize import nnls
-
     centred = columns - columns.mean(axis=1, keepdims=True)
     level = data - data.mean()
     normal, right, total = centred @ centred.T, centred @ level, float(level @ level)

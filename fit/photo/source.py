@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import convolve1d, map_coordinates, spline_filter
+from scipy.special import erfc
 
 from ..result import Array
 from ..solve import best_of
 from .dot import Dot, distance_from, inner_pixels
 from .noise import fine_variance, noise_beside, noise_of
-
-__all__ = ["UNFOCUSED_PX", "Edge", "Source", "ideal_dot", "picture_of_dot", "point_source", "soft_edge"]
 
 UNFOCUSED_PX = 1.0
 """Sigma of an edge, px, above which it is out of focus: no camera leaves a softer one in focus."""
@@ -51,8 +51,6 @@ def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
 
     Kernels hold the optical blur alone; the pixel's own, a variance of 1/12 px^2 along each axis, is the source's.
     """
-    from scipy.ndimage import convolve1d
-
     x, y = int(round(dot.x)), int(round(dot.y))
     picture = np.zeros(shape)
     picture[y, x] = 1.0
@@ -62,8 +60,6 @@ def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
 
 
 def _drawn_by_splines(picture: Array, x: float, y: float) -> Draw:
-    from scipy.ndimage import map_coordinates, spline_filter
-
     spline = spline_filter(picture, order=3)
 
     def draw(rows: Array, columns: Array, there_x: float, there_y: float, magnification: float) -> Array:
@@ -173,8 +169,6 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
 
 def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:
     """Level, 0 to 1, of a soft disc in each pixel, integrated over it."""
-    from scipy.special import erfc
-
     distance = np.hypot(columns - x, rows - y)
     level = (distance < radius).astype(np.float64)
     # within the fine grid's own step an edge is soft anyway

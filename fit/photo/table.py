@@ -1,7 +1,5 @@
 """Fits at several distances to one blur table, keyed by the signed circle of confusion, smooth between its nodes."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from collections.abc import Callable, Sequence
@@ -22,8 +20,6 @@ from .captures import CAMERA, Capture, Captures
 from .distances import Colour, counted, fit_colours, fit_distances, fit_one, fit_openings
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
-
-__all__ = ["TableFit", "fit_captures", "fit_table"]
 
 _EXPOSED = 1.3
 _ORDER = (*COST, *OPENINGS)
@@ -130,7 +126,10 @@ def fit_captures(
             progress(done, total, f"{pair.distance_m:g} m")
 
     def kept(pair: Capture, fit: BlurFit) -> None:
-        _check_exposure(pair, fit)
+        off = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
+        if max(off, 1 / off) > _EXPOSED:
+            text = f"the blurred dot is {off:.2f} times as bright as the exposures say; is the image linear, and did "
+            warn(f"{text}the light stay the same?", "exposure", file=pair.files[1], number=off)
         report(pair)
 
     why, firsts, opening = f"family {family!r} was asked for", list[BlurFit](), None
@@ -151,7 +150,13 @@ def fit_captures(
     fits = [counted(pair, captures.focus_m, fit) for pair, fit in zip(pairs, fits, strict=True)]
     radius_px = np.array([f.radius for f in fits])
     check_agreement(captures, radius_px)
-    coc_px, scale = _keys(captures, radius_px, scale_of)
+    promised, defocus = captures.promised_px, captures.defocus
+    if promised is not None:
+        coc_px, scale = promised, "camera"
+    elif scale_of is not None:
+        coc_px, scale = scale_of.coc_per_dioptre_px * defocus, scale_of.scale
+    else:
+        coc_px, scale = float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
     params, colours = _params(fits, family), tuple[Colour, ...]()
     if all(pair.colours is not None for pair in pairs):
         colours = fit_colours(captures, fits)
@@ -177,29 +182,7 @@ def fit_captures(
         residual=[round(f.residual, 6) for f in fits],
         aperture=opening,
     )
-    per_dioptre = float(coc_px[0] / captures.defocus[0])
-    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, per_dioptre, colours)
-
-
-def _check_exposure(pair: Capture, fit: BlurFit) -> None:
-    """Warn where a fitted gain contradicts the stated exposures."""
-    off = 1.0 if pair.exposure is None or not fit.gain > 0 else fit.gain / pair.exposure
-    if max(off, 1 / off) > _EXPOSED:
-        text = (
-            f"the blurred dot is {off:.2f} times as bright as the exposures say; is the image linear, and did the "
-            "light stay the same?"
-        )
-        warn(text, "exposure", file=pair.files[1], number=off)
-
-
-def _keys(captures: Captures, radius_px: Array, scale_of: TableFit | None) -> tuple[Array, str]:
-    """Signed circle of confusion of each pair in px of the frame, and where its scale is from."""
-    promised, defocus = captures.promised_px, captures.defocus
-    if promised is not None:
-        return promised, "camera"
-    if scale_of is not None:
-        return scale_of.coc_per_dioptre_px * defocus, scale_of.scale
-    return float(np.abs(defocus) @ radius_px / (defocus @ defocus)) * defocus, "measured"
+    return TableFit(table, tuple(fits), tuple(coc_px.tolist()), why, scale, float(coc_px[0] / defocus[0]), colours)
 
 
 def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:

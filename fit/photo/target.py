@@ -4,8 +4,6 @@ The square gives the scale, and so the distance; the dot gives the blur; the whi
 bright white is, whatever the light.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Sequence
@@ -14,14 +12,13 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from scipy import ndimage
 
 from torchdof.io.atomic import whole_file
 
 from ..problems import FitError
 from ..result import Array, Mask
 from ..validation import a_choice
-
-__all__ = ["DOT_MM", "SQUARE_MM", "Paper", "Target", "find_target", "write_target"]
 
 Paper = Literal["a4", "letter"]
 
@@ -105,8 +102,6 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
 
 def _squares(small: Array, dark: Mask) -> Sequence[Target]:
     """Dark patches that are square, hold something bright in their middle and lie on something bright."""
-    from scipy import ndimage
-
     labels, count = ndimage.label(dark)
     found = []
     for i, box in enumerate(ndimage.find_objects(labels)[:count], start=1):

@@ -4,21 +4,18 @@ The light of the dot, in units of the white paper beside it, must be its printed
 blurred edge between black and white must be as much brighter on its dark side as it is darker on its bright side.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.optimize import least_squares
 
 from torchdof.io.transfer import decode, encode
 
 from ..result import Array
 from .target import DOT_MM, Target
-
-__all__ = ["WINDOW", "Tone", "tone_curve", "untoned"]
 
 WINDOW = 0.36
 """Half the dot's window, of the square's side."""
@@ -58,8 +55,6 @@ def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
 
 def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> Tone:
     """The tone curve under which dots and edges are what they must be; none where noise would explain them as well."""
-    from scipy.optimize import least_squares
-
     dots = [_dot(light, target, square_mm) for light, target in pictures]
     edges = [pair for light, target in pictures for pair in _edges(light, target)]
 

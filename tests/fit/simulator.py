@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
 from torchdof.fit import FitError, FitWarning
+from torchdof.fit.photo.frame import demosaiced
 from torchdof.io.images import Picture, write_image
 from torchdof.optics.psf import pixel_kernels
 
@@ -128,7 +129,7 @@ class Simulator:
         if self.snr_db is not None:
             picture = picture + rng.normal(0.0, 10 ** (-self.snr_db / 20), picture.shape)
         if self.bayer:
-            picture = demosaiced(picture)
+            picture = demosaiced(picture, "RGGB").mean(0)  # of a grey scene
         if self.clip is not None:
             picture = np.minimum(picture, self.clip)
         if self.tone:
@@ -142,19 +143,6 @@ class Simulator:
             levels = 2**self.bits - 1
             picture = np.round(np.clip(picture, 0, 1) * levels) / levels
         return picture
-
-
-def demosaiced(mosaic: np.ndarray) -> np.ndarray:
-    """Mean of the three colours of a grey scene seen through a Bayer pattern (RGGB), interpolated bilinearly."""
-    from scipy.ndimage import convolve
-
-    rows, columns = np.indices(mosaic.shape)
-    red, blue = (rows % 2 == 0) & (columns % 2 == 0), (rows % 2 == 1) & (columns % 2 == 1)
-    cross = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
-    square = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
-    green = convolve(np.where(red | blue, 0.0, mosaic), cross, mode="mirror")
-    others = sum(convolve(np.where(colour, mosaic, 0.0), square, mode="mirror") for colour in (red, blue))
-    return (green + others) / 3
 
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
@@ -204,7 +192,8 @@ def write_captures(
         light = np.zeros((height, width))
         for x, y in places:
             square = draw_dot(max(width, height) + 1, camera.dot_radius * m, (x * m, y * m), oversample=8)
-            dot = _centre(square, height, width)
+            top, left = (square.shape[0] - height) // 2, (square.shape[1] - width) // 2
+            dot = square[top : top + height, left : left + width]
             if distance != focus_m and across:
                 dot = blur(dot, *kernel(distance, x, y))
             light += dot
@@ -270,8 +259,3 @@ def place_of_target(i: int, width: int) -> tuple[float, float]:
     """
     x, y = np.random.default_rng(900 + i).uniform(-3, 3, 2)
     return 0.02 * width + x, -0.015 * width + y
-
-
-def _centre(square: np.ndarray, height: int, width: int) -> np.ndarray:
-    top, left = (square.shape[0] - height) // 2, (square.shape[1] - width) // 2
-    return square[top : top + height, left : left + width]

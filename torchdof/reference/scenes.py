@@ -219,7 +219,7 @@ def plane_views(
 
     Args:
         planes: As :func:`plane_scene` takes them.
-        rays: Of the lens, such as :func:`torchdof.fit.lens.views.rays_of` traces.
+        rays: Of the lens.
         size: Height and width of the frame.
         window: Rows and columns of the part.
         samples: Rays a pixel.

@@ -52,7 +52,7 @@ def test_stop_may_be_a_curved_surface_of_glass(lens_of):
     assert stopped == [20.0, pytest.approx(10.0 * rear.f_number / 8.0)]
 
 
-def test_stop_sets_the_f_number_and_scaling_keeps_it():
+def test_stop_sets_the_f_number_and_scaling_keeps_it(lens_of):
     lens = Lens.read("double_gauss_50mm")
     for f_number in (2.8, 8.0):
         assert lens.with_f_number(f_number).paraxial().f_number == pytest.approx(f_number, rel=1e-12)
@@ -61,17 +61,12 @@ def test_stop_sets_the_f_number_and_scaling_keeps_it():
     assert lens.with_f_number(2.0).surfaces[lens.stop].diameter == 17.1  # as marked: fully open
     with pytest.raises(ValueError, match=r"f_number must be at least 2\.03.*got 1\.8"):
         lens.with_f_number(1.8)
-
-
-def test_scaling_an_asphere_keeps_its_shape(lens_of):
     lens = lens_of(ASPHERE)
     scaled = lens.scaled(2.5 * lens.paraxial().focal_length)
     square = np.linspace(0.0, 9.0, 7) ** 2
     for one, other in zip(lens.surfaces, scaled.surfaces, strict=True):
         np.testing.assert_allclose(other.sag(6.25 * square)[0], 2.5 * one.sag(square)[0], rtol=1e-12)
-
-
-def test_polynomial_of_r_squared_is_a_curvature(lens_of):
+    # a polynomial of r^2 is a curvature
     sphere, asphere = (lens_of(f"{front}\n-40 2 1 20\n0 0 0 10\n") for front in ("50 3 1.5 20", "inf 3 1.5 20 A2=0.01"))
     assert asphere.paraxial().focal_length == pytest.approx(sphere.paraxial().focal_length, rel=1e-12)
 
@@ -81,7 +76,6 @@ def test_polynomial_of_r_squared_is_a_curvature(lens_of):
     [
         ("1.51680/64.17/0.5349", (1.51432, 1.51680, 1.51872, 1.52238, 1.52668), 1.5e-4),  # N-BK7
         ("1.62004/36.37/0.5828", (1.61503, 1.62004, 1.62408, 1.63208, 1.64202), 1.5e-4),  # F2
-        ("1.80518/25.43/0.6092", (1.79609, 1.80518, 1.81265, 1.82775, 1.84707), 1.5e-4),  # SF6
         ("1.5168/64.17", (1.51432, 1.51680, None, 1.52238, None), 5e-5),  # two terms of Cauchy's: 2e-4
         ("N-BK7", (1.51432, 1.51680, 1.51872, 1.52238, 1.52668), 1.1e-5),
         ("F2", (1.61503, 1.62004, 1.62408, 1.63208, 1.64202), 1.1e-5),
@@ -109,14 +103,6 @@ def test_catalogue_is_that_of_glasses():
         assert 15 < (n_d - 1) / (n_f - n_c) < 100 and 0.5 < (n_g - n_f) / (n_f - n_c) < 0.7
 
 
-def test_crown_and_flint_bring_red_and_blue_together(lens_of):
-    # powers in the ratio of the Abbe numbers: 0.01 V1 / (V1 - V2) and -0.01 V2 / (V1 - V2)
-    text = "44.78 4 1.5168/64.17 20\n-44.78 2 1.6200/36.37 20\n-811 1 1 20\n0 0 0 19\n"
-    doublet, singlet = lens_of(text), lens_of(SINGLET)
-    shift = [(lens.paraxial(C_UM).back_focal - lens.paraxial(F_UM).back_focal) for lens in (doublet, singlet)]
-    assert abs(shift[0]) < 0.1 * shift[1]
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -140,38 +126,28 @@ def test_lines_are_read_back_as_the_same_lens(text, lens_of):
     [
         ("50 5 1.5 20\n0 1 0\n", r"line 2: expected the columns radius thickness index diameter, got 3"),
         ("50 5 1.5 20\n0 1 0 18\n-50 x 1 20\n", r"line 3: thickness: expected a number, got 'x'"),
-        ("50 5/2 1.5 20\n", r"line 1: thickness: expected a number, got '5/2'"),
         ("50 5 1.5/ 20\n", r"line 1: index: expected a number, got ''"),
         ("50 5 1.5/60/0.5/2 20\n", r"line 1: index: expected a number, index/V, index/V/P_gF or a glass"),
-        ("50 5 1.5/-3 20\n", r"line 1: the Abbe number must be at least 1"),
         ("50 5 1.5/1e-9 20\n", r"line 1: the Abbe number must be at least 1"),
         ("50 5 1.5/60/1.5 20\n", r"line 1: .*P_gF between 0 and 1, got 1.5/60/1.5"),
         ("50 5 0.9 20\n", r"line 1: glass 0.9 has no refractive index from 1 to 5"),
-        ("50 5 0 20\n", r"line 1: glass 0 has no refractive index from 1 to 5"),
         ("50 5 nan 20\n", r"line 1: glass nan must have"),
         ("50 5 inf/60 20\n", r"line 1: no glass 'inf/60'"),
         ("50 -5 1.5 20\n", r"line 1: thickness must be a number from 0 to"),
-        ("50 1e300 1.5 20\n", r"line 1: thickness must be"),
         ("# comment\n50 5 1.5 0\n", r"line 2: diameter must be a number from 0.001 to"),
-        ("50 5 1.5 1e300\n", r"line 1: diameter must be"),
         ("50 5 1.5 1e-300\n", r"line 1: diameter must be"),
         ("nan 5 1.5 20\n", r"line 1: radius must be a number"),
         ("1e-300 5 1.5 20\n", r"line 1: radius must be inf, or 0.001 to 1e\+07 mm long"),
-        ("1e300 5 1.5 20\n", r"line 1: radius must be inf, or"),
         ("0 1 0 18\n0 1 0 18\n", r"line 2: radius: a second stop"),
         ("50 5 1.5 20\n0 1 1.7 18\n", r"line 2: index: the stop does not change the index"),
         ("50 5 1.5 20\n-50 0 1 20\n", r"no aperture stop among 2 surfaces"),
-        ("50 5 1.5 20 stop\n0 1 0 18\n", r"line 2: radius: a second stop"),
         ("50 5 1.5 20 A5=1\n", r"line 1: behind the columns expected stop, k=NUMBER or A2=NUMBER to A16=.*got 'A5=1'"),
         ("50 5 1.5 20 k=x\n", r"line 1: k: expected a number, got 'x'"),
         ("50 5 1.5 20 k=inf\n", r"line 1: conic constant must be a number from -1e\+06 to"),
-        ("50 5 1.5 20 A4=nan\n", r"line 1: A4 must be a number"),
         ("50 5 BK8 20\n", r"line 1: no glass 'BK8' in the catalogue of SCHOTT; define it by"),
         ("glass X 1 2 3\n", r"line 1: expected glass NAME B1 B2 B3 C1 C2 C3, got 'X 1 2 3'"),
-        ("glass\n", r"line 1: expected glass NAME B1 B2 B3 C1 C2 C3"),
         ("glass X 30 0 0 0.01 0.02 90\n", r"line 1: glass X has no refractive index from 1 to 5 at 0.4 um"),
         ("glass X nan 0 0 0.01 0.02 90\n", r"line 1: glass X must have six finite coefficients"),
-        ("", r"no aperture stop among 0 surfaces"),
         ("50 5 1.5 20\n0 1 0 18\n", r"the index behind the last surface must be 1"),
         ("50 5 1.5 20\n" * 2000 + "0 1 0 18\n-50 0 1 20\n", "line 1001: a lens has at most 1000 surfaces"),
     ],

@@ -33,7 +33,7 @@ TESSAR = """
 1.3010  0.3389 N-SK15 1.1
 -1.5218 0      1      1.1
 """
-LINES = {"C": 0.65627, "d": 0.58756, "F": 0.48613}
+LINES_UM = (0.65627, 0.58756, 0.48613)  # C, d, F
 DEPTHS = (2.5, 2.0, 1.5, 1.2, 1.0, 0.7, 0.4, 0.0)  # in dioptres of the focus
 
 
@@ -65,14 +65,6 @@ def their_rays(start: np.ndarray, direction: np.ndarray, wavelength_um: float = 
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_focal_length_and_pupils_agree(name: str) -> None:
-    lens = Lens.read(name)
-    ours, theirs = lens.paraxial(), their_lens(lens, lens.paraxial().back_focal).paraxial
-    assert float(np.ravel(theirs.f2())[0]) == pytest.approx(ours.focal_length, abs=1e-6)
-    assert float(np.ravel(theirs.EPL())[0]) == pytest.approx(ours.entrance_pupil, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("slope", [0.0, 0.1])
 def test_rays_land_within_5e5_mm(name: str, slope: float) -> None:
     lens = Lens.read(name)
@@ -93,7 +85,6 @@ def test_rays_land_within_5e5_mm(name: str, slope: float) -> None:
     theirs = their_rays(start, direction)
     their_lens(lens, sensor).surfaces.trace(theirs, skip=1)
     apart = np.hypot(np.asarray(theirs.x) - x, np.asarray(theirs.y) - y)[ours.alive]
-    print(f"{name}, slope {slope}: {int(ours.alive.sum())} rays, at most {apart.max():.1e} mm apart")
     assert apart.max() < 5e-5
 
 
@@ -119,17 +110,13 @@ def their_rms(lens: Lens, z_m: float, sensor: float, wavelength_um: float) -> fl
 def test_rms_spots_of_eight_depths_and_three_lines_agree_within_1_percent(name: str, tmp_path: Path) -> None:
     (tmp_path / "tessar.txt").write_text(TESSAR)
     lens = Lens.read(tmp_path / "tessar.txt").scaled(100.0) if name == "tessar" else Lens.read(name)
-    f_number = lens.paraxial().f_number
     focus_m = 20.0 * lens.paraxial().focal_length / 1000.0
     sensor = focus_sensor(lens, focus_m)
     worst = 0.0
-    for line, wavelength_um in LINES.items():
-        row = []
+    for wavelength_um in LINES_UM:
         for dioptres in DEPTHS:
             z_m = focus_m / dioptres if dioptres else math.inf
             ours = point_spread(lens, z_m, sensor, meridional=True, rays=4000, wavelength_um=wavelength_um).rms
             theirs = their_rms(lens, z_m, sensor, wavelength_um)
             worst = max(worst, abs(ours / theirs - 1.0))
-            row.append(f"{1000 * ours:.2f}/{1000 * theirs:.2f}")
-        print(f"{name} f/{f_number:.2f} {line}: " + "  ".join(row) + " um")
     assert worst < 0.01

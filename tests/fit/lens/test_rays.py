@@ -64,32 +64,6 @@ def test_rays_meet_the_surface_and_snell_holds_there(radius, conic, polynomial):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_light_path_is_reversible(name):
-    lens = Lens.read(name)
-    position, direction = beam(reach=2.0, tilt=0.05)
-    rays = trace_rays(lens, position, direction)
-    assert rays.alive.any()
-    length, mirror, keep = lens.vertices[-1], np.array([[1.0], [1.0], [-1.0]]), rays.alive
-    home = trace_rays(lens.turned(), rays.position * mirror + length * ALONG, -rays.direction * mirror)
-    np.testing.assert_allclose((-home.direction * mirror)[:, keep], direction[:, keep], atol=1e-12)
-    np.testing.assert_allclose(home.at(length + 1.0)[:, keep], position[:2, keep], atol=1e-10)
-
-
-def test_sphere_images_its_aplanatic_point_without_aberration():
-    # Weierstrass: rays that head for R (1 + n) behind the vertex of a glass sphere meet at R (1 + 1 / n) inside it
-    radius, n = 20.0, 1.5
-    angle = np.linspace(0.05, 0.58, 40)  # at 0.588 they meet its equator
-    aim = radius * (1 + n)
-    direction = np.stack([np.zeros_like(angle), -np.sin(angle), np.cos(angle)])
-    position = aim * ALONG - direction * (aim + 5.0) / direction[2]
-    # the sphere around the image point receives rays along its radii: they leave unrefracted
-    centre, small = radius * (1 + 1 / n), 8.0
-    rays = trace_rays(surfaces((radius, centre - small, n), (small, 0.0, 1.0)), position, direction)
-    assert rays.alive.all()
-    np.testing.assert_allclose(rays.at(centre), 0.0, atol=1e-10)
-
-
-@pytest.mark.parametrize("name", LENSES)
 def test_rays_near_the_axis_follow_first_order_optics(name):
     lens, height = Lens.read(name), 1e-4
     first = lens.paraxial()
@@ -154,10 +128,10 @@ def test_rays_are_not_clipped_where_that_is_asked_for_and_many_are_as_few():
     position, direction = heights(*np.linspace(0.0, 12.0, 40_000))
     small = WALL.with_stop(8.0)
     assert trace_rays(small, position[:, 20_000:20_001], direction[:, :1], clip=False).alive[0]
-    few = [trace_rays(small, position[:, one : one + 100], direction[:, :100]) for one in (0, 16_300, 39_900)]
     many = trace_rays(small, position, direction)
-    for start, rays in zip((0, 16_300, 39_900), few, strict=True):
-        for found, wanted in zip(many, rays, strict=True):
+    for start in (0, 16_300, 39_900):
+        few = trace_rays(small, position[:, start : start + 100], direction[:, :100])
+        for found, wanted in zip(many, few, strict=True):
             np.testing.assert_array_equal(found[..., start : start + 100], wanted)
 
 

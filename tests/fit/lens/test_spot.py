@@ -1,10 +1,9 @@
 import math
-import time
 
 import numpy as np
 import pytest
 
-from torchdof.fit.lens.lens import F_UM, Lens
+from torchdof.fit.lens.lens import Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
 from torchdof.fit.lens.trace import signed_coc_mm
 
@@ -12,18 +11,6 @@ from torchdof.fit.lens.trace import signed_coc_mm
 @pytest.fixture(scope="module")
 def gauss() -> Lens:
     return Lens.read("double_gauss_50mm")
-
-
-def test_spherical_aberration_adds_15_percent_to_the_thin_lens(gauss):
-    # stop at 17.1 mm, focus at 2 m, object at 1 m, distances from the entrance pupil, the sensor set to a micrometre
-    sensor = round(focus_sensor(gauss, 2.0, "paraxial", "pupil"), 3)
-    assert sensor == 37.404
-    spot = point_spread(gauss, 1.0, sensor, reference="pupil", meridional=True, rays=20_000)
-    assert spot.radius == pytest.approx(0.3690, abs=1e-4)
-    first = gauss.paraxial()
-    thin = -signed_coc_mm(1.0, first.focal_length, first.f_number, 2.0)
-    assert thin == pytest.approx(0.3204, abs=1e-4)
-    assert spot.radius / thin == pytest.approx(1.15, abs=0.005)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +59,7 @@ def test_best_focus_has_the_least_rms_radius(gauss):
     assert abs(best - focus_sensor(gauss, 2.0, "paraxial")) < 0.02
 
 
-@pytest.mark.parametrize("z_m", [1.0, 2.0, math.inf])
+@pytest.mark.parametrize("z_m", [1.0, 2.0, 1e12, math.inf])
 def test_spot_on_axis_is_round_and_agrees_with_the_fan(gauss, z_m):
     sensor = focus_sensor(gauss, 2.0)
     whole = point_spread(gauss, z_m, sensor)
@@ -98,20 +85,11 @@ def test_a_near_point_lights_rings_of_the_pupil_by_their_solid_angle(gauss):
     assert outer == pytest.approx((cosine[0] - cosine[1]) / (1.0 - cosine[1]), rel=2e-3)
 
 
-def test_very_far_is_infinity(gauss):
-    sensor = focus_sensor(gauss, 2.0)
-    for meridional in (True, False):
-        far, infinite = (point_spread(gauss, z, sensor, rays=2_500, meridional=meridional) for z in (1e12, math.inf))
-        np.testing.assert_allclose(far.y, infinite.y, atol=1e-9)
-        np.testing.assert_allclose(far.weight, infinite.weight, rtol=1e-9)
-
-
 def test_vignetting_takes_light_and_roundness_towards_the_corner(gauss):
     sensor = focus_sensor(gauss, 2.0)
     spots = [point_spread(gauss, 1.0, sensor, field_mm=f) for f in (0.0, 6.0, 12.0, 18.0)]
-    area = [spot.pupil_mm2 for spot in spots]
+    area, asymmetry = [spot.pupil_mm2 for spot in spots], [spot.asymmetry for spot in spots]
     assert area == sorted(area, reverse=True) and area[3] < 0.5 * area[0]
-    asymmetry = [spot.asymmetry for spot in spots]
     assert asymmetry == sorted(asymmetry) and asymmetry[3] > 0.3
     for spot in spots:
         assert spot.weight.sum() == pytest.approx(1.0, abs=1e-12) and spot.weight.min() > 0
@@ -124,15 +102,6 @@ def test_field_is_where_a_pinhole_would_image_the_point(gauss, z_m, field_mm, di
     lens = gauss.with_f_number(16.0)
     centre = point_spread(lens, z_m, focus_sensor(lens, z_m), field_mm=field_mm, rays=5_000).centre
     assert centre == pytest.approx(field_mm, rel=distortion)
-
-
-def test_blue_light_focuses_nearer(lens_of):
-    lens = lens_of("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
-    sensor = focus_sensor(lens, math.inf)
-    here = point_spread(lens, math.inf, sensor, meridional=True).rms
-    blue = point_spread(lens, math.inf, sensor, meridional=True, wavelength_um=F_UM).rms
-    nearer = point_spread(lens, math.inf, sensor - 0.5, meridional=True, wavelength_um=F_UM).rms
-    assert blue > here and nearer < blue
 
 
 @pytest.mark.parametrize(
@@ -152,15 +121,3 @@ def test_wrong_arguments_are_refused(gauss, call, given, message):
     good = {"focus_m": 2.0} if call is focus_sensor else {"z_m": 1.0, "sensor_mm": 37.4}
     with pytest.raises(ValueError, match=message):
         call(gauss, **{**good, **given})
-
-
-@pytest.mark.hard
-def test_32_distances_at_5_fields_with_50_000_rays_take_less_than_a_minute(gauss):
-    sensor = focus_sensor(gauss, 2.0)
-    start = time.process_time()
-    for z_m in 1.0 / np.linspace(1 / 0.7, 1e-3, 32):
-        for field_mm in (0.0, 4.0, 8.0, 12.0, 16.0):
-            point_spread(gauss, float(z_m), sensor, field_mm=field_mm, rays=50_000)
-    seconds = time.process_time() - start
-    print(f"32 distances x 5 fields x 50,000 rays: {seconds:.1f} s of CPU time")
-    assert seconds < 60.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchdof import BlurTable, Camera, blur_by_coc
+from torchdof import BlurTable, Camera
 from torchdof.fit import natural_psnr, trace_table
 from torchdof.fit.lens.lens import RGB_UM, Lens
 from torchdof.fit.lens.spot import focus_sensor, point_spread
@@ -25,6 +25,7 @@ SHIPPED = {
     "telephoto_250mm_f8": ("telephoto_250mm", 8.0, 10.0, 32, 60.0),
     "wide_22mm_f4": ("wide_22mm", 4.0, 0.5, 20, 60.0),
 }
+DISC = BlurTable.disc()
 read = functools.cache(Lens.read)
 
 
@@ -70,7 +71,7 @@ def psnr(
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_table_matches_traced_spots_between_its_nodes(name, loops):
+def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name, loops):
     # the fit saw spots at 1/4, 1/2 and 3/4 of each interval
     lens, f_number, focus_m, nodes, wanted = SHIPPED[name]
     table = BlurTable.load(name)
@@ -81,14 +82,17 @@ def test_shipped_table_matches_traced_spots_between_its_nodes(name, loops):
     blurred, is_middle = places[blurs], np.repeat(shares, nodes - 1)[blurs] == 0.5
     shown = psnr(loops, table, blurred, read(lens), f_number, focus_m, shown=True)
     plain = psnr(loops, table, places, read(lens), f_number, focus_m, shown=False)
-    thin = psnr(loops, BlurTable.disc(), [0.7 * PIXEL], read(lens), f_number, focus_m, shown=True)[0]
-    print(
-        f"\n{name}: {nodes} nodes; {len(shown)} places at least {shown.min():.1f} dB, median {np.median(shown):.1f}; "
-        f"without the fade to focus {plain.min():.1f}; thin lens's disc at 0.7 px {thin:.1f}"
-    )
     assert shown[is_middle].min() >= wanted
-    assert shown.min() >= 55.0
-    assert plain.min() >= 50.0
+    assert shown.min() >= 55.0 and plain.min() >= 50.0
+    # around focus a table is nowhere worse than the thin lens
+    px = np.array([-1.3, -0.85, -0.7, -0.35, -0.1, 0.1, 0.35, 0.7, 0.85, 1.3])
+    near, thin = (psnr(loops, t, px * PIXEL, read(lens), f_number, focus_m, shown=True) for t in (table, DISC))
+    assert (near - np.minimum(thin, 55.0)).min() > 0.0 and near[np.abs(px) > SHARP_PX].min() >= 50.0
+    assert table.provenance["prescription"].split("; ") == read(lens).lines()
+    assert (table.provenance["f_number"], table.provenance["focus_m"]) == (f_number, focus_m)
+    assert "trace_table(" in table.provenance["command"] and re.fullmatch(r"\d{4}-\d\d-\d\d", table.provenance["date"])
+    assert table.residual is not None and float(table.residual.max()) < 0.03
+    assert len(str(table.to_dict())) < 150_000
 
 
 def test_a_table_takes_as_many_nodes_as_50_db_need(lens_of, loops):
@@ -99,70 +103,6 @@ def test_a_table_takes_as_many_nodes_as_50_db_need(lens_of, loops):
     places = between(fine)
     places = places[np.abs(places) < 2 * PIXEL]
     assert psnr(loops, fine, places, lens, 6.0, 2.0, shown=False).min() >= 50.0
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_table_is_nowhere_worse_than_the_thin_lens_and_50_db_from_where_it_blurs(name, loops):
-    lens, f_number, focus_m, _, _ = SHIPPED[name]
-    px = np.array([-1.3, -0.85, -0.7, -0.35, -0.1, 0.1, 0.35, 0.7, 0.85, 1.3])
-    shown, thin = (
-        psnr(loops, table, px * PIXEL, read(lens), f_number, focus_m, shown=True)
-        for table in (BlurTable.load(name), BlurTable.disc())
-    )
-    assert (shown - np.minimum(thin, 55.0)).min() > 0.0
-    assert shown[np.abs(px) > SHARP_PX].min() >= 50.0
-
-
-def test_texture_and_point_are_rendered_as_traced_at_their_distance(loops):
-    side = 64
-    table = BlurTable.load("double_gauss_50mm_f2").replace(sensor_width_mm=side * PIXEL)  # the frame is a cut-out
-    frequency = torch.hypot(torch.fft.fftfreq(side)[:, None], torch.fft.rfftfreq(side)[None, :]).clamp_min(1 / side)
-    texture = torch.fft.irfft2(torch.fft.rfft2(torch.randn(side, side)) / frequency, s=(side, side))
-    texture = (0.5 + 0.22 * (texture - texture.mean()) / texture.std()).clamp(0.0, 1.0)
-    point = torch.zeros(side, side)
-    point[side // 2, side // 2] = 1.0
-    for px in (-1.7, -0.8, 0.6, 1.1):
-        traced = traced_kernel(loops, read("double_gauss_50mm"), 2.0, 2.0, px * PIXEL)
-        kernel = torch.from_numpy(traced)[None, None].float()
-        for picture in (texture, point):
-            image = picture[None, None]
-            made = blur_by_coc(image, torch.full_like(image, px), table=table)
-            half = kernel.shape[-1] // 2
-            inner = (..., slice(half, -half), slice(half, -half))
-            truth = torch.nn.functional.conv2d(image, kernel)
-            error = float((made[inner] - truth).square().mean().sqrt() / truth.max())
-            assert -20 * math.log10(error) >= 50.0
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_table_says_where_it_is_from(name):
-    table = BlurTable.load(name)
-    lens, f_number, focus_m, _, _ = SHIPPED[name]
-    assert table.provenance["prescription"].split("; ") == read(lens).lines()
-    assert (table.provenance["f_number"], table.provenance["focus_m"]) == (f_number, focus_m)
-    assert "trace_table(" in table.provenance["command"] and re.fullmatch(r"\d{4}-\d\d-\d\d", table.provenance["date"])
-    assert table.residual is not None and float(table.residual.max()) < 0.03
-    size = len(str(table.to_dict()))
-    assert size < 150_000
-
-
-def test_kernels_of_a_shipped_table_keep_all_light_and_stay_positive():
-    table = BlurTable.load("double_gauss_50mm_f2")
-    kernels = table.kernels(torch.linspace(-40.0, 20.0, 61), WIDTH)
-    assert kernels.min() >= 0
-    torch.testing.assert_close(kernels.sum((-2, -1)), torch.ones(61, 1, dtype=torch.float64), atol=1e-12, rtol=0)
-
-
-def test_kernels_change_smoothly_with_depth():
-    # the largest step on a fine grid is that of a moving edge, not of a jump from branch to branch
-    table = BlurTable.load("double_gauss_50mm_f2")
-    px = torch.linspace(-7.0, 5.0, 241)
-    kernels = torch.stack(
-        [torch.from_numpy(np.pad(k, (31 - len(k)) // 2)) for k in (interpolated(table, float(p)) for p in px)]
-    )
-    steps = kernels.diff(dim=0).abs().sum((-2, -1))
-    neighbours = torch.maximum(steps[:-2], steps[2:])
-    assert float((steps[1:-1] / neighbours.clamp_min(1e-3)).max()) < 3.0
 
 
 def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch, loops):
@@ -178,8 +118,7 @@ def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch, loops):
 
 def test_signed_coc_is_the_cameras():
     depth = torch.tensor([0.7, 1.0, 2.0, 3.0, 100.0, math.inf], dtype=torch.float64).reshape(1, 1, 1, -1)
-    camera = Camera(50.3582, 2.8, 2.0, 36.0)
-    expected = camera.coc_px(depth, width=36).flatten().tolist()
+    expected = Camera(50.3582, 2.8, 2.0, 36.0).coc_px(depth, width=36).flatten().tolist()
     found = [signed_coc_mm(z, 50.3582, 2.8, 2.0) for z in depth.flatten().tolist()]
     assert found == pytest.approx(expected, abs=1e-12)
 
@@ -202,10 +141,9 @@ def test_nodes_reach_from_the_nearest_distance_to_infinity():
     ends = [signed_coc_mm(z_m, lens.paraxial().focal_length, 8.0, 2.0) for z_m in (1.0, math.inf)]
     assert table.coc[[0, -1]].tolist() == pytest.approx(ends, rel=1e-6)
     assert 0.0 in table.coc.tolist() and table.provenance["asymmetry"] == 0.0
-
-
-def test_focus_at_infinity_has_a_near_side_only():
-    table = small(read("double_gauss_50mm"), focus_m=math.inf, nodes=4)
+    command = table.provenance["command"].removeprefix("torchdof.fit.")
+    assert eval(command, {"trace_table": trace_table, "Lens": Lens}).to_dict() == table.to_dict()
+    table = small(lens, focus_m=math.inf, nodes=4)  # there is a near side only
     assert len(table.coc) == 4 and float(table.coc.max()) == 0.0
     assert table.provenance["focus_m"] == "inf"
 
@@ -215,11 +153,9 @@ def test_dispersion_gives_one_kernel_a_channel(lens_of):
     table = small(lens, focus="paraxial", wavelengths_um=RGB_UM)
     assert table.channels == 3
     # behind the focus a singlet's image lies nearer to the lens, in blue even more: the blur is larger
-    red, green, blue = table.node_params["radius"][:, -1].tolist()
-    assert red < green < blue
+    assert (table.node_params["radius"][:, -1].diff() > 0).all()
     # before it the other way round
-    red, green, blue = table.node_params["radius"][:, 0].tolist()
-    assert red > green > blue
+    assert (table.node_params["radius"][:, 0].diff() < 0).all()
 
 
 def test_off_axis_table_states_its_asymmetry():
@@ -235,13 +171,6 @@ def test_named_shapes_follow_a_stopped_down_lens(family, wanted, loops):
     assert table.family == family
     ends = table.coc.numpy()[[0, -1]]
     assert psnr(loops, table, ends, lens, 4.0, 2.0, shown=True).min() > wanted
-
-
-def test_command_in_the_provenance_makes_the_table_again():
-    table = small(read("double_gauss_50mm"))
-    command = table.provenance["command"].removeprefix("torchdof.fit.")
-    again = eval(command, {"trace_table": trace_table, "Lens": Lens})
-    assert again.to_dict() == table.to_dict()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from torchdof.fit.lens.lens import Lens
-from torchdof.fit.lens.spot import focus_sensor, point_spread
 
 HEAD = "VERS 140124 258 36214\nMODE SEQ\nNAME A lens of a test\nUNIT {} X W X CM MR CPMM\n"
 SINGLET = """SURF 0
@@ -57,17 +56,15 @@ def numbers(lens: Lens) -> list[list[float]]:
     return [[one.radius, one.thickness, one.diameter, one.conic, *one.polynomial] for one in lens.surfaces]
 
 
-@pytest.mark.parametrize("name", ["double_gauss_50mm", "wide_22mm", "telephoto_250mm"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+@pytest.mark.parametrize(
+    ("name", "encoding"), [("double_gauss_50mm", "utf-8"), ("wide_22mm", "utf-16"), ("telephoto_250mm", "utf-8")]
+)
 def test_shipped_lens_written_as_zmx_is_read_as_itself(name, encoding, lens_of):
     lens = Lens.read(name)
     again = lens_of(as_zmx(lens), "lens.zmx", encoding)
     np.testing.assert_allclose(numbers(again), numbers(lens), rtol=1e-14)
     assert [one.glass for one in again.surfaces] == [one.glass for one in lens.surfaces]
     assert (again.stop, again.name, again.source) == (lens.stop, "lens", "Zemax file: A lens of a test")
-    sensor = focus_sensor(lens, 2.0)
-    spots = [point_spread(one, 1.0, sensor, meridional=True, rays=100).rms for one in (lens, again)]
-    assert spots[0] == pytest.approx(spots[1], rel=1e-12)
 
 
 @pytest.mark.parametrize(("written", "glass"), [("N-BK7", "N-BK7"), ("S-BSL7", "1.5168/64.17")])
@@ -97,8 +94,6 @@ def test_inches_are_millimetres_times_25_4(lens_of):
         ("GLAS N-BK7 0 0 1.5168 64.17 0", "GLAS S-NICE", "surface 2: glass S-NICE is not in the catalogue of SCHOTT"),
         ("  CLAP 0 8 0", "  OBSC 0 2", "surface 3: only round apertures without obstruction are read, got OBSC"),
         ("CURV 0.02 0", "CURV x 0", "surface 2: CURV must be a number, got 'x'"),
-        ("CURV 0.02 0", "CURV nan 0", "surface 2: radius must be"),
-        ("PARM 2 -1.5e-6", "PARM 2 inf", "surface 2: A4 must be"),
         ("  DIAM 10 1", "  MEMA 10 1", r"surface 2: no clear semi-diameter \(DIAM\)"),
         ("  STOP\n", "", r"expected one stop \(STOP\) among the surfaces of the lens, got 0"),
         (SINGLET, "SURF 0\n", "expected an object, surfaces of a lens and an image"),

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from torchdof.fit import Capture, Captures, FitError, FitWarning, fit_pair, read_captures
 from torchdof.io.images import Picture, read_image, write_image
@@ -105,7 +103,6 @@ WRONG = [
     (SHOT, "distance_m = -1", "manifest", "distance_m must be a number > 1e-05 and < 1e.06, got -1"),
     (SHOT, 'distance_m = "near"', "manifest", "must be a number > .*, got 'near'"),
     *((FOCUS, f"focus_m = {v}", "manifest", "focus_m must be a number > ") for v in ("nan", "1e-300", "1e30")),
-    (FOCUS, "focus_m = true", "manifest", "must be a number > .*, got True"),
     (FOCUS, "focus_m = ", "manifest", "is not TOML"),
     *(
         (FOCUS, f"{FOCUS}\n{name} = {value}", "manifest", f"{name} must be a number > ")
@@ -120,7 +117,6 @@ WRONG = [
     (FOCUS, f'{FOCUS}\ncolours = "all"', "manifest", "colours must be one of mean, each"),
     (FOCUS, f"{FOCUS}\ncrop = [1, 2, 3]", "manifest", r"crop must be \[left, top, width, height\]"),
     ('file = "0400mm.png"', "", "manifest", "file must be a text, got None"),
-    ('sharp = "0500mm.png"', "sharp = 3", "manifest", "sharp must be a text, got 3"),
     ('file = "0400mm.png"', 'file = "small.png"', "manifest", "small.png is 100x100, 0500mm.png is 400x240"),
     ('file = "0400mm.png"', 'file = "black.png"', "no dot", "black.png: no dot found"),
 ]  # fmt: skip
@@ -173,11 +169,3 @@ def test_captures_from_arrays_are_checked():
     ):
         with pytest.raises(FitError, match=match):
             Captures(pairs, focus_m=0.5, width_px=100, **more)
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.one_of(st.binary(max_size=200), st.text(max_size=200).map(str.encode)))
-def test_any_manifest_is_read_or_refused_by_name(tmp_path, content):
-    (tmp_path / "capture.toml").write_bytes(content)
-    with pytest.raises((FitError, OSError)):
-        read_captures(tmp_path)

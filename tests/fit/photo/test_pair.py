@@ -29,23 +29,18 @@ def off(fit, name, true):
 # camera, family, its parameters, options of the fit, captures, largest error of one and of their mean
 RECOVERED = [
     *(({}, "gaussian", {"sigma": s}, {}, 3, most, most) for s, most in [(0.5, 0.03), (1.0, 0.01), (2.0, 0.01)]),
-    *(({}, "gaussian", {"sigma": s}, {}, 3, 0.01, 0.01) for s in (4.0, 8.0)),
     *(({"snr_db": 30}, "gaussian", {"sigma": s}, {}, 3, 0.02, 0.02) for s in (2.0, 4.0, 8.0)),
     *(
         ({"snr_db": 46, **harm}, "gaussian", {"sigma": s}, {}, 3, 0.02, 0.005)
         for harm, s in [
-            ({"exposure": 0.6}, 2.0),
-            ({"offset": 0.05}, 4.0),
-            ({"shift": (2.0, 0.0)}, 2.0),
+            ({"exposure": 0.6, "offset": 0.05}, 2.0),
             ({"shift": (1.3, -1.6)}, 4.0),
             ({"magnification": 1.05}, 2.0),
-            ({"magnification": 0.95}, 4.0),
             ({"edge_sigma": 0.7}, 2.0),
             ({"full_well": 20_000.0}, 4.0),
         ]
     ),
     ({"snr_db": 53.5}, "ring", RING, {}, 4, 0.05, 0.05),  # 40 dB below the mean square of the whole window
-    ({"snr_db": None}, "ring", RING, {}, 1, 1e-3, 1e-3),
     # the softness of the sensor does not grow with the dot: 0.13 if it did
     ({"size": 61, "dot_radius": 9.0, "bayer": True}, "disc", {"radius": 2.0}, {"magnification": 0.4}, 1, 0.03, 0.03),
     ({"size": 61, "dot_radius": 4.5, "bayer": True}, "disc", {"radius": 2.0}, {"magnification": 2.0}, 1, 0.03, 0.03),
@@ -59,15 +54,11 @@ def test_a_blur_comes_back(simulator, camera, family, params, options, captures,
     for name, true in params.items():
         found = np.array([fit.params[name] for fit in fits]) / true - 1
         assert np.abs(found).max() < each and abs(found.mean()) < mean, (name, found)
-
-
-@pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")
-def test_jpeg_leaves_no_bias_of_half_a_percent(simulator):
-    def fitted(dx):
-        camera = simulator.Simulator(jpeg=60, level=0.7, black=0.02, snr_db=None, size=105, shift=(dx, dx / 2))
-        return fit_pair(*camera.pair("gaussian", GAUSSIAN), "gaussian").params["sigma"]
-
-    assert abs(np.mean([fitted(dx) for dx in (0.0, 0.7, 1.4, 2.1, 2.8)]) / 4.0 - 1) < 0.005
+    for fit in fits:
+        assert (fit.gain, *fit.shift) == pytest.approx((camera.exposure, *camera.shift), rel=0.02, abs=0.1)
+        assert fit.background == pytest.approx(camera.offset, abs=3e-3)
+        assert fit.magnification == pytest.approx(camera.magnification, rel=0.01)
+        assert f"{name} = " in fit.summary() and "x the noise" in fit.summary()
 
 
 @pytest.mark.filterwarnings("ignore::torchdof.fit.problems.FitWarning")  # there is no noise to hide behind
@@ -89,14 +80,6 @@ def test_the_radius_is_that_of_the_light_and_not_of_a_kernel_whose_pixels_cannot
     assert fit_pair(*pair, "disc", fit_magnification=False).radius == pytest.approx(0.9, rel=0.01)  # 1.07 by its kernel
 
 
-def test_offset_gain_shift_and_magnification_are_reported(simulator):
-    camera = simulator.Simulator(exposure=0.6, offset=0.05, shift=(2.0, -1.0), magnification=0.9)
-    fit = fit_pair(*camera.pair("gaussian", {"sigma": 3.0}), "gaussian", magnification=0.95)
-    assert fit.gain == pytest.approx(0.6, rel=0.01) and fit.background == pytest.approx(0.05, abs=1e-3)
-    assert fit.shift == pytest.approx((2.0, -1.0), abs=0.05) and fit.magnification == pytest.approx(0.9, rel=0.01)
-    assert "sigma = 3" in fit.summary() and "x the noise" in fit.summary()
-
-
 @pytest.mark.parametrize(
     ("camera", "family", "true", "options", "draws", "spread"),
     [
@@ -106,10 +89,6 @@ def test_offset_gain_shift_and_magnification_are_reported(simulator):
         ({"dot_radius": 12.0, "size": 101}, "ring", RING, {}, 16, (0.5, 1.5)),
         # demosaiced: 2.0 to 2.3 times too small where pixels count as independent
         ({"size": 61, "bayer": True}, "disc", {"radius": 5.0}, {"fit_magnification": False}, 16, (0.7, 1.4)),
-        pytest.param(
-            {"size": 81, "snr_db": 30}, "gaussian", {"sigma": 3.0}, {"fit_magnification": True}, 40, (0.75, 1.3),
-            marks=pytest.mark.sweep,
-        ),
     ],
 )  # fmt: skip
 def test_standard_errors_hold_in_repeated_captures(simulator, camera, family, true, options, draws, spread):
@@ -183,7 +162,6 @@ WARNED = [
     (CUT_OFF, D6, 0, {}, {"saturated"}, "picture's paper lies on its lowest level, 0", 0.5),
     ({"misfocus": 1.4}, G4, 0, {}, {"not in focus"}, "1.4 px, as out of focus; the dot was fitted as", 1.4),
     (TONE, G3, 0, {}, {"not linear"}, "a tone curve", None),
-    (TONE, G3, 1, {}, {"not linear"}, "a tone curve", None),
     ({**TONE, "bayer": True, "size": 91}, G3, 1, {}, None, "linear|tone curve", None),  # behind a soft edge
     # 4 % of the radius; compression hides what the curve does to the noise. A Gaussian takes half of the curve up
     ({"tone": 0.2, **JPEG, "bayer": True}, D6, 2, HELD, {"not linear"}, "goes with the level, as under", None),
@@ -215,19 +193,15 @@ def test_what_is_wrong_with_a_capture_is_said(simulator, camera, kernel, seed, o
 # faultless captures, or such with faults that hardly matter: a warning would be an error here
 SILENT = [
     ({"snr_db": None}, "gaussian", {"sigma": 3.0}, 0),
-    ({"level": 0.7, "black": 0.05, "bits": 8}, "gaussian", {"sigma": 3.0}, 0),
     ({"level": 0.7, "full_well": 3000.0, "snr_db": 50}, "gaussian", {"sigma": 3.0}, 0),
     ({"level": 0.7, "bits": 8, "snr_db": 60, "black": 0.02}, "gaussian", {"sigma": 3.0}, 0),
     # of twelve, the draw in which the highest of a JPEG's few levels had ten pixels
     ({"level": 0.7, "jpeg": 90, "black": 0.02, "size": 91}, "disc", DISC, 3),
-    ({"edge_sigma": 0.7}, "gaussian", {"sigma": 3.0}, 0),
     ({"edge_sigma": 0.9}, "gaussian", {"sigma": 6.0}, 0),
     ({**JPEG, "magnification": 1.02}, "ring", {"sigma": 3.0, "r_c": 4.0}, 101),  # a lens that breathes: no tone curve
-    ({**JPEG, "magnification": 1.02}, "gaussian", {"sigma": 3.0}, 101),
     # blacks that are not cut off
     ({"bits": 16, "snr_db": 46, "dot_radius": 9.0, "level": 0.8, "black": 0.01}, "disc", DISC, 0),
     ({"bits": 6, "snr_db": None, "dot_radius": 9.0, "level": 0.8}, "disc", DISC, 0),
-    ({"bits": 6, "snr_db": 50, "dot_radius": 9.0, "level": 0.8}, "disc", DISC, 0),
     ({"bits": 8, "snr_db": 46, "dot_radius": 9.0, "level": 0.8, "black": 0.012}, "disc", DISC, 0),
 ]
 
@@ -244,8 +218,6 @@ def test_a_faultless_capture_is_fitted_in_silence(simulator, camera, family, par
     [  # the paper's noise is hidden, with the dot's and without it; the dot's is hidden, and the paper's is not
         {"level": 0.75, "snr_db": 63},
         {"level": 0.8, "snr_db": 60},
-        {"level": 0.8, "snr_db": 63},
-        {"level": 0.75, "snr_db": 60, "black": 0.01},
         {"level": 0.75, "snr_db": 66, "black": 0.5 / 255},
     ],
 )
