@@ -159,12 +159,7 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
 
 @pytest.mark.parametrize(("name", "make", "image", "values"), FILES, ids=[file[0] for file in FILES])
 def test_a_file_that_is_not_what_it_should_be_is_refused_by_name_in_one_line(
-    name: str,
-    make: Made | None,
-    image: str | None,
-    values: str | None,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, make: Made | None, image: str | None, values: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if make is not None:
