@@ -24,7 +24,7 @@ from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect
-from .options import Scene, edges_of, pick_device, refuse_input
+from .options import Scene, pick_device, refuse_input
 from .printed import Bar, WarnOnce, tell
 
 if TYPE_CHECKING:
@@ -157,9 +157,10 @@ class Renderer:
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
             table = _with_alpha(self.table) if picture.has_alpha else self.table
-            blur: Callable[..., Tensor] = functools.partial(
-                blur_by_coc, table=table, depth_edges=edges_of(command.depth_edges), **command.accuracy.options()
-            )
+            options: dict[str, Any] = command.accuracy.options() | {
+                "depth_edges": command.depth_edges.replace("-", " ")
+            }
+            blur: Callable[..., Tensor] = functools.partial(blur_by_coc, table=table, **options)
             with torch.no_grad():
                 if command.lights:
                     pixels = _with_lights(picture, pixels, command.lights)
