@@ -125,13 +125,6 @@ class Rendered:
     facts: dict[str, Any]
     seconds: float
 
-    def tell(self, as_json: bool) -> None:
-        """Prints one line."""
-        facts = {"out": str(self.out), **self.facts, "seconds": self.seconds}
-        remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
-        words = [*self.words, f"{facts['width']} x {facts['height']}", f"{self.seconds:.2f} s on {facts['device']}"]
-        tell(as_json, facts, f"{self.out}: {'; '.join(words)}{remarks}")
-
 
 class Renderer:
     """What ``torchdof render`` does with each frame: reads, renders and writes it."""
@@ -172,11 +165,15 @@ class Renderer:
         seconds = frame.seconds + time.perf_counter() - start
         return Rendered(out, dataclasses.replace(picture, pixels=pixels), words, facts, seconds)
 
-    def write(self, rendered: Rendered) -> Rendered:
-        """Writes the picture, whole or not at all, and adds the seconds that this took."""
-        start = time.perf_counter()
-        write_image(rendered.out, rendered.picture, self.command.files.out_transfer, self.command.files.bits)
-        return dataclasses.replace(rendered, seconds=rendered.seconds + time.perf_counter() - start)
+    def write(self, rendered: Rendered) -> None:
+        """Writes the picture, whole or not at all, and prints one line."""
+        start, files, out = time.perf_counter(), self.command.files, str(rendered.out)
+        write_image(rendered.out, rendered.picture, files.out_transfer, files.bits)
+        seconds = rendered.seconds + time.perf_counter() - start
+        facts = {"out": out, **rendered.facts, "seconds": seconds}
+        remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
+        words = [*rendered.words, f"{facts['width']} x {facts['height']}", f"{seconds:.2f} s on {facts['device']}"]
+        tell(self.command.as_json, facts, f"{out}: {'; '.join(words)}{remarks}")
 
     def _told(self, camera: Camera | None, largest_px: float, holes: int) -> tuple[list[str], dict[str, Any]]:
         """What was done to a frame, for people and for programs."""
