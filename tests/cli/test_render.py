@@ -116,6 +116,7 @@ def test_lights_expand_the_clipped_lamps_of_a_photograph_and_alpha_is_blurred_pr
 
 def test_the_line_tells_what_was_done(scene: Path, run: Run) -> None:
     told = run(f"{ONE} {LENS}")
+    assert run(f"{ONE} --resume") == "out.exr: is there already\n"
     assert told.startswith(
         "out.exr: focus 2 m, f/1.4, 50 mm on 4 mm; blur radius up to 1.8 px; disc, layered; 24 x 16;"
     )
@@ -287,18 +288,6 @@ def test_sequence_follows_the_focus_of_its_keyframes(scene: Path, image: Tensor,
     for n, focus_m in ((1, 2.0), (2, 3.0), (3, 6.0)):
         expected = torchdof.depth_of_field(image * n, depth, CAMERA.replace(focus_m=focus_m))
         torch.testing.assert_close(pixels(f"out.{n:04d}.exr"), expected, rtol=0, atol=1e-5)
-
-
-def test_resume_renders_only_what_is_missing(scene: Path, run: Run) -> None:
-    run(f"{SEQUENCE} --focus-m 2")
-    (scene / "out.0002.exr").unlink()
-    os.utime("out.0001.exr", (1, 1))
-    lines = run(f"{SEQUENCE} --focus-m 2 --resume").splitlines()
-    assert lines[0] == "2 of 3 frames are there already"
-    assert len(lines) == 2 and lines[1].startswith("out.0002.exr: ")
-    assert os.stat("out.0001.exr").st_mtime == 1
-    run(ONE)
-    assert run(f"{ONE} --resume") == "out.exr: is there already\n"
 
 
 def test_steady_depth_flickers_less_and_parts_are_those_of_the_whole(
