@@ -1,5 +1,6 @@
 """A sequence that is interrupted, a disk that fills up, memory that runs out, and what is seen while it takes long."""
 
+import functools
 import io
 import os
 import re
@@ -82,25 +83,16 @@ def test_a_frame_that_cannot_be_read_or_written_ends_a_sequence_by_its_name(
 def test_the_next_frame_is_read_and_the_last_written_while_one_is_rendered(
     scene: Path, run: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reading, rendering = ([threading.Event() for _ in range(4)] for _ in range(2))
-    read, render, write = frame.Renderer.read, frame.Renderer.render, frame.Renderer.write
-    number = lambda out: int(out.name.split(".")[1]) - 1  # noqa: E731
+    meeting = threading.Barrier(3)
 
-    def slow_read(self: Any, image: Path, depth: Path, out: Path) -> Any:
-        reading[number(out)].set()
-        return read(self, image, depth, out)
+    def waiting(self: frame.Renderer, step: Callable[..., Any], out: str, *arguments: Any) -> Any:
+        if out in repr(arguments):
+            meeting.wait(20)
+        return step(self, *arguments)
 
-    def slow_render(self: Any, source: Any, out: Path, *others: Any) -> Any:
-        rendering[number(out)].set()
-        assert out.name == "out.0003.exr" or reading[number(out) + 1].wait(20), "the next is not read"
-        return render(self, source, out, *others)
-
-    def slow_write(self: Any, rendered: Any) -> Any:
-        assert rendered.out.name == "out.0003.exr" or rendering[number(rendered.out) + 1].wait(20), "the next waits"
-        return write(self, rendered)
-
-    for name, slow in (("read", slow_read), ("render", slow_render), ("write", slow_write)):
-        monkeypatch.setattr(frame.Renderer, name, slow)
+    for name, out in (("read", "out.0003"), ("render", "out.0002"), ("write", "out.0001")):
+        own = getattr(frame.Renderer, name)
+        monkeypatch.setattr(frame.Renderer, name, functools.partialmethod(waiting, own, out))
     assert [line[:12] for line in run(SEQUENCE).splitlines()] == [f"out.000{n}.exr" for n in (1, 2, 3)]
 
 
