@@ -77,7 +77,7 @@ def unwound_on_termination() -> Iterator[None]:
     """SIGTERM and SIGHUP as ``SystemExit``, which tidies up behind itself, unless somebody handles them."""
 
     def leave(number: int, _: FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)  # the status that a shell tells of a process that the signal ended
+        raise SystemExit(128 + number)  # as shells tell of a process that a signal ended
 
     ends = {getattr(signal, name, signal.SIGTERM) for name in ("SIGTERM", "SIGHUP")}
     main = threading.current_thread() is threading.main_thread()  # no other hears of signals
