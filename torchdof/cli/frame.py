@@ -53,8 +53,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     With ``holes``, those that nobody said how to fill stay NaN; otherwise they are a ``ValueError``.
     """
     start, name, fill = time.perf_counter(), str(depth or image), scene.depth_map.fill_depth
-    picture = read_image(image, **encoding)
-    values, filled = _metres(image, depth, picture, scene), 0
+    picture, filled = read_image(image, **encoding), 0
+    values = _metres(image, depth, picture, scene)
     if fill is not None or not holes:
         values, filled = resolve_holes(values, name, fill)  # type: ignore[arg-type]
     return Frame(name, picture, values, filled, time.perf_counter() - start)
@@ -62,33 +62,30 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
 
 def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> Tensor:
     """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes."""
-    said, name, width = scene.depth_map, str(depth or image), picture.pixels.shape[-1]
+    said, name, pixels = scene.depth_map, str(depth or image), picture.pixels
+    kind = said.depth_kind
     if depth is not None or said.depth_channel is not None:
         values = read_values(depth or image, said.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
-    is_coc, sizes = said.depth_kind == "coc", [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, picture.pixels)]
-    if is_coc and sizes[0] != sizes[1]:
+    sizes = [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, pixels)]
+    if kind == "coc" and sizes[0] != sizes[1]:
         raise ValueError(f"{name}: coc is {sizes[0]} pixels but the image is {sizes[1]}; they must be the same")
     try:
-        same_aspect(picture.pixels, values)
-        if said.depth_kind == "relative":
-            ends, kind = (said.near_m or 0.0, said.far_m or 0.0), said.relative_kind or "disparity"
-            metres = from_relative(values, *ends, kind, value_range=said.value_range, unknown=said.depth_unknown)
-            return at_size_of(picture.pixels, metres)
+        same_aspect(pixels, values)
+        if kind == "relative":
+            ends, relative = (said.near_m or 0.0, said.far_m or 0.0), said.relative_kind or "disparity"
+            values = from_relative(values, *ends, relative, value_range=said.value_range, unknown=said.depth_unknown)
+            return at_size_of(pixels, values)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
+    view_deg = scene.lens.view_deg(picture.metadata, pixels.shape[-1]) if kind == "distance" else None
     metres = depth_from_values(
-        values,
-        said.depth_kind,
-        scale=said.depth_scale,
-        offset=said.depth_offset,
-        unknown=said.depth_unknown,
-        fov_x_deg=scene.lens.view_deg(picture.metadata, width) if said.depth_kind == "distance" else None,
+        values, kind, scale=said.depth_scale, offset=said.depth_offset, unknown=said.depth_unknown, fov_x_deg=view_deg
     )
-    return metres if is_coc else at_size_of(picture.pixels, metres)
+    return metres if kind == "coc" else at_size_of(pixels, metres)
 
 
 def coc_of(
