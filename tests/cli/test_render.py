@@ -23,6 +23,8 @@ from torchdof.io.highlights import expand_highlights
 from torchdof.io.images import Picture, read_image, write_image
 from torchdof.optics.field import Field
 
+pytestmark = pytest.mark.usefixtures("scene")  # its files lie in the working folder
+
 Run = Callable[..., str]
 LENS = "--focal-length-mm 50 --f-number 1.4 --sensor-width-mm 4"  # blurs by 1.8 px
 ONE = "render image.exr depth.npy -o out.exr --focus-m 2"
@@ -70,7 +72,6 @@ PENTAGON = torchdof.BlurTable.polygon(5, 15.0, 0.2, squeeze=1.5, vignetting=0.3)
     ],
 )
 def test_render_is_the_function_on_files(
-    scene: Path,
     image: Tensor,
     depth: Tensor,
     run: Run,
@@ -99,7 +100,7 @@ def test_render_is_the_function_on_files(
 
 
 def test_lights_expand_the_clipped_lamps_of_a_photograph_and_alpha_is_blurred_premultiplied(
-    scene: Path, depth: Tensor, run: Run
+    depth: Tensor, run: Run
 ) -> None:
     night = torch.full((1, 4, 16, 24), 0.01)
     night[:, :3, 8, 18], night[:, 3] = 1.0, 1.0
@@ -114,7 +115,7 @@ def test_lights_expand_the_clipped_lamps_of_a_photograph_and_alpha_is_blurred_pr
     assert bool(((pixels("out.exr")[:, 3] > 0.01) & (pixels("out.exr")[:, 3] < 0.99)).any())
 
 
-def test_the_line_tells_what_was_done(scene: Path, run: Run) -> None:
+def test_the_line_tells_what_was_done(run: Run) -> None:
     told = run(f"{ONE} {LENS}")
     assert run(f"{ONE} --resume") == "out.exr: is there already\n"
     assert told.startswith(
@@ -126,9 +127,7 @@ def test_the_line_tells_what_was_done(scene: Path, run: Run) -> None:
     assert "5 blades, curvature 0.2, turned by 15, squeeze 1.5, vignetting 0.3; no occlusion" in told
 
 
-def test_camera_comes_from_the_file_when_nobody_states_it_and_that_is_said(
-    scene: Path, image: Tensor, run: Run
-) -> None:
+def test_camera_comes_from_the_file_when_nobody_states_it_and_that_is_said(image: Tensor, run: Run) -> None:
     tags = {"Exif:FocalLength": 85.0, "FNumber": 1.8, "Exif:SubjectDistance": 3.0, "Exif:FocalLengthIn35mmFilm": 85.0}
     write_image("photo.exr", Picture(image, metadata={name: ("float", value) for name, value in tags.items()}))
     line = run("render photo.exr depth.npy -o out.exr")
@@ -139,7 +138,7 @@ def test_camera_comes_from_the_file_when_nobody_states_it_and_that_is_said(
     assert "[focal length assumed, f-number assumed, sensor width assumed]" in run(ONE)
 
 
-def test_kinds_of_depth_are_the_same_metres(scene: Path, image: Tensor, depth: Tensor, run: Run) -> None:
+def test_kinds_of_depth_are_the_same_metres(image: Tensor, depth: Tensor, run: Run) -> None:
     both = torch.cat([image, depth], dim=1)[0].permute(1, 2, 0).contiguous().numpy()
     store("zed.exr", both, "float", ("R", "G", "B", "Z"))
     near = depth[0, 0].numpy() == 2.0
@@ -174,7 +173,7 @@ def test_kinds_of_depth_are_the_same_metres(scene: Path, image: Tensor, depth: T
     assert not torch.allclose(pixels("out.exr"), pixels("expected.exr"), atol=1e-2)
 
 
-def test_ready_circles_of_confusion_need_no_camera(scene: Path, image: Tensor, run: Run) -> None:
+def test_ready_circles_of_confusion_need_no_camera(image: Tensor, run: Run) -> None:
     coc_px = torch.linspace(-3, 3, 24).expand(1, 1, 16, 24)
     np.save("coc.npy", coc_px.numpy())
     line = run("render image.exr coc.npy -o out.exr --depth-kind coc")
@@ -203,7 +202,7 @@ def test_mistakes_are_one_warning_a_sequence_and_errors_where_strict(scene: Path
     assert CliRunner().invoke(app, fitting.split()).stderr == ""
 
 
-def test_warnings_of_depth_can_be_silenced(scene: Path, depth: Tensor) -> None:
+def test_warnings_of_depth_can_be_silenced(depth: Tensor) -> None:
     np.save("depth.npy", depth.numpy() * 1000)
     command = [sys.executable, "-W", "ignore", "-m", "torchdof", *f"{ONE} {LENS}".split()]
     told = subprocess.run(command, capture_output=True, text=True)
@@ -211,7 +210,7 @@ def test_warnings_of_depth_can_be_silenced(scene: Path, depth: Tensor) -> None:
 
 
 @pytest.mark.parametrize("place", ["everywhere alike", "across the field"])
-def test_table_of_three_colours_blurs_alpha_like_green(scene: Path, image: Tensor, run: Run, place: str) -> None:
+def test_table_of_three_colours_blurs_alpha_like_green(image: Tensor, run: Run, place: str) -> None:
     table = torchdof.BlurTable("gaussian", coc=[1.0], params={"sigma": [[0.2], [0.5], [0.9]]})
     if place == "across the field":
         sizes = torch.tensor([0.2, 0.1, 0.3, 0.2]).reshape(2, 2, 1).expand(2, 2, 3)
@@ -226,7 +225,7 @@ def test_table_of_three_colours_blurs_alpha_like_green(scene: Path, image: Tenso
     assert not torch.allclose(out[:, 0], out[:, 1], atol=1e-3)
 
 
-def test_show_focus_draws_outlines_by_zone_and_keeps_all_other_colours(scene: Path, run: Run) -> None:
+def test_show_focus_draws_outlines_by_zone_and_keeps_all_other_colours(run: Run) -> None:
     colours = torch.tensor([0.3, 0.1, 0.2])[:, None, None].expand(1, 3, 16, 24).clone()
     colours[..., 8:, :] *= 0.2  # an outline across all three zones
     write_image("photo.exr", Picture(colours, sample="float"))
@@ -245,7 +244,7 @@ def test_show_focus_draws_outlines_by_zone_and_keeps_all_other_colours(scene: Pa
     assert torch.equal(tinted[0, 0, :, :6], tinted[0, 2, :, :6])
 
 
-def test_json_says_for_programs_what_the_line_says(scene: Path, depth: Tensor, run: Run) -> None:
+def test_json_says_for_programs_what_the_line_says(depth: Tensor, run: Run) -> None:
     run(f"{SEQUENCE} --focus-m 2 --frames 1-1 {LENS}")
     printed = run(f"{SEQUENCE} --focus-m inf {LENS} --resume --json --attention 18,8,4")
     there, *frames = [json.loads(line) for line in printed.splitlines()]
@@ -267,7 +266,7 @@ def test_json_says_for_programs_what_the_line_says(scene: Path, depth: Tensor, r
     assert frames[0]["seconds"] > 0
 
 
-def test_metadata_bits_and_transfer_of_the_result_are_as_asked(scene: Path, image: Tensor, run: Run) -> None:
+def test_metadata_bits_and_transfer_of_the_result_are_as_asked(image: Tensor, run: Run) -> None:
     write_image("photo.jpg", Picture(image, metadata={"Make": ("string", "Maker"), "FNumber": ("float", 2.0)}))
     run("render photo.jpg depth.npy -o out.jpg --focus-m 2")
     metadata = read_image("out.jpg").metadata
@@ -281,7 +280,7 @@ def test_metadata_bits_and_transfer_of_the_result_are_as_asked(scene: Path, imag
     torch.testing.assert_close(pixels("again.exr"), image, rtol=0, atol=1e-5)
 
 
-def test_sequence_follows_the_focus_of_its_keyframes(scene: Path, image: Tensor, depth: Tensor, run: Run) -> None:
+def test_sequence_follows_the_focus_of_its_keyframes(image: Tensor, depth: Tensor, run: Run) -> None:
     lines = run(f"{SEQUENCE} --focus-m 1:2,3:6 {LENS}").splitlines()
     told = [re.search(r"out.(\d+).exr: focus ([\d.]+) m", line).groups() for line in lines]  # type: ignore[union-attr]
     assert told == [("0001", "2"), ("0002", "3"), ("0003", "6")]
