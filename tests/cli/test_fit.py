@@ -3,16 +3,17 @@
 import functools
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-from click.testing import CliRunner, Result
 from torch import Tensor
 
 from torchdof import BlurTable, blur_by_coc
-from torchdof.cli.main import app
 from torchdof.fit.lens import trace
+
+Run = Callable[..., str]
 
 
 def kernel(distance: float) -> tuple[str, dict[str, float]]:
@@ -28,51 +29,46 @@ def folder(simulator: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> P
     )
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["fit", *map(str, arguments)])
-
-
-def test_a_folder_becomes_a_table_with_pictures(folder: Path, tmp_path: Path) -> None:
-    result = run(folder, "-o", tmp_path / "mine.json", "--plots", tmp_path / "pictures")
-    assert result.exit_code == 0, result.output
+def test_a_folder_becomes_a_table_with_pictures(run: Run, folder: Path, tmp_path: Path) -> None:
+    told = run("fit", folder, "-o", tmp_path / "mine.json", "--plots", tmp_path / "pictures")
     table = BlurTable.load(tmp_path / "mine.json")
     assert table.family == "disc" and len(table.coc) == 3 and table.name == "my lens"
     assert table.provenance["command"].startswith("torchdof fit ")
-    assert all(words in result.output for words in ("±", "family: disc", "x noise")) and "warning" not in result.output
+    assert all(words in told for words in ("±", "family: disc", "x noise")) and "warning" not in told
     assert sorted(f.name for f in (tmp_path / "pictures").iterdir()) == [
         "mine_1000mm.png", "mine_400mm.png", "mine_800mm.png", "mine_table.png", "mine_texture.png",
     ]  # fmt: skip
 
 
-def test_pictures_whose_transfer_nobody_stated_are_said(folder: Path, tmp_path: Path) -> None:
+def test_pictures_whose_transfer_nobody_stated_are_said(run: Run, folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder, tmp_path / "lens")
     manifest = tmp_path / "lens" / "capture.toml"
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
-    result = run(tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc")
-    assert result.exit_code == 0, result.output
-    assert "warning: " in result.output and "nobody said how 0500mm.png and 3 more are encoded" in result.output
-    facts = json.loads(run(tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json").stdout)
+    told = run("fit", tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc")
+    assert "warning: " in told and "nobody said how 0500mm.png and 3 more are encoded" in told
+    facts = json.loads(run("fit", tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json"))
     assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
     assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
     assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"])
     assert "nobody said how 0500mm.png" in facts["warnings"][0]
 
 
-def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(simulator: ModuleType, tmp_path: Path) -> None:
+def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(
+    run: Run, simulator: ModuleType, tmp_path: Path
+) -> None:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
     grid = [(-60, 0), (60, 0)]
     folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], kernel, grid=grid, width=240, height=120)
     manifest = folder / "capture.toml"
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
     options = ("-o", tmp_path / "mine.json", "--family", "disc", "--dots", "each")
-    result = run(folder, *options)
-    assert result.exit_code == 0, result.output
-    assert "dot 1 at" in result.output and result.output.count("nobody said how") == 1
-    lines = run(folder, *options, "--json").stdout.splitlines()  # each is for a table of its own
+    told = run("fit", folder, *options)
+    assert "dot 1 at" in told and told.count("nobody said how") == 1
+    lines = run("fit", folder, *options, "--json").splitlines()  # each is for a table of its own
     assert ["nobody said how" in json.loads(line)["warnings"][0] for line in lines] == [True, True]
 
 
-def test_a_polygon_becomes_a_table_with_its_blades(simulator: ModuleType, tmp_path: Path) -> None:
+def test_a_polygon_becomes_a_table_with_its_blades(run: Run, simulator: ModuleType, tmp_path: Path) -> None:
     camera = simulator.Simulator(level=0.7, snr_db=46, dot_radius=7.0, black=0.02)
 
     def hexagon(distance: float) -> tuple[str, dict[str, float]]:
@@ -80,33 +76,30 @@ def test_a_polygon_becomes_a_table_with_its_blades(simulator: ModuleType, tmp_pa
 
     folder = simulator.write_captures(tmp_path / "lens", camera, 0.5, [0.8], hexagon, width=110, height=90)
     out = tmp_path / "mine.json"
-    result = run(folder, "-o", out, "--family", "polygon", "--plots", tmp_path)
-    assert result.exit_code == 0, result.output
+    told = run("fit", folder, "-o", out, "--family", "polygon", "--plots", tmp_path)
     table = BlurTable.load(out)
     assert table.family == "disc" and table.aperture is not None and table.aperture.blades == 6
-    assert "6 blades" in result.output and (tmp_path / "mine_800mm.png").is_file()
+    assert "6 blades" in told and (tmp_path / "mine_800mm.png").is_file()
 
 
-def test_a_lens_becomes_a_table(tmp_path: Path) -> None:
+def test_a_lens_becomes_a_table(run: Run, tmp_path: Path) -> None:
     arguments = ("--lens", "double_gauss_50mm", "--f-number", "4", "--nodes", "5", "-o", tmp_path / "lens.json")
-    result = run(*arguments)
-    assert result.exit_code == 0, result.output
-    facts = json.loads(run(*arguments, "--json").stdout)
+    told = run("fit", *arguments)
+    facts = json.loads(run("fit", *arguments, "--json"))
     assert facts["out"] == str(tmp_path / "lens.json") and facts["f_number"] == 4.0 and facts["family"] == "radial"
     assert BlurTable.load(tmp_path / "lens.json").unit == "mm"
-    told = " ".join(result.output.split())
+    told = " ".join(told.split())
     assert "50.3582 mm, f/4, focus 2.0 m; 5 distances from" in told and "family: radial, residual" in told
 
 
-def test_the_target_is_written_and_nothing_else(tmp_path: Path) -> None:
-    result = run("--target", tmp_path / "target.pdf", "--paper", "letter")
-    assert result.exit_code == 0, result.output
-    assert (tmp_path / "target.pdf").read_bytes().startswith(b"%PDF") and "print it at 100 %" in result.output
+def test_the_target_is_written_and_nothing_else(run: Run, tmp_path: Path) -> None:
+    told = run("fit", "--target", tmp_path / "target.pdf", "--paper", "letter")
+    assert (tmp_path / "target.pdf").read_bytes().startswith(b"%PDF") and "print it at 100 %" in told
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_photographs_of_the_target_become_a_table_and_a_sheet(
-    simulator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, simulator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulator.write_photographs(tmp_path / "phone", 0.2, [0.4], width=560, tone=0.0, noise=0.004)
     rendered = []
@@ -116,9 +109,8 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(
         return blur_by_coc(image, coc_px, table=table)
 
     monkeypatch.setattr("torchdof.cli.fitted.blur_by_coc", recorded)
-    result = run(tmp_path / "phone", "-o", tmp_path / "phone.json", "--family", "disc")
-    assert result.exit_code == 0, result.output
-    told = " ".join(result.output.split())
+    told = run("fit", tmp_path / "phone", "-o", tmp_path / "phone.json", "--family", "disc")
+    told = " ".join(told.split())
     assert "in focus" in told and "better: 1 distances out of focus: five to nine" in told
     table = BlurTable.load(tmp_path / "phone.json")
     assert table.unit == "mm" and table.provenance["sharp"] == "img_0000.jpg"
@@ -129,25 +121,20 @@ def test_photographs_of_the_target_become_a_table_and_a_sheet(
     assert photograph.shape[-1] > 60 and photograph.max() > 0.7 and photograph[..., :5].max() < 0.1
 
 
-def test_field_and_wavelengths_of_a_lens(tmp_path: Path) -> None:
-    (tmp_path / "single.txt").write_text("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
-    options = ("--lens", tmp_path / "single.txt", "--f-number", "8", "--nodes", "5", "-o", tmp_path / "lens.json")
-    result = run(*options, "--wavelengths", "rgb")
-    assert result.exit_code == 0, result.output
-    assert BlurTable.load(tmp_path / "lens.json").channels == 3
-
-
-def test_a_lens_is_traced_across_its_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lens_is_traced_in_its_colours_and_across_its_field(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     few = functools.partial(trace.trace_table, field_nodes=2, field_rays=2000)
     monkeypatch.setattr(trace, "trace_table", few)
-    (tmp_path / "single.txt").write_text("50 5 1.5168 20\n0 1 0 8\n-50 0 1 20\n")
+    (tmp_path / "single.txt").write_text("50 5 1.5168/64.17 20\n0 1 0 8\n-50 0 1 20\n")
     file = tmp_path / "lens.json"
     options = ("--lens", tmp_path / "single.txt", "--f-number", "8", "--nodes", "5", "-o", file)
-    result = run(*options, "--field", "0,6,12")
-    assert result.exit_code == 0, result.output
-    assert "across the field: [0.0, 6.0, 12.0] mm" in result.output
-    drawn = CliRunner().invoke(app, ["tables", str(file), "-o", str(tmp_path / "table.png")])
-    assert "distances to 12" in drawn.output and (tmp_path / "table.png").is_file()
+    run("fit", *options, "--wavelengths", "rgb")
+    assert BlurTable.load(file).channels == 3
+    told = run("fit", *options, "--field", "0,6,12")
+    assert "across the field: [0.0, 6.0, 12.0] mm" in told
+    drawn = run("tables", file, "-o", tmp_path / "table.png")
+    assert "distances to 12" in drawn and (tmp_path / "table.png").is_file()
     field = BlurTable.load(file).field
     assert field is not None and field.radius.tolist() == [0.0, 6.0, 12.0]
     assert 1.02 * field.box[0, 0, 1] < field.box[0, 2, 1]  # a single lens is worse off its axis

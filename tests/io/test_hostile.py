@@ -1,8 +1,11 @@
-"""Files that lie, are damaged, too large, or of a kind that is not read: refused by name, in one line, without harm."""
+"""Files that lie, are damaged, too large, or of a kind that is not read: refused by name, in one line, without harm.
 
-import io
+Files with any bytes changed: tests/fuzz.
+"""
+
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -17,11 +20,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from torchdof import BlurTable
-from torchdof.depth.reading import read_depth
 from torchdof.io import foreign
 from torchdof.io.decode import MOST_ATTRIBUTES
 from torchdof.io.images import Picture, read_image, read_values, write_image
@@ -29,10 +29,6 @@ from torchdof.io.images import Picture, read_image, read_values, write_image
 pytestmark = pytest.mark.hard
 
 Made = Callable[[Path], object]
-FUZZ = settings(
-    max_examples=max(100, settings().max_examples // 5),
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
 KINDS = {".png": "8", ".tif": "float", ".exr": "half", ".jpg": "8", ".hdr": "float", ".pfm": "float"}
 
 
@@ -72,12 +68,9 @@ def with_array(array: Any, cut: int | None = None) -> Made:
     return make
 
 
-def with_member(name: str) -> Made:
-    def make(path: Path) -> None:
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr(name, "no array")
-
-    return make
+def with_member(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(path.stem, "no array")
 
 
 def loop(path: Path) -> None:
@@ -158,18 +151,13 @@ FILES: list[tuple[str, Made | None, str | None, str | None]] = [
     ("cut.npy", with_array(np.zeros((50, 50)), cut=500), None, "cannot be read as an array"),
     ("junk.npy", with_bytes(b"\x93NUMPY junk"), None, "cannot be read as an array"),
     ("large.npy", large_map, None, "claims 16384 x 32768 pixels"),
-    *((f"{m}.npz", with_member(m), None, "cannot be read as an array") for m in ("depth.txt", "depth", "depth.npy")),
+    *((f"{m}.npz", with_member, None, "cannot be read as an array") for m in ("depth.txt", "depth", "depth.npy")),
 ]
 
 
 @pytest.mark.parametrize(("name", "make", "image", "values"), FILES, ids=[file[0] for file in FILES])
 def test_a_file_that_is_not_what_it_should_be_is_refused_by_name_in_one_line(
-    name: str,
-    make: Made | None,
-    image: str | None,
-    values: str | None,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, make: Made | None, image: str | None, values: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     if make is not None:
@@ -227,19 +215,13 @@ def test_names_that_are_no_utf_8_are_read_and_written(tmp_path: Path) -> None:
         write_image(folder / f"x{suffix}", tiny(), sample=sample)  # type: ignore[arg-type]
         named = folder / (os.fsdecode(b"\xe9") + suffix)
         (folder / f"x{suffix}").rename(named)
-        assert torch.equal(read_image(named).pixels, read_image(shutil_copy(named, tmp_path)).pixels)
+        assert torch.equal(read_image(named).pixels, read_image(shutil.copy(named, tmp_path / f"copy{suffix}")).pixels)
     np.save(folder / os.fsdecode(b"\xe9.npy"), np.ones((2, 3)))
     assert read_values(folder / os.fsdecode(b"\xe9.npy")).mean() == 1.0
     BlurTable.disc().save(folder / "x.json")
     named.write_bytes(TEXT)
     with pytest.raises(OSError, match="is not a PFM file"):
         read_image(named)
-
-
-def shutil_copy(path: Path, folder: Path) -> Path:
-    copy = folder / f"copy{path.suffix}"
-    copy.write_bytes(path.read_bytes())
-    return copy
 
 
 # Damage
@@ -253,32 +235,6 @@ def test_a_truncated_file_is_refused(tmp_path: Path, suffix: str, sample: Any, s
     (tmp_path / f"cut{suffix}").write_bytes(content[: int(len(content) * share)])
     with pytest.raises(OSError, match=r"cut\.\w+: (is damaged or cut short|is cut short|cannot be read)"):
         read_image(tmp_path / f"cut{suffix}")
-
-
-@pytest.mark.parametrize("suffix", [*KINDS, ".npy", ".npz"])
-@FUZZ
-@given(st.data())
-def test_a_file_with_bytes_changed_is_read_or_refused_by_name(suffix: str, tmp_path: Path, data: Any) -> None:
-    path = tmp_path / f"x{suffix}"
-    if not path.exists():
-        array = np.linspace(1, 2, 12, dtype=np.float32).reshape(3, 4)
-        stored = io.BytesIO()
-        np.savez_compressed(stored, depth=array) if suffix == ".npz" else np.save(stored, array)
-        (tmp_path / f"whole{suffix}").write_bytes(stored.getvalue())
-        if suffix in KINDS:
-            write_image(tmp_path / f"whole{suffix}", tiny())
-        path.touch()
-    content = bytearray((tmp_path / f"whole{suffix}").read_bytes())
-    # mostly in the header, where sizes and offsets are
-    places = st.integers(0, min(len(content), 400) - 1) | st.integers(0, len(content) - 1)
-    for place, value in data.draw(st.lists(st.tuples(places, st.integers(0, 255)), min_size=1, max_size=6)):
-        content[place] = value
-    path.write_bytes(content[: data.draw(st.integers(1, len(content)) | st.just(len(content)))])
-    for read in (read_image, read_values) if suffix in KINDS else (lambda p: read_depth(p, fill="far"),):
-        try:
-            read(path)
-        except (ValueError, OSError) as error:
-            assert path.name in str(error)
 
 
 SILENT = """
@@ -307,31 +263,6 @@ def test_no_library_prints_a_line_of_its_own_about_a_damaged_picture(tmp_path: P
     call = [sys.executable, "-c", SILENT, *KINDS]
     run = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert (run.returncode, run.stdout, run.stderr.split()) == (0, "", [*KINDS])
-
-
-def two_parts(path: Path) -> None:
-    specs = [oiio.ImageSpec(16, 16, channels, "float") for channels in (3, 1)]
-    specs[1].channelnames = ("Z",)
-    for spec, name in zip(specs, ("beauty", "z"), strict=True):
-        spec.attribute("name", name)
-    output = oiio.ImageOutput.create(str(path))
-    assert output is not None and output.open(str(path), tuple(specs))
-    assert output.write_image(np.ones((16, 16, 3), np.float32))
-    assert output.open(str(path), specs[1], "AppendSubimage")
-    assert output.write_image(np.ones((16, 16, 1), np.float32)) and output.close()
-
-
-@pytest.mark.parametrize("place", range(4, 120, 5))
-@pytest.mark.parametrize("value", [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f"])
-def test_hostile_sizes_in_headers_of_an_exr_are_refused_by_name(tmp_path: Path, place: int, value: bytes) -> None:
-    path = tmp_path / "x.exr"
-    two_parts(path)
-    content = path.read_bytes()
-    path.write_bytes(content[:place] + value + content[place + 4 :])
-    try:
-        read_image(path)
-    except (ValueError, OSError) as error:
-        assert "x.exr" in str(error)
 
 
 def with_attributes(path: Path, count: int) -> None:

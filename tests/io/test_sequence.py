@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -44,18 +45,14 @@ def test_frame_ranges_are_read(text: str, expected: tuple[int, int]) -> None:
     assert parse_frames(text) == expected
 
 
-@pytest.mark.parametrize("text", ["", "a", "1-", "5-1", "1,2", "1.5"])
-def test_other_frame_ranges_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="--frames"):
-        parse_frames(text)
+FOCUS = ["", "near", "0", "-1", "nan", "1:2,", "1:2,1:3", "1:2,3", "2,3", "1:0", "x:2", "1.5:2", "1:2:3"]
+FRAMES = ["", "a", "1-", "5-1", "1,2", "1.5"]
 
 
-@pytest.mark.parametrize(
-    "text", ["", "near", "0", "-1", "nan", "1:2,", "1:2,1:3", "1:2,3", "2,3", "1:0", "x:2", "1.5:2", "1:2:3"]
-)
-def test_other_focus_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match=r"--focus-m expects metres \(2.0\) or keyframes"):
-        parse_focus(text)
+@pytest.mark.parametrize(("read", "text"), [*((parse_focus, t) for t in FOCUS), *((parse_frames, t) for t in FRAMES)])
+def test_other_texts_are_refused(read: Callable[[str], object], text: str) -> None:
+    with pytest.raises(ValueError, match=r"--frames|--focus-m expects metres \(2.0\) or keyframes"):
+        read(text)
 
 
 def test_focus_between_keyframes_is_linear_in_dioptres_and_held_outside() -> None:

@@ -136,9 +136,9 @@ class Bench:
             raise ValueError("compiled and exported graphs have one kernel a layer; leave --onnx and --compile out")
         scene = dataclasses.replace(shipped() if self.image is None else self._read(self.image), table=table)
         chosen: dict[speed.Runtime, bool] = {"onnxruntime": self.speed.onnx, "compiled": self.speed.compiled}
-        runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)
+        runtimes = [runtime for runtime, is_chosen in chosen.items() if is_chosen]
         rows = speed.compare(scene, self.speed.repeat, console, runtimes, self.speed.scan)
         if self.as_json:
             facts = {"scene": scene.name, "remark": scene.remark, "table": repr(scene.table)}

@@ -123,14 +123,14 @@ def _parameters(kind: type[Any], group: str) -> Iterator[tuple[click.Parameter, 
 
 def _parameter(field: Any, hint: Any) -> click.Parameter:
     """The argument or option that a field is."""
-    facts, required = field.metadata, field.default is dataclasses.MISSING
+    facts, required, read = field.metadata, field.default is dataclasses.MISSING, field.metadata["read"]
     if typing.get_origin(hint) in (types.UnionType, typing.Union):
         hint = typing.get_args(hint)[0]
-    several = typing.get_origin(hint) is tuple and facts["read"] is None
+    several = typing.get_origin(hint) is tuple and read is None
     hint = typing.get_args(hint)[0] if several else hint
     given: dict[str, Any] = {"help": facts["help"], "metavar": facts["metavar"], "required": required}
-    if facts["read"] is not None:
-        given["type"] = click.STRING
+    if read is not None:
+        given |= {"type": click.STRING, "callback": lambda _, __, text: None if text is None else read(text)}
     elif typing.get_origin(hint) is Literal:
         given["type"] = click.Choice(typing.get_args(hint))
     else:
@@ -148,11 +148,8 @@ def _parameter(field: Any, hint: Any) -> click.Parameter:
 
 def _made(kind: type[Any], values: dict[str, Any]) -> Any:
     """An object of a class, and of the classes in it, from the values of all their fields."""
-    made = {}
-    for field, hint in _fields(kind):
-        if dataclasses.is_dataclass(hint):
-            made[field.name] = _made(hint, values)  # type: ignore[arg-type]
-        else:
-            value, read = values[field.name], field.metadata["read"]
-            made[field.name] = value if read is None or value is None else read(value)
+    made = {
+        field.name: _made(hint, values) if dataclasses.is_dataclass(hint) else values[field.name]  # type: ignore[arg-type]
+        for field, hint in _fields(kind)
+    }
     return kind(**made)

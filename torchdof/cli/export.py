@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .command import option
-from .options import Accuracy, Blur, Sensor, edges_of, edges_option, json_option
+from .options import Accuracy, Blur, Sensor, edges_option, json_option
 from .printed import Bar, tell
 
 __all__ = ["Export"]
@@ -80,7 +80,7 @@ class Export:
         else:
             camera = Camera.from_fov(self.sensor.fov_deg, 0.01, 2.0)  # aperture and focus are inputs of the graph
         dof = DepthOfField(camera, self.blur.chosen(), **self.accuracy.options(), max_coc_px=self.max_coc, check=False)
-        graph = {**dataclasses.asdict(self.graph), "depth_edges": edges_of(self.depth_edges)}
+        graph = {**dataclasses.asdict(self.graph), "depth_edges": self.depth_edges.replace("-", " ")}
         with Bar("tracing") as bar:
             report = to_onnx(dof, out, **graph, progress=bar.update)
         tell(self.as_json, {"out": str(out), **dataclasses.asdict(report)}, f"{report}\nwrote {out}")

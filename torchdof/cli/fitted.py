@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -68,21 +68,18 @@ def trace_lens(said: Fit, source: str) -> None:
 def fit_photographs(said: Fit, folder: Path) -> None:
     """Fits photographs of the target, or the dots of a manifest, tells how well, and writes their tables."""
     options, photographs, shown = said.photographs, None, Shown(quiet=said.as_json)
+    colours, dots = (None if value == "manifest" else value for value in (options.colours, options.dots))
     with _heard() as doubts:
         if folder.is_dir() and not (folder / MANIFEST).is_file():
-            colours: Literal["mean", "each"] = "each" if options.colours == "each" else "mean"
-            photographs = read_photographs(folder, square_mm=said.target.square_mm, colours=colours, root=options.root)
+            each: Any = colours or "mean"
+            photographs = read_photographs(folder, square_mm=said.target.square_mm, colours=each, root=options.root)
             capture_sets = [photographs.captures]
+            shown.photographs(photographs)
         else:
-            dots = None if options.dots == "manifest" else options.dots
-            colour = None if options.colours == "manifest" else options.colours
-            capture_sets = read_captures(str(folder), dots=dots, colours=colour, root=options.root)
-    if photographs is not None:
-        shown.photographs(photographs)
+            capture_sets = read_captures(str(folder), dots=dots, colours=colours, root=options.root)  # type: ignore[arg-type]
     across = photographs is None and capture_sets[0].notes["dots"] == "field"
     command = f"torchdof fit {folder.name} --family {options.family} --accuracy-db {options.accuracy_db:g}"
-    told = set[str]()
-    fitted: list[tuple[Captures, TableFit]] = []
+    told, fitted = set[str](), list[tuple[Captures, TableFit]]()
     for i, captures in enumerate(capture_sets):
         table_file = said.out if len(capture_sets) == 1 else said.out.with_name(f"{said.out.stem}_{i:02d}.json")
         if len(capture_sets) > 1:
@@ -108,8 +105,7 @@ def fit_photographs(said: Fit, folder: Path) -> None:
             facts["advice"] = list(photographs.advice)
         shown.facts(facts)
         if said.plots is not None and photographs is None:
-            shown.draw_fits(captures, result, said.plots, table_file.stem)
-            shown.draw(result.table, said.plots, table_file.stem)
+            shown.draw(result.table, said.plots, table_file.stem, captures, result)
     if across:
         shown.write(table_of_dots(fitted), said.out)
 
@@ -127,21 +123,19 @@ def _heard() -> Iterator[list[str]]:
 def _facts_of(captures: Captures, result: TableFit) -> dict[str, Any]:
     """What :meth:`Shown.fit` tells, for programs."""
     of_fit = ("params", "stderr", "residual", "residual_over_noise", "magnification")
-    fits = [
-        {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fitted, name) for name in of_fit}}
-        for pair, fitted, coc in zip(captures, result.fits, result.coc_px, strict=True)
-    ]
-    colours = [
-        {
-            "name": colour.name,
-            "radius_px": [f.radius for f in colour.fits],
-            "focus_shift_dioptres": colour.focus_shift_dioptres,
-            "lateral_px": colour.lateral_px,
-        }
-        for colour in result.colours
-    ]
-    chosen = {"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale}
-    return {**chosen, "focus_m": captures.focus_m, "fits": fits, "colours": colours}
+    of_colour = ("name", "focus_shift_dioptres", "lateral_px")
+    return {
+        **{"name": captures.name, "family": result.fits[0].family, "why": result.why, "scale": result.scale},
+        "focus_m": captures.focus_m,
+        "fits": [
+            {"distance_m": pair.distance_m, "coc_px": coc, **{name: getattr(fit, name) for name in of_fit}}
+            for pair, fit, coc in zip(captures, result.fits, result.coc_px, strict=True)
+        ],
+        "colours": [
+            {**{name: getattr(colour, name) for name in of_colour}, "radius_px": [fit.radius for fit in colour.fits]}
+            for colour in result.colours
+        ],
+    }
 
 
 class Shown:
@@ -226,21 +220,24 @@ class Shown:
         else:
             self._save(sheet, target)
 
-    def draw_fits(self, captures: Captures, result: TableFit, folder: Path, stem: str) -> None:
-        """Draws each distance's fit."""
-        from torchdof.fit.plots import picture_of_fit
+    def draw(
+        self,
+        table: BlurTable,
+        folder: Path,
+        stem: str,
+        captures: Captures | None = None,
+        result: TableFit | None = None,
+    ) -> None:
+        """Draws each distance's fit, a table over depth, and the blur texture of its largest circle of confusion."""
+        from torchdof.fit import plots
 
-        for pair, fitted in zip(captures, result.fits, strict=True):
-            self._save(picture_of_fit(fitted), folder / f"{stem}_{pair.distance_m * 1000:.0f}mm.png")
-
-    def draw(self, table: BlurTable, folder: Path, stem: str) -> None:
-        """Draws a table over depth, and the blur texture of its largest circle of confusion."""
-        from torchdof.fit.plots import picture_of_table, picture_of_texture
-
-        self._save(picture_of_table(table), folder / f"{stem}_table.png")
+        if captures is not None and result is not None:
+            for pair, fit in zip(captures, result.fits, strict=True):
+                self._save(plots.picture_of_fit(fit), folder / f"{stem}_{pair.distance_m * 1000:.0f}mm.png")
+        self._save(plots.picture_of_table(table), folder / f"{stem}_table.png")
         scales = {"fraction": float(_WIDTH), "mm": _WIDTH / (table.sensor_width_mm or 36.0), "relative": 16.0}
         largest = float(table.coc[table.coc.abs().argmax()]) * scales[table.unit]
-        self._save(picture_of_texture(table, largest, _WIDTH), folder / f"{stem}_texture.png")
+        self._save(plots.picture_of_texture(table, largest, _WIDTH), folder / f"{stem}_texture.png")
 
     def _save(self, figure: Any, target: Path) -> None:
         """Writes a figure, whole or not at all."""

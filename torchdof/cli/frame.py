@@ -24,7 +24,7 @@ from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect
-from .options import Scene, edges_of, pick_device, refuse_input
+from .options import Scene, pick_device, refuse_input
 from .printed import Bar, WarnOnce, tell
 
 if TYPE_CHECKING:
@@ -53,8 +53,8 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     With ``holes``, those that nobody said how to fill stay NaN; otherwise they are a ``ValueError``.
     """
     start, name, fill = time.perf_counter(), str(depth or image), scene.depth_map.fill_depth
-    picture = read_image(image, **encoding)
-    values, filled = _metres(image, depth, picture, scene), 0
+    picture, filled = read_image(image, **encoding), 0
+    values = _metres(image, depth, picture, scene)
     if fill is not None or not holes:
         values, filled = resolve_holes(values, name, fill)  # type: ignore[arg-type]
     return Frame(name, picture, values, filled, time.perf_counter() - start)
@@ -62,33 +62,30 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
 
 def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> Tensor:
     """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes."""
-    said, name, width = scene.depth_map, str(depth or image), picture.pixels.shape[-1]
+    said, name, pixels = scene.depth_map, str(depth or image), picture.pixels
+    kind = said.depth_kind
     if depth is not None or said.depth_channel is not None:
         values = read_values(depth or image, said.depth_channel)
     elif picture.depth is not None:
         values = picture.depth
     else:
         raise ValueError(f"{image}: has no depth channel; name a depth file after it: IMAGE DEPTH")
-    is_coc, sizes = said.depth_kind == "coc", [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, picture.pixels)]
-    if is_coc and sizes[0] != sizes[1]:
+    sizes = [f"{t.shape[-1]} x {t.shape[-2]}" for t in (values, pixels)]
+    if kind == "coc" and sizes[0] != sizes[1]:
         raise ValueError(f"{name}: coc is {sizes[0]} pixels but the image is {sizes[1]}; they must be the same")
     try:
-        same_aspect(picture.pixels, values)
-        if said.depth_kind == "relative":
-            ends, kind = (said.near_m or 0.0, said.far_m or 0.0), said.relative_kind or "disparity"
-            metres = from_relative(values, *ends, kind, value_range=said.value_range, unknown=said.depth_unknown)
-            return at_size_of(picture.pixels, metres)
+        same_aspect(pixels, values)
+        if kind == "relative":
+            ends, relative = (said.near_m or 0.0, said.far_m or 0.0), said.relative_kind or "disparity"
+            values = from_relative(values, *ends, relative, value_range=said.value_range, unknown=said.depth_unknown)
+            return at_size_of(pixels, values)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
+    view_deg = scene.lens.view_deg(picture.metadata, pixels.shape[-1]) if kind == "distance" else None
     metres = depth_from_values(
-        values,
-        said.depth_kind,
-        scale=said.depth_scale,
-        offset=said.depth_offset,
-        unknown=said.depth_unknown,
-        fov_x_deg=scene.lens.view_deg(picture.metadata, width) if said.depth_kind == "distance" else None,
+        values, kind, scale=said.depth_scale, offset=said.depth_offset, unknown=said.depth_unknown, fov_x_deg=view_deg
     )
-    return metres if is_coc else at_size_of(picture.pixels, metres)
+    return metres if kind == "coc" else at_size_of(pixels, metres)
 
 
 def coc_of(
@@ -125,13 +122,6 @@ class Rendered:
     facts: dict[str, Any]
     seconds: float
 
-    def tell(self, as_json: bool) -> None:
-        """Prints one line."""
-        facts = {"out": str(self.out), **self.facts, "seconds": self.seconds}
-        remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
-        words = [*self.words, f"{facts['width']} x {facts['height']}", f"{self.seconds:.2f} s on {facts['device']}"]
-        tell(as_json, facts, f"{self.out}: {'; '.join(words)}{remarks}")
-
 
 class Renderer:
     """What ``torchdof render`` does with each frame: reads, renders and writes it."""
@@ -157,9 +147,10 @@ class Renderer:
             picture = dataclasses.replace(picture, channels=("R", "G", "B", "A")[: pixels.shape[1]])
         else:
             table = _with_alpha(self.table) if picture.has_alpha else self.table
-            blur: Callable[..., Tensor] = functools.partial(
-                blur_by_coc, table=table, depth_edges=edges_of(command.depth_edges), **command.accuracy.options()
-            )
+            options: dict[str, Any] = command.accuracy.options() | {
+                "depth_edges": command.depth_edges.replace("-", " ")
+            }
+            blur: Callable[..., Tensor] = functools.partial(blur_by_coc, table=table, **options)
             with torch.no_grad():
                 if command.lights:
                     pixels = _with_lights(picture, pixels, command.lights)
@@ -171,11 +162,15 @@ class Renderer:
         seconds = frame.seconds + time.perf_counter() - start
         return Rendered(out, dataclasses.replace(picture, pixels=pixels), words, facts, seconds)
 
-    def write(self, rendered: Rendered) -> Rendered:
-        """Writes the picture, whole or not at all, and adds the seconds that this took."""
-        start = time.perf_counter()
-        write_image(rendered.out, rendered.picture, self.command.files.out_transfer, self.command.files.bits)
-        return dataclasses.replace(rendered, seconds=rendered.seconds + time.perf_counter() - start)
+    def write(self, rendered: Rendered) -> None:
+        """Writes the picture, whole or not at all, and prints one line."""
+        start, files, out = time.perf_counter(), self.command.files, str(rendered.out)
+        write_image(rendered.out, rendered.picture, files.out_transfer, files.bits)
+        seconds = rendered.seconds + time.perf_counter() - start
+        facts = {"out": out, **rendered.facts, "seconds": seconds}
+        remarks = f" [{', '.join(facts['assumed'])}]" if facts["assumed"] else ""
+        words = [*rendered.words, f"{facts['width']} x {facts['height']}", f"{seconds:.2f} s on {facts['device']}"]
+        tell(self.command.as_json, facts, f"{out}: {'; '.join(words)}{remarks}")
 
     def _told(self, camera: Camera | None, largest_px: float, holes: int) -> tuple[list[str], dict[str, Any]]:
         """What was done to a frame, for people and for programs."""

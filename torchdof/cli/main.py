@@ -1,20 +1,60 @@
-"""The command line. Each command lives in a module of its own, which is imported when it is asked for."""
+"""The command line: each command is imported when it is asked for, and what is wrong with the input is one sentence."""
 
+import contextlib
+import errno
 import importlib
 import importlib.metadata
 import os
-import signal
-from types import FrameType
+import sys
+from collections.abc import Iterator
+from typing import Any
 
 import click
 
+from ..io.atomic import unwound_on_termination
 from .command import command_of
-from .errors import told_in_one_sentence
 
 __all__ = ["app", "main"]
 
 COMMANDS = ("render", "fit", "export", "bench", "inspect", "tables")
 """Each is a class in the module of its name."""
+
+_EXTRAS = {
+    **{"scipy": "fit", "threadpoolctl": "fit", "matplotlib": "plot"},
+    **{"onnx": "export", "onnxscript": "export", "onnxruntime": "export"},
+}
+_TOO_LITTLE = "there is too little memory for this image; try a smaller one, or --tolerance draft"
+# PyTorch's own words for it on the CPU are those of what it is built from
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "size calculation overflowed", "new thread")
+
+
+@contextlib.contextmanager
+def _told_in_one_sentence() -> Iterator[None]:
+    """Ends with code 2 and the message of errors of the input, files, memory and missing packages; others pass."""
+    try:
+        yield
+        return
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in _EXTRAS:
+            raise
+        message = f"this command needs {package}; install it with: pip install 'torchdof[{_EXTRAS[package]}]'"
+    except (OSError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno == errno.EPIPE:
+            raise
+        message = str(error) or type(error).__name__
+    except MemoryError:  # numpy's has a message of its own, about arrays
+        message = _TOO_LITTLE
+    except RuntimeError as error:
+        torch = sys.modules.get("torch")  # whoever ran out of a device's memory has imported it
+        if torch is not None and isinstance(error, torch.OutOfMemoryError):
+            message = "the device has too little memory for this image; try --device cpu"
+        elif any(words in str(error) for words in _NO_MEMORY):
+            message = _TOO_LITTLE
+        else:
+            raise
+    click.echo(f"error: {message}", err=True)
+    raise SystemExit(2)
 
 
 class _Commands(click.Group):
@@ -30,7 +70,7 @@ class _Commands(click.Group):
         return command_of(cmd_name, getattr(module, cmd_name.capitalize()))
 
     def invoke(self, ctx: click.Context) -> object:
-        with told_in_one_sentence():
+        with _told_in_one_sentence():
             return super().invoke(ctx)
 
 
@@ -42,22 +82,13 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
         ctx.exit()
 
 
+_VERSION: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _print_version}
+
+
 @click.group(cls=_Commands, context_settings={"max_content_width": 120})
-@click.option(
-    "--version",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_print_version,
-    help="Print the version and the engine in use.",
-)
+@click.option("--version", **_VERSION, help="Print the version and the engine in use.")
 def app() -> None:
     """Depth of field from an image and its depth: the photograph that a real lens would have taken."""
-
-
-def _end(number: int, _: FrameType | None) -> None:
-    """Ends the process as Ctrl-C does: what is being written is completed, or vanishes."""
-    raise SystemExit(128 + number)
 
 
 def main() -> None:
@@ -66,7 +97,5 @@ def main() -> None:
     # some. GNU's library and LLVM's read these when PyTorch is loaded; what the user set is left as it is.
     if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"} & set(os.environ):
         os.environ |= {"OMP_WAIT_POLICY": "passive", "KMP_BLOCKTIME": "0"}
-    for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) == signal.SIG_DFL:
-            signal.signal(getattr(signal, name), _end)
-    app(prog_name="torchdof")
+    with unwound_on_termination():
+        app(prog_name="torchdof")

@@ -24,28 +24,11 @@ if TYPE_CHECKING:
     from ..optics.blur_table import BlurTable
     from ..optics.camera import Camera
 
-__all__ = [
-    "Accuracy",
-    "Blur",
-    "DepthMap",
-    "Lens",
-    "Opening",
-    "Scene",
-    "Sensor",
-    "edges_of",
-    "edges_option",
-    "json_option",
-    "pick_device",
-    "refuse_input",
-]
+__all__ = ["Accuracy", "Blur", "DepthMap", "Lens", "Opening", "Scene", "Sensor"]
+__all__ += ["edges_option", "json_option", "pick_device", "refuse_input"]
 
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
-_FIXED_NAMES = {
-    "focus_range_m": "--focus-range",
-    "tilt_deg": "--tilt",
-    "swing_deg": "--swing",
-    "fov_x_deg": "--fov-deg",
-}
+_SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
 _IDEAL = ("disc", "gaussian")
 
 
@@ -113,51 +96,48 @@ class Lens(Sensor):
 
     def view_deg(self, metadata: Mapping[str, Any], width: int) -> float:
         """Horizontal field of view, stated or by focal length and sensor, which the file may know."""
-        facts = camera_facts(metadata, width)
-        focal_mm = self.focal_length_mm or facts.get("focal_length_mm")
-        sensor_mm = self.sensor_width_mm or facts.get("sensor_width_mm")
+        known = self._known(metadata, width)
         if self.fov_deg is not None:
             return self.fov_deg
-        if focal_mm is None or sensor_mm is None:
+        if not {"focal_length_mm", "sensor_width_mm"} <= set(known):
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
-        return 2 * math.degrees(math.atan(sensor_mm / (2 * focal_mm)))
+        return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
+
+    def _known(self, metadata: Mapping[str, Any], width: int) -> dict[str, float]:
+        """Numbers of the camera that the user or else the file states."""
+        stated = {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
+        return camera_facts(metadata, width) | stated
 
     def camera(
         self, metadata: Mapping[str, Any], depth: "Tensor", frame: int = 0, median: bool = False
     ) -> "tuple[Camera, list[str]]":
-        """The camera of one frame: what the user said, else the file's metadata, else 50 mm, f/2.8 and 36 mm.
+        """The camera of one frame, and remarks on what the user did not state: the file does, or it is assumed.
 
-        With ``median``, the focus is at the median depth where the user said nothing, whatever the file says.
-
-        Returns:
-            The camera and remarks on what was not stated.
-
-        Raises:
-            ValueError: If the focus is stated nowhere, or a number makes no lens; options are named.
+        With ``median``, the focus is at the median depth where the user said nothing, whatever the file says. Refuses
+        a focus that is stated nowhere, and numbers that make no lens, by the names of the options.
         """
         from ..optics.camera import Camera
 
-        facts, remarks, focus_m = camera_facts(metadata, depth.shape[-1]), list[str](), math.inf
+        known, remarks, focus_m = self._known(metadata, depth.shape[-1]), list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
         elif not self.has_focus and median:
             focus_m = float(depth[depth > 0].median())
             remarks.append("focus at the median depth")
         elif not self.has_focus:
-            if "focus_m" not in facts:
+            if "focus_m" not in known:
                 raise ValueError("where is the focus? give --focus-m METRES or --focus-at X,Y (the file does not say)")
-            focus_m = facts["focus_m"]
+            focus_m = known["focus_m"]
             remarks.append("focus from the file")
         if self.fov_deg is None:
-            lens = {name: getattr(self, name) for name in _ASSUMED}
-            for name in (name for name, stated in lens.items() if stated is None):
-                lens[name] = facts.get(name, _ASSUMED[name])
+            for name in (name for name in _ASSUMED if getattr(self, name) is None):
                 words = "f-number" if name == "f_number" else name.rsplit("_", 1)[0].replace("_", " ")
-                remarks.append(f"{words} {'from the file' if name in facts else 'assumed'}")
+                remarks.append(f"{words} {'from the file' if name in known else 'assumed'}")
         elif self.aperture_radius_m is None and self.f_number is None:
             raise ValueError("--fov-deg needs the opening of the lens: either --aperture-radius-m or --f-number")
         with _by_option(self._names()):
             if self.fov_deg is None:
+                lens: dict[str, Any] = {name: known.get(name, assumed) for name, assumed in _ASSUMED.items()}
                 camera = Camera(**lens, focus_m=focus_m)
             else:
                 radius_m = self.aperture_radius_m
@@ -180,11 +160,12 @@ class Lens(Sensor):
     def _names(self) -> dict[str, str]:
         """What the user knows a number of the camera as: the option that states it, or the file's own."""
         focus = "--focus-at" if self.focus_at else "--focus-range" if self.focus_range else "--focus-m"
-        names = {"focus_m": focus if self.has_focus else f"{focus} (not given)", **_FIXED_NAMES}
-        for name in (*_ASSUMED, "aperture_radius_m"):
-            given = getattr(self, name) is not None
-            names[name] = f"--{name.replace('_', '-')}" + ("" if given else " (not given)")
-        return names
+        given = {name: getattr(self, name) is not None for name in (*_ASSUMED, "aperture_radius_m")}
+        spelled = {name: f"--{name.replace('_', '-')}" for name in given} | {"focus_m": focus}
+        given["focus_m"] = self.has_focus
+        return _SPELLED | {
+            name: spelled[name] + ("" if is_given else " (not given)") for name, is_given in given.items()
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,9 +246,10 @@ class Opening:
     def __post_init__(self) -> None:
         if self.aperture is not None and (self.blades or self.curvature):
             raise ValueError("--aperture is the whole opening; leave --blades and --curvature out")
-        if self.blades == 0 and self.aperture is None and self.curvature:
+        is_round = self.blades == 0 and self.aperture is None
+        if is_round and self.curvature:
             raise ValueError("--curvature is that of blades; give --blades too")
-        if self.blades == 0 and self.aperture is None and self.rotation:
+        if is_round and self.rotation:
             raise ValueError("--rotation turns blades or an image; give --blades or --aperture too")
 
     def opening(self) -> "Aperture | None":
@@ -282,11 +264,7 @@ class Opening:
         return None if aperture.is_round and self.squeeze == 1.0 and not aperture.depends_on_place else aperture
 
     def table_of(self, name: str) -> "BlurTable":
-        """A table by its name, or by the path of its JSON file, with this opening in place of its own.
-
-        Raises:
-            FileNotFoundError: If there is no such table; the message lists those there are.
-        """
+        """A table by its name, or by the path of its JSON file, with this opening in place of its own."""
         from ..optics.blur_table import BlurTable
         from ..optics.table_file import shipped
 
@@ -337,11 +315,6 @@ def edges_option(default: str) -> Any:
         default,
         group="Depth map",
     )
-
-
-def edges_of(name: str) -> Any:
-    """What the library calls that."""
-    return name.replace("-", " ")
 
 
 def json_option() -> Any:

@@ -47,32 +47,27 @@ def json_line(facts: Mapping[str, Any]) -> str:
 class WarnOnce:
     """Warns of likely mistakes, a line each on standard error: what is wrong with a sequence is so in each frame.
 
-    Args:
-        strict: Raise instead of warning.
+    With ``strict`` a mistake is a ``ValueError``; else ``PYTHONWARNINGS=ignore`` silences them.
     """
 
     def __init__(self, strict: bool = False) -> None:
-        self._strict = strict
-        self._names: set[str] = set()
+        self._strict, self._names = strict, set[str]()
 
     def warn(self, source: str | os.PathLike[str], mistakes: "Iterable[Mistake]") -> None:
-        """Warns of each mistake of a kind that was not warned of before; ``PYTHONWARNINGS=ignore`` silences them.
-
-        Raises:
-            ValueError: If there is one, and strictness is asked for.
-        """
+        """Warns of each mistake of a kind that was not warned of before."""
         from ..depth.sanity import DepthWarning
 
         for mistake in mistakes:
+            message = f"{source}: {mistake.message}"
             if self._strict:
-                raise ValueError(f"{source}: {mistake.message} (--strict)")
+                raise ValueError(f"{message} (--strict)")
             if mistake.name in self._names:
                 continue
             self._names.add(mistake.name)
             with warnings.catch_warnings():
                 warnings.showwarning = _one_line
                 try:
-                    warnings.warn(f"{source}: {mistake.message}", DepthWarning, stacklevel=2)
+                    warnings.warn(message, DepthWarning, stacklevel=2)
                 except DepthWarning as warning:  # only strictness makes errors of them
                     _one_line(warning)
 
@@ -88,21 +83,18 @@ def _is_terminal() -> bool:
 class Bar:
     """A bar with an estimate on standard error, from the third second on, where that is a terminal.
 
-    Args:
-        what: What is being done.
-        total: How many steps there are; None where nobody knows.
+    It says what is being done, of how many steps in total; None where nobody knows.
     """
 
     def __init__(self, what: str, total: float | None = None) -> None:
         self.is_seen = _is_terminal()
         if self.is_seen:
+            from rich import progress
             from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-            columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
-            self._progress = Progress(
-                *columns,
-                TimeRemainingColumn(),
+            elapsed, remaining = progress.TimeElapsedColumn(), progress.TimeRemainingColumn()
+            self._progress = progress.Progress(
+                *(progress.TextColumn("{task.description}", markup=False), progress.BarColumn(), elapsed, remaining),
                 console=Console(stderr=True),
                 transient=True,
                 redirect_stdout=sys.stdout.isatty(),  # lines go above the bar; to a file they go as ever

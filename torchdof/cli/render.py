@@ -18,7 +18,7 @@ from .printed import Bar, json_line
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from .frame import Frame, Rendered, Renderer
+    from .frame import Frame, Renderer
 
 __all__ = ["Render"]
 
@@ -131,8 +131,7 @@ class Render:
         renderer = Renderer(self)
         with Bar(f"rendering {self.out.name}") as bar:
             frame = renderer.read(self.image, self.depth, self.out)
-            rendered = renderer.write(renderer.render(frame, self.out, bar=bar))
-        rendered.tell(self.as_json)
+            renderer.write(renderer.render(frame, self.out, bar=bar))
 
     def _render_sequence(self) -> None:
         """Renders the frames of a numbered sequence, in order; with ``--resume`` only those that are missing."""
@@ -166,10 +165,9 @@ class Render:
             first, last = self.files.frames
             wanted, existing = range(first, last + 1), {n for n in numbers if first <= n <= last}
             if len(existing) < len(wanted):
-                missing, absent = next(n for n in wanted if n not in existing), len(wanted) - len(existing)
-                raise FileNotFoundError(
-                    f"{source.name(missing)}: there is no such file ({absent} of {len(wanted)} frames missing)"
-                )
+                missing = source.name(next(n for n in wanted if n not in existing))
+                absent = f"{len(wanted) - len(existing)} of {len(wanted)} frames missing"
+                raise FileNotFoundError(f"{missing}: there is no such file ({absent})")
             numbers = wanted
         if not numbers:
             raise FileNotFoundError(f"{self.image}: there are no such files")
@@ -181,23 +179,17 @@ class Render:
 
     def _render_each(self, renderer: "Renderer", files: Mapping[int, Path], read: "Callable[[int], Frame]") -> None:
         """Renders frames in order; while one is rendered, the next is read and the one before is written."""
-
-        def write(rendered: "Rendered") -> None:  # in a thread that no interrupt ends between a file and its name
-            renderer.write(rendered).tell(self.as_json)
-
         with Bar("", len(files)) as bar, ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
-            numbers, coming, written = iter(files), list["Future[Frame]"](), list[Future[None]]()
+            numbers, coming, written = iter(files), list["Future[Frame]"](), writer.submit(lambda: None)
             try:
                 for k, (n, out) in enumerate(files.items()):
                     bar.update(f"frame {k + 1} of {len(files)}", k)
                     coming += [reader.submit(read, ahead) for ahead in itertools.islice(numbers, 2 - len(coming))]
                     rendered = renderer.render(coming.pop(0).result(), out, n)
-                    for last in written:
-                        last.result()
-                    written = [writer.submit(write, rendered)]
+                    written.result()
+                    written = writer.submit(renderer.write, rendered)  # which no interrupt ends half way
             finally:  # what was rendered is written, whatever happens to the next
-                for last in written:
-                    last.result()
+                written.result()
 
     def _tell_of_those_there(self, files: Sequence[Path], line: str) -> None:
         lines = [json_line({"out": str(file), "is_there_already": True}) for file in files]

@@ -101,32 +101,22 @@ def _column(table: "BlurTable") -> "Tensor":
     import torch
     import torch.nn.functional as functional
 
-    size = _CELL[0] // _ZOOM // 2 * 2 - 1
-    places = _PLACES if table.depends_on_place else (0.0,)
-    columns = [_kernels(table, place, size) for place in places]  # [n, 1 or C, size, size]
+    from ..optics.kernel_bank import bank_of
+    from ..optics.placed_kernels import layer_shares, placed
+
+    size, columns = _CELL[0] // _ZOOM // 2 * 2 - 1, []
+    for place in _PLACES if table.depends_on_place else ():
+        kernels, frame = [], (round(_WIDTH / 1.5), _WIDTH)
+        y, x = (torch.tensor([place * side / math.hypot(*frame)]) for side in frame)
+        for coc in _COC_PX:
+            own = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=[size // 2 + 1]).float()
+            shares = layer_shares(table, coc, 1, frame).to(own)
+            kernel = placed(own, [(shares, own.new_ones(()))], y, x)[0]
+            kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))
+        columns.append(torch.stack(kernels))
+    columns = columns or [table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()]  # [n, 1 or C, size, size]
     shown = torch.cat([k / k.amax((1, 2, 3), keepdim=True) for k in columns], -1)
     shown = shown[:, :3] if shown.shape[1] >= 3 else shown[:, :1].expand(-1, 3, -1, -1)
     shown = functional.interpolate(shown, scale_factor=float(_ZOOM), mode="nearest")
     below, beside = _CELL[0] - shown.shape[-2], max(0, _CELL[1] - shown.shape[-1])
     return functional.pad(shown, (beside // 2, beside - beside // 2, below, 0)).transpose(0, 1).flatten(1, 2)[None]
-
-
-def _kernels(table: "BlurTable", place: float, size: int) -> "Tensor":
-    """Kernels ``[n, 1 or C, size, size]`` at a part of the way from the middle of the frame to its corner."""
-    import torch
-    import torch.nn.functional as functional
-
-    from ..optics.kernel_bank import bank_of
-    from ..optics.placed_kernels import layer_shares, placed
-
-    if not table.depends_on_place:
-        return table.kernels(torch.tensor(_COC_PX), _WIDTH, size=size).float()
-    frame = (round(_WIDTH / 1.5), _WIDTH)
-    y, x = (torch.tensor([place * side / math.hypot(*frame)]) for side in frame)
-    kernels = []
-    for coc in _COC_PX:
-        own = bank_of(table).kernels(torch.tensor([coc]), _WIDTH, longest=[size // 2 + 1]).float()
-        shares = layer_shares(table, coc, 1, frame).to(own)
-        kernel = placed(own, [(shares, own.new_ones(()))], y, x)[0]
-        kernels.append(functional.pad(kernel, ((size - kernel.shape[-1]) // 2,) * 4))
-    return torch.stack(kernels)

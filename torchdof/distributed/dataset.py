@@ -27,19 +27,12 @@ Made by torchdof.
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """What is in a data set.
-
-    Args:
-        samples: Samples that were written.
-        shards: Shards that hold them.
-        broken: Image file and error of each sample that could not be made.
-        seconds: Of the processor, over all samples.
-    """
+    """What is in a data set: samples and the shards that hold them; image and error of each sample that is left out."""
 
     samples: int
     shards: int
     broken: list[tuple[str, str]]
-    seconds: float
+    seconds: float  # of the processor, over all samples
 
 
 def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | None = None) -> list[Pair]:
@@ -125,12 +118,10 @@ def make_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     rows = shard_rows(pairs, per_shard, copies)
-    settings = {
-        **{"images": len(pairs), "copies": copies, "per_shard": per_shard},
-        "sha256_of_samples": hashlib.sha256(json.dumps(rows).encode()).hexdigest(),
-        **RenderShards(out, blur, format=format, **render).settings(),  # wrong ones are refused before Ray starts
-    }
-    settings = json.loads(json.dumps(settings))  # with lists for tuples
+    made = RenderShards(out, blur, format=format, **render)  # wrong arguments are refused before Ray starts
+    digest = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+    settings = {"images": len(pairs), "copies": copies, "per_shard": per_shard, "sha256_of_samples": digest}
+    settings = json.loads(json.dumps(settings | made.settings()))  # with lists for tuples
     _same_as_before(out / "plan.json", settings)
     missing = [row for row in rows if samples_of(out / name_of(row["shard"], format)) is None]
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
@@ -149,16 +140,14 @@ def make_dataset(
             compute=ray.data.ActorPoolStrategy(size=min(workers, len(missing))),
             num_cpus=1,
         )
-        start, made, left = time.perf_counter(), 0, {row["shard"]: len(json.loads(row["samples"])) for row in missing}
+        start, count, left = time.perf_counter(), 0, {row["shard"]: len(json.loads(row["samples"])) for row in missing}
         for row in told.iter_rows():
-            made += not row["error"]
+            count += not row["error"]
             left[row["shard"]] -= 1
             if not left[row["shard"]]:
                 say(f"{name_of(row['shard'], format)} is complete")
-        seconds = time.perf_counter() - start
-        say(
-            f"{made} samples in {seconds:.1f} s: {made / seconds:.2f} images/s, {made / seconds / workers:.2f} a worker"
-        )
+        s = time.perf_counter() - start
+        say(f"{count} samples in {s:.1f} s: {count / s:.2f} images/s, {count / s / workers:.2f} a worker")
     summary = summary_of(out)
     _describe(out, summary, settings)
     for image, problem in summary.broken:
@@ -167,11 +156,7 @@ def make_dataset(
 
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
-    """What is in the complete shards of a folder.
-
-    Raises:
-        FileNotFoundError: If there is no such folder.
-    """
+    """What is in the complete shards of a folder; ``FileNotFoundError`` if there is none."""
     shards = [path for path in sorted(_there(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
     noted = [samples for samples in map(samples_of, shards) if samples is not None]
     rows = [row for samples in noted for row in samples]
@@ -197,13 +182,9 @@ def _same_as_before(path: Path, settings: dict[str, Any]) -> None:
 
 def _describe(out: Path, summary: Summary, settings: dict[str, Any]) -> None:
     """The data set's card, and the list of what was left out."""
-    facts = {
-        "samples": summary.samples,
-        "shards": summary.shards,
-        "inputs left out": f"{len(summary.broken)}, listed in broken.txt",
-        "time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample",
-        **settings,
-    }
+    facts: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
+    facts |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
+    facts |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}
     lines = [f"| {name} | {fact if isinstance(fact, str) else json.dumps(fact)} |" for name, fact in facts.items()]
     write_text(out / "README.md", "\n".join([_CARD, "| what | how much |", "| --- | --- |", *lines, ""]))
     write_text(out / "broken.txt", "".join(f"{image}\t{problem}\n" for image, problem in summary.broken))

@@ -43,13 +43,7 @@ _KEPT = ("blurred", "sharp", "depth")
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """An image and its depth.
-
-    Args:
-        image: Image file.
-        depth: Depth file; None takes the depth channel of the image.
-        focus_m: Distance in focus in metres; None draws one.
-        f_number: F-number; None draws one.
+    """An image file and its depth file, None for the image's own depth channel; what None is of a camera is drawn.
 
     Raises:
         ValueError: If a number is not positive.
@@ -71,15 +65,12 @@ class Pair:
 
 
 def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> list[dict[str, Any]]:
-    """Rows for ``ray.data.from_items``, one for each shard.
+    """Rows for ``ray.data.from_items``, one for each shard: its number, and as JSON its samples, a pair and a key each.
 
     Args:
         pairs: Images and depths.
         per_shard: Samples in a shard.
         copies: How often each image is blurred, each time by another camera.
-
-    Returns:
-        ``{"shard": number, "samples": JSON}``; a sample is a pair and its key.
 
     Raises:
         ValueError: If there are no pairs, or a number is not at least 1.
@@ -253,19 +244,14 @@ class RenderShards:
             f"sharp{self.picture}": lambda path: write_image(path, Picture(source.pixels, source.channels)),
             "depth.npy": lambda path: np.save(path, metres[0, 0].numpy()),
         }
+        table, (height, width) = options.table, blurred.shape[-2:]
         parameters = {
-            **_plain(vars(camera)),
-            **_plain(options.arguments()),
-            "table": options.table.name or options.table.family,
-            "table_fingerprint": options.table.fingerprint(),
-            "aperture": None if options.table.aperture is None else repr(options.table.aperture),
-            "image": _text(image),
-            "depth": depth and _text(depth),
-            "height": blurred.shape[-2],
-            "width": blurred.shape[-1],
-            "largest_coc_px": float(camera.coc_px(metres, blurred.shape[-1]).abs().nan_to_num().max()),
-            "seed": self.seed,
-            "torchdof": importlib.metadata.version("torchdof"),
+            **_plain(vars(camera) | options.arguments()),
+            **{"table": table.name or table.family, "table_fingerprint": table.fingerprint()},
+            "aperture": None if table.aperture is None else repr(table.aperture),
+            **{"image": _text(image), "depth": depth and _text(depth), "height": height, "width": width},
+            "largest_coc_px": float(camera.coc_px(metres, width).abs().nan_to_num().max()),
+            **{"seed": self.seed, "torchdof": importlib.metadata.version("torchdof")},
         }
         kept = {name: _bytes(name, write) for name, write in files.items() if name.partition(".")[0] in self.keep}
         return {"key": key, **kept, "json": parameters}

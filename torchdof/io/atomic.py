@@ -16,10 +16,9 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-__all__ = ["whole_file", "write_text"]
+__all__ = ["unwound_on_termination", "whole_file", "write_text"]
 
-_DAY = 86_400.0  # seconds
-_ENDS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_DAY_S = 86_400.0
 
 
 @contextlib.contextmanager
@@ -48,7 +47,7 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise PermissionError(f"{path}: may not write to the folder {target.parent}")
     _remove_abandoned(target.parent)
     part = target.with_name(f".{uuid.uuid4().hex}.part{target.suffix}")
-    with _unwound_on_termination():
+    with unwound_on_termination():
         try:
             yield part
             with part.open("rb+") as file:
@@ -69,19 +68,20 @@ def _remove_abandoned(folder: Path) -> None:
     """Removes what processes that were killed had not finished writing."""
     for part in folder.glob("." + "[0-9a-f]" * 32 + ".part*"):
         with contextlib.suppress(OSError):
-            if time.time() - part.stat().st_mtime > _DAY:
+            if time.time() - part.stat().st_mtime > _DAY_S:
                 part.unlink()
 
 
 @contextlib.contextmanager
-def _unwound_on_termination() -> Iterator[None]:
+def unwound_on_termination() -> Iterator[None]:
     """SIGTERM and SIGHUP as ``SystemExit``, which tidies up behind itself, unless somebody handles them."""
 
     def leave(number: int, _: FrameType | None) -> NoReturn:
-        raise SystemExit(128 + number)  # the status that a shell tells of a process that the signal ended
+        raise SystemExit(128 + number)  # as shells tell of a process that a signal ended
 
+    ends = {getattr(signal, name, signal.SIGTERM) for name in ("SIGTERM", "SIGHUP")}
     main = threading.current_thread() is threading.main_thread()  # no other hears of signals
-    heard = [number for number in _ENDS if main and signal.getsignal(number) == signal.SIG_DFL]
+    heard = [number for number in ends if main and signal.getsignal(number) == signal.SIG_DFL]
     try:
         for number in heard:
             signal.signal(number, leave)

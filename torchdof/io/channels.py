@@ -6,18 +6,10 @@ Parts = list[tuple[str, tuple[str, ...]]]  # label and channel names of each par
 
 
 def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int, list[int], tuple[str, ...]]:
-    """Finds R, G, B (or Y), and A beside them.
+    """Finds R, G, B (or Y), and A beside them: the index of their part, their indices in it, and their plain names.
 
-    Args:
-        parts: Label and channel names of each part.
-        layer: Part or layer to look in; None for the first with colour, those without a layer name first.
-        layered: Whether names may carry a layer before a dot (EXR).
-
-    Returns:
-        Index of the part, indices of its channels, and their plain names.
-
-    Raises:
-        ValueError: If there is no colour, or no layer of that name.
+    Looks in a part or layer by name, or for the first with colour, those without a layer's name first. ``layered`` says
+    whether names may carry a layer before a dot (EXR). Refuses files without colour, or without the layer.
 
     Example:
         >>> colour_channels([("", ("A", "B", "G", "R", "Z"))], None, True)
@@ -48,10 +40,7 @@ def colour_channels(parts: Parts, layer: str | None, layered: bool) -> tuple[int
 
 
 def depth_channel(parts: Parts) -> tuple[int, int] | None:
-    """Finds the depth channel: ``Z``, ``depth``, or a layer of depth such as ``ViewLayer.Depth.Z``; never ``Normal.Z``.
-
-    Returns:
-        Index of the part and of the channel in it, or None.
+    """The part and place of the depth channel: ``Z``, ``depth``, ``ViewLayer.Depth.Z``, ...; never ``Normal.Z``.
 
     Example:
         >>> depth_channel([("", ("N.X", "N.Y", "N.Z", "ViewLayer.Depth.Z"))])

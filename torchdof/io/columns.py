@@ -16,13 +16,13 @@ _UNBOUNDED = 10_000  # characters of a line
 def print_columns(
     console: Console, title: str, columns: Mapping[str, Sequence[str]], words: Collection[str] = ()
 ) -> None:
-    """Print a table; columns that the terminal has no room for are folded below the others, the first before them.
+    """Prints a table; columns that the terminal has no room for are folded below the others, the first before them.
 
     Args:
-        console: to print on.
-        title: above the table.
-        columns: cells `[rows]` below each heading, all as many.
-        words: headings of columns of words, which are aligned to the left; the others hold numbers.
+        console: To print on.
+        title: Above the table.
+        columns: Cells below each heading, all as many.
+        words: Headings of columns of words, which are aligned to the left; the others hold numbers.
 
     Example:
         >>> from rich.console import Console

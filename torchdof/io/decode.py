@@ -22,17 +22,8 @@ from ..validation import show
 from .memory import free_bytes
 from .metadata import kept_metadata
 
-__all__ = [
-    "MOST_ATTRIBUTES",
-    "Part",
-    "PixelType",
-    "check_chunks",
-    "existing",
-    "first_line",
-    "named_in_utf8",
-    "read_array",
-    "read_parts",
-]
+__all__ = ["MOST_ATTRIBUTES", "Part", "PixelType", "check_chunks", "existing", "first_line", "named_in_utf8"]
+__all__ += ["read_array", "read_parts"]
 
 PixelType = Literal["8", "16", "half", "float"]
 
@@ -43,36 +34,20 @@ MOST_ATTRIBUTES = 4096
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One part of a file, as stored.
+    """One part of a file, as stored."""
 
-    Args:
-        label: Name of the part, often empty.
-        names: Names of the channels.
-        values: ``[H, W, C]``.
-        kinds: What each channel was stored as, as OpenImageIO calls it: "uint8", "half", ...
-        is_exr: Whether names may carry a layer before a dot, and whole numbers are no parts of white.
-        straight_alpha: Whether colour is not multiplied by alpha yet.
-        metadata: Name -> (OpenImageIO type, value).
-        window: x, y, full x, full y, full width, full height.
-    """
-
-    label: str
-    names: tuple[str, ...]
-    values: np.ndarray
-    kinds: tuple[str, ...]
-    is_exr: bool = False
-    straight_alpha: bool = False
-    metadata: dict[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)
-    window: tuple[int, int, int, int, int, int] | None = None
+    label: str  # the part's name, often empty
+    names: tuple[str, ...]  # of the channels
+    values: np.ndarray  # [H, W, C]
+    kinds: tuple[str, ...]  # what each channel was stored as, as OpenImageIO calls it: "uint8", "half", ...
+    is_exr: bool = False  # names may carry a layer before a dot, and whole numbers are no parts of white
+    straight_alpha: bool = False  # colour is not multiplied by alpha yet
+    metadata: dict[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)  # name -> (OpenImageIO type, value)
+    window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
 
 
 def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
-    """The path, if there is a file of one of these types at it.
-
-    Raises:
-        ValueError: If the suffix is none of ``suffixes``; ``what`` names what was wanted.
-        OSError: If there is no file, or it is empty.
-    """
+    """The path, if there is a file of one of these types at it, which is not empty; ``what`` names what was wanted."""
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise ValueError(f"expected the path of {what}, got {show(path)}")
     path = Path(path)
@@ -105,12 +80,7 @@ def named_in_utf8(path: Path) -> Iterator[str]:
 
 
 def read_parts(path: Path) -> list[Part]:
-    """Reads every part of an image file.
-
-    Raises:
-        OSError: If the file is damaged, cut short or not an image.
-        ValueError: If it is too large, holds deep samples, or colours in a way that is not read here.
-    """
+    """Every part of an image file: ``OSError`` if it is damaged, ``ValueError`` if it is too large or not read here."""
     if path.suffix.lower() == ".pfm":
         return [_read_pfm(path)]
     check_chunks(path)
@@ -163,11 +133,7 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
 
 
 def check_chunks(path: Path) -> None:
-    """Refuse a PNG that is cut short or has a wrong checksum: its library would print a line of its own about it.
-
-    Raises:
-        OSError: Naming the part that is damaged.
-    """
+    """Refuse a PNG that is cut short or has a wrong checksum: its library would print a line of its own about it."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         place, name = 8, b"" if content[:8] == b"\x89PNG\r\n\x1a\n" else b"IEND"
         while name != b"IEND":
@@ -235,15 +201,7 @@ def _read_pfm(path: Path) -> Part:
 
 
 def read_array(path: Path, key: str | None) -> np.ndarray:
-    """Reads an ``.npy`` or ``.npz`` file as ``[H, W]`` numbers; pickled objects are refused.
-
-    Args:
-        path: The file.
-        key: Name of the array in an ``.npz`` file; None takes the only one.
-
-    Raises:
-        ValueError: If the file is damaged, too large, or does not hold such an array.
-    """
+    """The numbers ``[H, W]`` of an ``.npy`` file, or of an ``.npz`` file's only array or that of a name; no pickles."""
     try:
         if path.suffix.lower() == ".npz":
             with zipfile.ZipFile(path) as archive:
@@ -275,18 +233,7 @@ def read_array(path: Path, key: str | None) -> np.ndarray:
 
 
 def _check_size(path: Path, width: int, height: int, pixel_bytes: int, others: int = 0) -> int:
-    """Refuse what a header promises if it is too much to read, or more than there is memory for.
-
-    Args:
-        path: The file.
-        width: In pixels.
-        height: In pixels.
-        pixel_bytes: What a pixel takes, as stored and as read.
-        others: Bytes that other parts of the file take.
-
-    Returns:
-        The bytes that it takes.
-    """
+    """The bytes that a picture takes, stored and read, ``others`` being taken already; refused if there are too few."""
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
         raise ValueError(f"{path}: its header claims {width} x {height} pixels; between 1 and {MAX_PIXELS} are read")
     needed, free = width * height * pixel_bytes, free_bytes()

@@ -26,17 +26,14 @@ from .transfer import Transfer, decode, default_transfer, encode, encode_8_bits
 
 __all__ = ["Picture", "read_image", "read_values", "write_image"]
 
-_SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".hdr", ".pfm")
 _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hold, its default first
     ".exr": ("half", "float"),
     ".png": ("8", "16"),
-    ".tif": ("8", "16", "float"),
-    ".tiff": ("8", "16", "float"),
-    ".jpg": ("8",),
-    ".jpeg": ("8",),
-    ".hdr": ("float",),
-    ".pfm": ("float",),
+    **dict.fromkeys((".tif", ".tiff"), ("8", "16", "float")),
+    **dict.fromkeys((".jpg", ".jpeg"), ("8",)),
+    **dict.fromkeys((".hdr", ".pfm"), ("float",)),
 }
+_SUFFIXES = tuple(_SAMPLES)
 _OIIO_SAMPLE: dict[PixelType, str] = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
 _STORED: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.items()} | {"double": "float"}
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}

@@ -4,18 +4,12 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-__all__ = ["camera_facts", "kept_metadata", "original_width"]
+__all__ = ["camera_facts", "kept_metadata"]
 
 # Facts about how one file was stored, which are wrong for the next.
 _STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgbe:", "thumbnail", "Exif:ExifVersion")
-_STORAGE_NAMES = (
-    "name",
-    "planarconfig",
-    "textureformat",
-    "Exif:FlashPixVersion",
-    "CompressionQuality",
-    "Exif:ColorSpace",
-)
+_STORAGE_NAMES: tuple[str, ...] = ("name", "planarconfig", "textureformat", "CompressionQuality")
+_STORAGE_NAMES += ("Exif:FlashPixVersion", "Exif:ColorSpace")
 _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 
 
@@ -30,12 +24,6 @@ def kept_metadata(attributes: Iterable[Any]) -> dict[str, tuple[Any, Any]]:
         for a in attributes
         if not a.name.startswith(_STORAGE_PREFIXES) and a.name not in _STORAGE_NAMES
     }
-
-
-def original_width(metadata: Mapping[str, tuple[Any, Any]]) -> int | None:
-    """Width in pixels at which EXIF says a picture was taken, or None: a crop is narrower."""
-    value = metadata.get("Exif:PixelXDimension", (None, None))[1]
-    return int(value) if isinstance(value, int | float) and 0 < value < 2**31 else None
 
 
 def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int) -> dict[str, float]:

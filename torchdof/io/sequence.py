@@ -14,11 +14,8 @@ _DIGITS = 18
 class FramePattern:
     """A file name with a place for the frame's number: ``####`` or ``%04d``, zero-padded to that many digits.
 
-    Args:
-        path: The name; the number stands in its last component, folders are called what they are called.
-
-    Raises:
-        ValueError: If there is no place for a number, more than one, or one of more digits than a name can have.
+    The number stands in the last component of the path; folders are called what they are called. ``ValueError`` if
+    there is no place for a number, more than one, or one of more digits than a name can have.
 
     Example:
         >>> FramePattern("out/shot.####.exr").name(7)
@@ -29,9 +26,8 @@ class FramePattern:
         self.path = Path(path)
         places = list(_PLACEHOLDER.finditer(self.path.name))
         if len(places) != 1:
-            raise ValueError(
-                f"{path}: expected one place for the frame number in the file's name, such as shot.####.exr"
-            )
+            told = "expected one place for the frame number in the file's name, such as shot.####.exr"
+            raise ValueError(f"{path}: {told}")
         place = places[0]
         self._before, self._after = self.path.name[: place.start()], self.path.name[place.end() :]
         text = place.group()
@@ -63,10 +59,7 @@ class FramePattern:
 
 
 def parse_frames(text: str) -> tuple[int, int]:
-    """Reads ``first-last`` or a single number.
-
-    Raises:
-        ValueError: If the text is not that, or last comes before first.
+    """Reads ``first-last`` or a single number; ``ValueError`` for other text, or if last comes before first.
 
     Example:
         >>> parse_frames("10-24")
@@ -82,13 +75,9 @@ def parse_frames(text: str) -> tuple[int, int]:
 
 
 def parse_focus(text: str) -> list[tuple[int, float]]:
-    """Reads a focus distance in metres, ``2.0``, or keyframes ``frame:metres``, ``1:2.0,48:5.5``.
+    """Reads a focus distance in metres, ``2.0``, as one keyframe, or keyframes ``frame:metres``, in their order.
 
-    Returns:
-        Keyframes in order; a plain distance is one keyframe.
-
-    Raises:
-        ValueError: If a part cannot be read, is not positive, or a frame is named twice.
+    ``ValueError`` if a part cannot be read, is not positive, or a frame is named twice.
 
     Example:
         >>> parse_focus("1:2.0,48:inf")
@@ -110,20 +99,10 @@ def parse_focus(text: str) -> list[tuple[int, float]]:
 
 
 def focus_at_frame(keys: list[tuple[int, float]], frame: int) -> float:
-    """Focus distance at a frame: linear in 1/distance between keyframes, held before the first and after the last.
+    """Metres in focus at a frame: linear in 1/distance between keyframes, held before the first and after the last.
 
     Blur is proportional to the difference of inverse distances, so a rack of focus that is even in 1/m changes the blur
     evenly, and can end at infinity.
-
-    Args:
-        keys: Keyframes (frame, metres) in order, at least one.
-        frame: Number of the frame.
-
-    Returns:
-        Metres.
-
-    Raises:
-        ValueError: If there is no keyframe or the frame is not a number.
 
     Example:
         >>> focus_at_frame([(0, 1.0), (10, 2.0)], 5)
