@@ -53,9 +53,12 @@ def halves(left: float, right: float) -> Tensor:
 def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tensor:
     """Closed form of a plane: the image, continued over its border, convolved with a kernel, in float64."""
     image, radius = image.double(), coc_px.flatten()[:1].double()
-    half = max(image.shape[-2:]) - 1  # from one pixel of the frame to another
-    kernel = (table or BlurTable.disc()).kernels(radius, image.shape[-1], window=2 * half + 1)[0]
-    half = min(half, kernel.shape[-1] // 2)
+    if table is None:
+        half = max(image.shape[-2:]) - 1  # from one pixel of the frame to another
+        kernel = BlurTable.disc().kernels(radius, image.shape[-1], window=2 * half + 1)[0]
+    else:
+        kernel = table.kernels(radius, image.shape[-1])[0]
+    half = kernel.shape[-1] // 2
     wide = continued(image, None, threshold(image), (half,) * 4, half)
     return functional.conv2d(wide, kernel.expand(image.shape[1], -1, -1)[:, None], groups=image.shape[1])
 
@@ -110,8 +113,12 @@ class Case:
 
     def pairs(self, dtype: torch.dtype = torch.float32) -> Iterator[tuple[Tensor, Tensor, Camera | None]]:
         """Image, map and camera of each picture; without a camera the map is a circle of confusion."""
-        cameras = self.cameras if len(self.cameras) > 1 else len(self.maps) * (self.cameras or [None])  # type: ignore[operator]
-        maps = self.maps if len(self.maps) == len(cameras) else len(cameras) * list(self.maps)
+        cameras: list[Camera | None] = list(self.cameras) or [None]
+        maps = list(self.maps)
+        if len(cameras) == 1:
+            cameras *= len(maps)
+        elif len(maps) == 1:
+            maps *= len(cameras)
         for values, camera in zip(maps, cameras, strict=True):
             yield self.light(dtype), values, camera
 
@@ -198,9 +205,9 @@ _FAR = _with(_with(whole(1e-6), slice(8, 20), value=1e12), slice(20, None), valu
 _DEPTH, _DEEP, _COC = slope(1.2, 6.0), slope(1.0, 9.0), slope(-5.0, 5.0)
 _MANY = Plan(tuple(torch.linspace(-1, 1, 2001).double().tolist()), 0.0)
 _FOCUS_ENDS = from_blur_axis(1e-12)
-_EXACT = {"float32": 0.0, "float16": 0.0}
-_DARK = {"truth": darkest, "float32": 1e-6, "float16": 0.0}
-_EVEN = {"truth": itself, "float32": 1e-6, "float16": 0.0}
+_EXACT: dict[str, Any] = {"float32": 0.0, "float16": 0.0}
+_DARK: dict[str, Any] = {"truth": darkest, "float32": 1e-6, "float16": 0.0}
+_EVEN: dict[str, Any] = {"truth": itself, "float32": 1e-6, "float16": 0.0}
 
 CASES = [
     Case("infinity, 1e12 m and 3.1 m everywhere", [whole(v) for v in (math.inf, 1e12, 3.1)], disc, cameras=[CAMERA]),

@@ -1,11 +1,12 @@
 """Long use of one process: it does not grow, and threads and workers make the same pictures."""
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.hard import soak
 
 SOAK = Path(__file__).with_name("soak.py")
 
@@ -52,9 +53,5 @@ def test_a_forked_worker_renders_after_its_parent_has_by_many_threads(engine: st
 
 @pytest.mark.hard
 def test_eight_threads_with_a_module_each_make_the_same_pictures() -> None:
-    spec = importlib.util.spec_from_file_location("torchdof_soak", SOAK)
-    assert spec is not None and spec.loader is not None
-    soak = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(soak)
     truth = [soak.rendering(seed) for seed in range(12)]
     assert soak.same(soak.in_threads(range(12), 8), truth)
