@@ -23,17 +23,6 @@ def test_file_is_small_and_every_case_agrees_to_1e_5(layered: Any) -> None:
     assert 0 < layered.verification.max_error < 1e-5
 
 
-def test_file_renders_another_size_focus_and_aperture(layered: Any) -> None:
-    generator = torch.Generator().manual_seed(3)
-    image = torch.rand(2, 3, 45, 71, generator=generator)
-    coarse = torch.rand(2, 1, 5, 7, generator=generator) * 4 + 1
-    depth = torch.nn.functional.interpolate(coarse, (45, 71))
-    tensors = image, depth, torch.tensor([1.4, 3.0]), torch.tensor([4.0, 7.0])
-    expected = layered.eager(*tensors)
-    assert (expected - image).abs().max() > 0.1
-    torch.testing.assert_close(layered.render(*tensors), expected, atol=1e-5, rtol=0)
-
-
 def test_all_in_focus_is_returned_bit_for_bit(layered: Any) -> None:
     image = torch.rand(1, 3, 50, 40)
     out = layered.render(image, torch.full((1, 1, 50, 40), 2.0), torch.tensor([2.0]), torch.tensor([0.5]))
