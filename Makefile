@@ -61,7 +61,7 @@ sanitize: $(INSTALLED)
 
 SECONDS := 3600
 fuzz: $(INSTALLED)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/run.py --seconds $(SECONDS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --seconds $(SECONDS)
 
 soak: $(INSTALLED)
 	$(BIN)/python tests/hard/soak.py --renderings 1000

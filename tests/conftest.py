@@ -1,7 +1,5 @@
-import functools
-import importlib.util
+import importlib
 import os
-import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -9,6 +7,8 @@ from typing import Any
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
+
+from tests import exported
 
 settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", parent=settings.get_profile("local"), derandomize=True, print_blob=True)
@@ -26,33 +26,10 @@ def _same_random_numbers() -> None:
     torch.manual_seed(0)
 
 
-@functools.cache
-def _beside(name: str) -> ModuleType:
-    """A module of shared helpers in this folder: tests are imported one by one, not as a package."""
-    spec = importlib.util.spec_from_file_location(f"torchdof_tests_{name}", Path(__file__).parent / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="session")
-def loops() -> ModuleType:
-    """The slow references of `loops.py`."""
-    return _beside("loops")
-
-
-@pytest.fixture(scope="session")
-def tolerances() -> dict[torch.dtype, dict[str, float]]:
-    """Type -> rtol and atol, for `assert_close(a, b, **tolerances[a.dtype])`."""
-    return _beside("tolerances").TOLERANCES
-
-
 @pytest.fixture(scope="session")
 def simulator() -> ModuleType:
     """A camera that photographs dots: `fit/simulator.py`."""
-    return _beside("fit/simulator")
+    return importlib.import_module("tests.fit.simulator")
 
 
 @pytest.fixture(scope="session")
@@ -67,29 +44,29 @@ def shared_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def layered(shared_folder: Path) -> Any:
     """An exported module with occlusion, by convolution at resolutions down to a sixteenth."""
-    return _beside("exported").export_once("layered", shared_folder)
+    return exported.export_once("layered", shared_folder)
 
 
 @pytest.fixture(scope="session")
 def fold(shared_folder: Path) -> Any:
     """An exported module without occlusion, by the literal scatter."""
-    return _beside("exported").export_once("fold", shared_folder)
+    return exported.export_once("fold", shared_folder)
 
 
 @pytest.fixture(scope="session")
 def fold_with_occlusion(shared_folder: Path) -> Any:
     """The same with occlusion."""
-    return _beside("exported").export_once("fold with occlusion", shared_folder)
+    return exported.export_once("fold with occlusion", shared_folder)
 
 
 @pytest.fixture(scope="session")
 def plain(shared_folder: Path) -> Any:
     """An exported module without occlusion, which is traced in a few seconds."""
-    return _beside("exported").export_once("plain", shared_folder)
+    return exported.export_once("plain", shared_folder)
 
 
 @pytest.fixture(scope="session")
 def exported_by_command(shared_folder: Path) -> tuple[Path, str]:
     """A file of blur radii as ``torchdof export`` writes it, without occlusion, and what that printed."""
-    path, told = _beside("exported").command_once(shared_folder)
+    path, told = exported.command_once(shared_folder)
     return path, told

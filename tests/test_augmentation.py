@@ -1,6 +1,8 @@
 """Depth of field among Kornia's augmentations, and torchvision's."""
 
+import functools
 import io
+from collections.abc import Callable
 from typing import Any
 
 import kornia.augmentation as K
@@ -116,12 +118,14 @@ def test_depth_may_lack_its_channel_or_be_shared(shape: tuple[int, ...]) -> None
     assert torch.equal(aug(image, depth.reshape(shape), params=aug._params), expected)
 
 
-def test_one_image_is_kept_or_becomes_a_batch() -> None:
+def test_one_image_is_kept_or_becomes_a_batch_and_a_dict_is_taken() -> None:
     image, depth = sample(1)
     aug = random_dof(keepdim=True)
     out = aug(image[0], depth[0])
     assert out.shape == (3, 18, 24)
     assert torch.equal(random_dof()(image[0], depth[0, 0], params=aug._params)[0], out)
+    given = aug({"image": image[0], "depth": depth[0]})
+    assert torch.equal(given["image"], aug(image[0], depth[0], params=aug._params)) and given["depth"] is not None
 
 
 def test_the_last_channel_is_the_depth_and_is_returned() -> None:
@@ -221,13 +225,6 @@ def test_torchvision_composes_dicts_of_its_tensors() -> None:
     assert torch.equal(out["image"].as_subclass(Tensor), (expected - 0.5) / 0.5)
 
 
-def test_a_dict_of_plain_tensors_is_taken_too() -> None:
-    image, depth = sample(1)
-    dof = random_dof()
-    out = dof({"image": image[0], "depth": depth[0]})
-    assert torch.equal(out["image"], dof(image, depth, params=dof._params)[0]) and out["depth"] is not None
-
-
 class Blurred(Dataset[Tensor]):
     """Sixteen times the same image, blurred at random."""
 
@@ -265,42 +262,34 @@ def test_it_is_pickled_with_its_lenses() -> None:
 
 # Refused
 
+IMAGE, DEPTH = sample()
+partial: Any = functools.partial
+ARGUMENTS: list[tuple[dict[str, Any], str]] = [
+    ({"focus_m": 2.0}, "focus_m must be two numbers"),
+    ({"focus_m": (5.0, 0.5)}, "focus_m must be two numbers, the smallest first"),
+    ({"focus_m": (0.0, 5.0)}, "focus_m must be a number > 0"),
+    ({"focus_m": (0.04, 5.0)}, "focus_m must be longer than the focal length"),
+    ({"f_number": (1.4, float("inf"))}, "f_number must be a number"),
+    ({"table": []}, "table must be"),
+    ({"table": ["disc"]}, "table must be a torchdof.BlurTable, got str"),
+    ({"transfer": "gamma"}, "transfer must be 'linear' or 'srgb'"),
+    ({"camera": 50}, "camera must be a torchdof.Camera"),
+    ({"tolerance": 2.0}, "tolerance must be a number"),
+    ({"p": 2.0}, "p must be a probability from 0 to 1"),
+    ({"p": True}, "p must be a probability from 0 to 1"),
+]
+REFUSED: list[tuple[Callable[[], Any], str]] = [
+    *((partial(RandomDepthOfField, **arguments), message) for arguments, message in ARGUMENTS),
+    (lambda: K.AugmentationSequential(random_dof(), data_keys=["input", "mask"])(IMAGE, DEPTH),
+     r"needs a depth: .*DepthAugmentationSequential.*3 channels alone"),
+    (lambda: random_dof()({"image": IMAGE}), "a dict must have 'image' and 'depth', got the keys image"),
+    (lambda: random_dof()(IMAGE, DEPTH[:3, 0]), r"depth must be \[4, 1, 18, 24\].* got \[1, 3, 18, 24\]"),
+    (lambda: random_dof()((IMAGE - 0.5) / 0.2, DEPTH), r"must lie in \[0, 1\].*put normalization behind"),
+    (lambda: random_dof()((IMAGE * 255).byte(), DEPTH), r"floating-point tensor.*image.float\(\) / 255"),
+]  # fmt: skip
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"focus_m": 2.0}, "focus_m must be two numbers"),
-        ({"focus_m": (5.0, 0.5)}, "focus_m must be two numbers, the smallest first"),
-        ({"focus_m": (0.0, 5.0)}, "focus_m must be a number > 0"),
-        ({"focus_m": (0.04, 5.0)}, "focus_m must be longer than the focal length"),
-        ({"f_number": (1.4, float("inf"))}, "f_number must be a number"),
-        ({"table": []}, "table must be"),
-        ({"table": ["disc"]}, "table must be a torchdof.BlurTable, got str"),
-        ({"transfer": "gamma"}, "transfer must be 'linear' or 'srgb'"),
-        ({"camera": 50}, "camera must be a torchdof.Camera"),
-        ({"tolerance": 2.0}, "tolerance must be a number"),
-        ({"p": 2.0}, "p must be a probability from 0 to 1"),
-        ({"p": True}, "p must be a probability from 0 to 1"),
-    ],
-)
-def test_wrong_arguments_are_refused_by_name(arguments: dict[str, Any], message: str) -> None:
+
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_what_makes_no_picture_is_refused_by_name(call: Callable[[], Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        RandomDepthOfField(**arguments)
-
-
-def test_an_image_without_depth_is_refused_saying_how_to_give_it() -> None:
-    image, depth = sample()
-    with pytest.raises(ValueError, match=r"needs a depth: .*DepthAugmentationSequential.*3 channels alone"):
-        K.AugmentationSequential(random_dof(), data_keys=["input", "mask"])(image, depth)
-    with pytest.raises(ValueError, match="a dict must have 'image' and 'depth', got the keys image"):
-        random_dof()({"image": image})
-    with pytest.raises(ValueError, match=r"depth must be \[4, 1, 18, 24\].* got \[1, 3, 18, 24\]"):
-        random_dof()(image, depth[:3, 0])
-
-
-def test_values_that_are_not_encoded_are_refused() -> None:
-    image, depth = sample()
-    with pytest.raises(ValueError, match=r"must lie in \[0, 1\].*put normalization behind"):
-        random_dof()((image - 0.5) / 0.2, depth)
-    with pytest.raises(ValueError, match=r"floating-point tensor.*image.float\(\) / 255"):
-        random_dof()((image * 255).byte(), depth)
+        call()

@@ -1,4 +1,4 @@
-"""Derivatives of the picture, by finite differences in float64: image, depth, focus and f-number, in every way."""
+"""Derivatives of the picture: those of finite differences, finite where a scene is hostile, and leading downhill."""
 
 import math
 from collections.abc import Callable
@@ -6,164 +6,156 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as functional
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests.scenes import CAMERA, WAYS, slope, whole
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
 from torchdof.render.layer_weights import from_blur_axis
 from torchdof.render.plan import Plan
 
-EVERY_WAY = pytest.mark.parametrize(
-    "way",
-    [
-        {"method": "layered", "occlusion": True},
-        {"method": "layered", "occlusion": False},
-        {"method": "fold", "occlusion": True},
-        {"method": "fold", "occlusion": False},
-        {"method": "layered", "occlusion": False, "normalize": False},
-    ],
-    ids=["layered-over", "layered-sum", "fold-over", "fold-sum", "plain-sum"],
-)
-TABLES = {"disc": BlurTable.disc(), "sato_j15": BlurTable.load("sato_j15")}
+EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+SUMS: dict[str, dict[str, Any]] = {**WAYS, "plain sum": {"occlusion": False, "normalize": False}}
+SMALL = Camera(sensor_width_mm=0.6)
+NUMBERS = ("image", "depth", "focus_m", "f_number")
 
 
-def case() -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image, depth, focus and f-number of a tiny scene from in front of focus to far behind it, in float64."""
+def case() -> dict[str, Tensor]:
+    """A tiny scene from in front of focus to far behind it, in float64."""
     image = torch.rand(1, 2, 3, 4, dtype=torch.float64)
     depth = torch.linspace(0.8, 6.0, 12, dtype=torch.float64).reshape(1, 1, 3, 4)
     depth[0, 0, 1] = depth[0, 0, 1].flip(0)
     focus, f_number = (torch.tensor([value], dtype=torch.float64) for value in (1.37, 2.1))
-    return image, depth, focus, f_number
+    coc = SMALL.replace(focus_m=focus, f_number=f_number).coc_px(depth, 4)
+    assert float(coc.min()) < -1.5 and float(coc.max()) > 1.5, "blur on both sides of focus"
+    return dict(zip(NUMBERS, (image, depth, focus, f_number), strict=True))
 
 
-def renderer(way: dict[str, Any], name: str = "disc") -> Callable[..., Tensor]:
-    return DepthOfField(Camera(sensor_width_mm=0.6), TABLES[name], tolerance=1 / 60, **way)
+@pytest.mark.parametrize("way", SUMS.values(), ids=SUMS)
+@pytest.mark.parametrize("name", [*NUMBERS, "coc_px"])
+def test_gradients_are_those_of_finite_differences(name: str, way: dict[str, Any]) -> None:
+    given = case()
+    if name == "coc_px":  # an even slope would lie on the kinks of "nearer than half way"
+        coc = torch.linspace(-2.83, 3.17, 12, dtype=torch.float64) + 0.2 * torch.rand(12, dtype=torch.float64)
+        leaf = coc.reshape(1, 1, 3, 4).requires_grad_()
+        assert torch.autograd.gradcheck(lambda x: blur_by_coc(given["image"], x, tolerance=1 / 60, **way), leaf)
+        return
+    leaf, dof = given.pop(name).requires_grad_(), DepthOfField(SMALL, tolerance=1 / 60, **way)
+    assert torch.autograd.gradcheck(lambda x: dof(**given, **{name: x}), leaf)
 
 
-def test_the_case_has_blur_in_front_of_and_behind_focus() -> None:
-    image, depth, focus, f_number = case()
-    coc = Camera(f_number=f_number, focus_m=focus, sensor_width_mm=0.6).coc_px(depth, 4)
-    assert float(coc.min()) < -1.5 and float(coc.max()) > 1.5
-    assert not torch.equal(renderer({})(image, depth, focus, f_number), image)
+@pytest.mark.parametrize("which", ["a measured table", "leaves of the camera", "a plan", "a plan, sum"])
+def test_gradients_go_through(which: str) -> None:
+    image, depth, focus, f_number = case().values()
+    if which == "leaves of the camera":
 
+        def render(focus: Tensor, f_number: Tensor) -> Tensor:
+            return DepthOfField(Camera(50.0, f_number, focus, 0.6), tolerance=1 / 60)(image, depth)
 
-@EVERY_WAY
-def test_gradients_with_respect_to_the_image(way: dict[str, Any]) -> None:
-    image, depth, focus, f_number = case()
-    render = renderer(way)
-    assert torch.autograd.gradcheck(lambda image: render(image, depth, focus, f_number), image.requires_grad_())
-
-
-@EVERY_WAY
-def test_gradients_with_respect_to_depth(way: dict[str, Any]) -> None:
-    image, depth, focus, f_number = case()
-    render = renderer(way)
-    assert torch.autograd.gradcheck(lambda depth: render(image, depth, focus, f_number), depth.requires_grad_())
-
-
-def test_gradients_through_a_measured_table() -> None:
-    image, depth, focus, f_number = case()
-    render = renderer({"occlusion": False}, "sato_j15")
-    assert torch.autograd.gradcheck(lambda depth: render(image, depth, focus, f_number), depth.requires_grad_())
-
-
-@EVERY_WAY
-@pytest.mark.parametrize("number", ["focus_m", "f_number"])
-def test_gradients_with_respect_to_the_camera(way: dict[str, Any], number: str) -> None:
-    image, depth, focus, f_number = case()
-    render = renderer(way)
-    numbers = {"focus_m": focus, "f_number": f_number}
-    leaf = numbers.pop(number).requires_grad_()
-    assert torch.autograd.gradcheck(lambda value: render(image, depth, **numbers, **{number: value}), leaf)
-
-
-def test_gradients_of_a_camera_that_was_built_of_leaves() -> None:
-    image, depth, focus, f_number = case()
-
-    def render(focus: Tensor, f_number: Tensor) -> Tensor:
-        return DepthOfField(Camera(50.0, f_number, focus, 0.6), tolerance=1 / 60)(image, depth)
-
-    assert torch.autograd.gradcheck(render, (focus.requires_grad_(), f_number.requires_grad_()))
+        assert torch.autograd.gradcheck(render, (focus.requires_grad_(), f_number.requires_grad_()))
+        return
+    plan = Plan.all(6.0, 1 / 60) if "plan" in which else None
+    table = BlurTable.load("sato_j15") if "table" in which else BlurTable.disc()
+    dof = DepthOfField(SMALL, table, tolerance=1 / 60, occlusion=which == "a plan")
+    assert torch.autograd.gradcheck(lambda d: dof(image, d, focus, f_number, plan), depth.requires_grad_())
 
 
 @EVERY_WAY
-def test_gradients_with_respect_to_the_coc(way: dict[str, Any]) -> None:
-    image = torch.rand(1, 2, 3, 4, dtype=torch.float64)
-    # an even slope would lie on the kinks of "nearer than half way"
-    coc = torch.linspace(-2.83, 3.17, 12, dtype=torch.float64) + 0.2 * torch.rand(12, dtype=torch.float64)
-    coc = coc.reshape(1, 1, 3, 4).requires_grad_()
-    assert torch.autograd.gradcheck(lambda coc: blur_by_coc(image, coc, tolerance=1 / 60, **way), coc)
+def test_the_picture_is_the_same_with_gradients_and_their_adjoint_is_that_of_the_sum(way: dict[str, Any]) -> None:
+    image, *others = case().values()
+    dof = DepthOfField(SMALL, tolerance=1 / 60, **way)
+    plain, seen, other = dof(image, *others), torch.rand_like(image), torch.rand_like(image)
+    out = dof(image.requires_grad_(), *others)
+    assert_close(out, plain, rtol=0.0, atol=0.0)
+    if not way["occlusion"]:  # with it the picture is not linear in the image: mixed pixels are told by what they show
+        (back,) = torch.autograd.grad(out, image, seen)
+        assert_close((back * other).sum(), (seen * dof(other, *others)).sum(), rtol=1e-11, atol=0.0)
 
 
-def test_gradients_with_respect_to_the_light_alone_render_the_same_picture() -> None:
-    image, depth, focus, f_number = case()
-    plain = renderer({})(image, depth, focus, f_number)
-    assert_close(renderer({})(image.requires_grad_(), depth, focus, f_number), plain, rtol=0.0, atol=0.0)
+# Where they must be finite
 
 
-@pytest.mark.parametrize("way", [{"occlusion": True}, {"occlusion": False}], ids=["over", "sum"])
-def test_gradients_with_a_plan_of_the_user(way: dict[str, Any]) -> None:
-    image, depth, focus, f_number = case()
-    plan = Plan.all(6.0, 1 / 60)
-    dof = DepthOfField(Camera(sensor_width_mm=0.6), **way)
-    depth.requires_grad_()
-    assert torch.autograd.gradcheck(lambda d: dof(image, d, focus, f_number, plan), depth)
+def _nodes() -> Tensor:
+    nodes = torch.tensor(Plan.still(torch.tensor([[[[-4.0, 4.0]]]]), 1 / 255).coc_px)
+    assert len(nodes) >= 12
+    return nodes.repeat(9)[:108].reshape(1, 1, 9, 12)
+
+
+def _beside(first: float, second: float) -> Tensor:
+    return torch.tensor([first, second]).repeat(54).reshape(1, 1, 9, 12)
+
+
+def _holes() -> Tensor:
+    depth = slope(1.2, 9.0, 9, 12)
+    depth[0, 0, 3:5, 4:7], depth[0, 0, 7, 2] = math.nan, 0.0
+    return depth
+
+
+EVEN = torch.linspace(-4, 4, 108).reshape(1, 1, 9, 12)
+DEPTHS: dict[str, Tensor] = {
+    "focus plane": whole(2.0, 9, 12),
+    "one pixel in focus": torch.linspace(1.3, 2.7, 108).reshape(1, 1, 9, 12),
+    "infinity": whole(math.inf, 9, 12),
+    "infinity beside focus": _beside(2.0, math.inf),
+    "a micrometre": whole(1e-6, 9, 12),
+    "a micrometre beside infinity": _beside(1e-6, math.inf),
+    "checkerboard": _beside(1.2, 9.0),
+    "noise": 2.0 * 10 ** (0.5 * torch.randn(1, 1, 9, 12, generator=torch.Generator().manual_seed(0))),
+    "holes": _holes(),
+}
+COCS: dict[str, Tensor] = {
+    "nodes of layers": _nodes(),
+    "zero": whole(0.0, 9, 12),
+    "partly zero": torch.where(torch.arange(12) % 6 < 2, 0.0, EVEN),
+    "end of focus": from_blur_axis(1e-12) * EVEN.sign(),
+}
 
 
 @EVERY_WAY
-@pytest.mark.parametrize("where", ["focus plane", "layer nodes", "in focus", "end of focus", "infinity"])
-def test_gradients_are_finite_where_the_picture_has_a_kink(way: dict[str, Any], where: str) -> None:
-    image = torch.rand(1, 1, 5, 6, dtype=torch.float32, requires_grad=True)
-    coc = torch.linspace(-3, 3, 30).reshape(1, 1, 5, 6)
-    if where == "focus plane":
-        coc[..., 2:4] = 0.0
-    elif where == "layer nodes":
-        nodes = Plan.still(coc, 1 / 255).coc_px
-        coc = torch.tensor(nodes).repeat(30)[:30].reshape(1, 1, 5, 6)
-    elif where == "in focus":
-        coc = torch.zeros(1, 1, 5, 6)
-    elif where == "end of focus":
-        coc = from_blur_axis(1e-12) * coc.sign()
-    if where == "infinity":
-        depth = torch.full((1, 1, 5, 6), math.inf)
-        depth[..., 3:] = 2.0
-        focus = torch.tensor([2.0], requires_grad=True)
-        leaves = [image, depth.requires_grad_(), focus]
-        out = DepthOfField(Camera(sensor_width_mm=0.5), **way)(image, depth, focus)
+@pytest.mark.parametrize("name", [*DEPTHS, *COCS])
+def test_gradients_are_finite_on_hostile_maps(name: str, way: dict[str, Any]) -> None:
+    image = torch.rand(1, 2, 9, 12, requires_grad=True)
+    if name in COCS:
+        leaves = [image, COCS[name].clone().requires_grad_()]
+        out = blur_by_coc(*leaves, **way)
     else:
-        leaves = [image, coc.requires_grad_()]
-        out = blur_by_coc(image, coc, **way)
-    for grad in torch.autograd.grad(out.square().sum(), leaves):
-        assert torch.isfinite(grad).all()
+        focus, f_number = (torch.tensor([v], requires_grad=True) for v in (2.0, 2.0))
+        leaves = [image, DEPTHS[name].clone().requires_grad_(), focus, f_number]
+        out = DepthOfField(CAMERA, check=name != "holes", **way)(*leaves)
+    assert torch.isfinite(out).all()
+    assert all(torch.isfinite(grad).all() for grad in torch.autograd.grad(out.square().sum(), leaves))
 
 
-@pytest.mark.parametrize("method", ["layered", "fold"])
-def test_the_gradient_of_the_image_is_the_adjoint_of_the_paper_s_sum(method: str) -> None:
-    # with occlusion the picture is not linear in the image: mixed pixels are told by what they show
-    way = {"method": method, "occlusion": False}
-    image, depth, focus, f_number = case()
-    render = renderer(way)
-    seen = torch.rand_like(image)
-    out = render(image.requires_grad_(), depth, focus, f_number)
-    (back,) = torch.autograd.grad(out, image, seen)
-    other = torch.rand_like(image)
-    forward = render(other, depth, focus, f_number)
-    assert_close((back * other).sum(), (seen * forward).sum(), rtol=1e-11, atol=0.0)
+@EVERY_WAY
+@pytest.mark.parametrize(("dtype", "light"), [
+    *((torch.float32, light) for light in (0.0, 1e-30, 1e-40, 1e8)), (torch.float16, 1.0), (torch.bfloat16, 1.0)
+])  # fmt: skip
+def test_gradients_are_finite_at_hostile_light_and_of_its_type(
+    way: dict[str, Any], dtype: torch.dtype, light: float
+) -> None:
+    image = torch.full((1, 2, 9, 12), light, dtype=dtype)
+    image[..., 4, 5] = 2 * light
+    leaves = [image.requires_grad_(), EVEN.clone().requires_grad_()]
+    grads = torch.autograd.grad(blur_by_coc(*leaves, **way).float().square().sum(), leaves)
+    assert [grad.dtype for grad in grads] == [dtype, torch.float32] and all(torch.isfinite(g).all() for g in grads)
+
+
+# By transforms
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # by PyTorch, for tangents
 @pytest.mark.parametrize("way", [{"occlusion": True}, {"method": "fold", "occlusion": False}], ids=["over", "paper"])
-@pytest.mark.parametrize("which", ["image", "depth", "focus", "f-number", "rotation", "squeeze"])
+@pytest.mark.parametrize("which", [*NUMBERS, "rotation", "squeeze"])
 def test_derivatives_forwards_and_by_transforms_are_those_of_autograd(way: dict[str, Any], which: str) -> None:
-    numbers = [torch.tensor(value, dtype=torch.float64) for value in (25.0, 1.3)]
-    inputs = dict(zip(["image", "depth", "focus", "f-number", "rotation", "squeeze"], [*case(), *numbers], strict=True))
+    numbers = {name: torch.tensor(value, dtype=torch.float64) for name, value in (("rotation", 25.0), ("squeeze", 1.3))}
+    inputs = case() | numbers
     seen, step = torch.rand_like(inputs["image"]), torch.rand_like(inputs[which])
 
     def shown(value: Tensor) -> Tensor:
         image, depth, focus, f_number, rotation, squeeze = {**inputs, which: value}.values()
         table = BlurTable.polygon(5, rotation_deg=rotation, squeeze=squeeze)
-        dof = DepthOfField(Camera(sensor_width_mm=0.6), table, tolerance=1 / 60, **way)
-        return (dof(image, depth, focus, f_number) * seen).sum()
+        return (DepthOfField(SMALL, table, tolerance=1 / 60, **way)(image, depth, focus, f_number) * seen).sum()
 
     leaf = inputs[which].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(shown(leaf), leaf)
@@ -184,3 +176,61 @@ def test_transforms_leave_kernels_in_the_cache_that_serve_without_them() -> None
     assert not torch._C._functorch.is_functorch_wrapped_tensor(plain)
     twin = DepthOfField(dof.camera, BlurTable.polygon(7, rotation_deg=12.34))
     assert_close(twin(image, depth), plain, rtol=0.0, atol=0.0)
+
+
+# Depth from defocus: what made this blur?
+
+RAMP = slope(0, 1)
+DESCENTS: dict[str, tuple[list[float], list[float], Callable[[Tensor], dict[str, Tensor]], int, float, float]] = {
+    "a plane before focus": ([1 / 1.3], [1 / 1.55], lambda x: {"depth": torch.ones_like(RAMP) / x}, 80, 0.02, 0.005),
+    "a plane behind focus": ([1 / 5.0], [1 / 2.6], lambda x: {"depth": torch.ones_like(RAMP) / x}, 80, 0.02, 0.005),
+    "a slope": ([0.33, 0.17], [0.26, 0.26], lambda x: {"depth": 1 / (x[0] + (x[1] - x[0]) * RAMP)}, 60, 0.03, 0.02),
+    "the focus": ([1.6], [1.35], lambda x: {"depth": 2 + 6 * RAMP, "focus_m": x}, 50, 0.07, 0.01),
+    "the f-number": ([2.0], [3.0], lambda x: {"depth": 2 + 6 * RAMP, "f_number": x}, 50, 0.07, 0.01),
+}  # fmt: skip
+
+
+def descend(start: Tensor, picture_of: Callable[[Tensor], Tensor], target: Tensor, steps: int, rate: float) -> Tensor:
+    """Gradient descent on the squared difference of pictures."""
+    unknown = start.clone().requires_grad_()
+    adam = torch.optim.Adam([unknown], lr=rate, betas=(0.8, 0.9))
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
+    for _ in range(steps):
+        adam.zero_grad()
+        (picture_of(unknown) - target).square().mean().backward()
+        adam.step()
+        schedule.step()
+    return unknown.detach()
+
+
+def detailed(height: int = 24, width: int = 32) -> Tensor:
+    """Light with detail of every size, so that any blur shows."""
+    coarse = functional.interpolate(torch.rand(1, 1, height // 4, width // 4), (height, width))
+    return 0.1 + torch.rand(1, 1, height, width) * coarse
+
+
+@pytest.mark.hard
+@pytest.mark.parametrize("name", DESCENTS)
+def test_descent_finds(name: str) -> None:
+    truth, start, scene_of, steps, rate, limit = DESCENTS[name]
+    image, dof = detailed(), DepthOfField(CAMERA)
+    target = dof(image, **scene_of(torch.tensor(truth, requires_grad=True))).detach()
+    found = descend(torch.tensor(start), lambda x: dof(image, **scene_of(x)), target, steps, rate)
+    assert found.tolist() == pytest.approx(truth, rel=limit)
+
+
+@pytest.mark.hard
+def test_descent_finds_a_depth_for_every_pixel() -> None:
+    image, dof, truth = (
+        detailed(16, 24),
+        DepthOfField(CAMERA.replace(focus_m=1.0)),
+        0.25 + 0.35 * torch.rand(1, 1, 3, 4),
+    )
+
+    def picture_of(grid: Tensor) -> Tensor:
+        fine = functional.interpolate(grid.clamp(0.05, 0.95), (16, 24), mode="bilinear", align_corners=True)
+        return dof(image, 1 / fine)
+
+    target = picture_of(truth.clone().requires_grad_()).detach()
+    found = descend(torch.full_like(truth, 0.42), picture_of, target, steps=90, rate=0.03)
+    assert float((found - truth).abs().mean()) < 0.02

@@ -1,6 +1,5 @@
 import io
 import math
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -11,20 +10,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests import loops
+from tests.scenes import WAYS, disc
+from tests.tolerances import TOLERANCES
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
 from torchdof.render.border import continued
-from torchdof.render.highlights import threshold
 from torchdof.render.plan import Plan
 
-Tolerances = dict[torch.dtype, Any]
 TYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
-WAYS: list[dict[str, Any]] = [
-    {"method": "layered", "occlusion": True},
-    {"method": "layered", "occlusion": False},
-    {"method": "fold", "occlusion": True},
-    {"method": "fold", "occlusion": False},
-]
-EVERY_WAY = pytest.mark.parametrize("way", WAYS, ids=["layered-over", "layered-sum", "fold-over", "fold-sum"])
+EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 TABLES = {
     "disc": BlurTable.disc(),
     "gaussian": BlurTable.gaussian(),
@@ -48,14 +42,6 @@ def scene(height: int = 12, width: int = 17, reach: float = 4.0, seed: int = 1) 
     return image, reach * slope.clamp(-1, 1)[None, None]
 
 
-def convolved(image: Tensor, kernels: Tensor) -> Tensor:
-    """Image, continued over its border, convolved with a kernel `[1 or C, k, k]`; float64."""
-    kernels = kernels.expand(image.shape[1], -1, -1)[:, None]
-    half = kernels.shape[-1] // 2
-    light = continued(image.double(), None, threshold(image).double(), (half,) * 4, half)
-    return functional.conv2d(light, kernels, groups=len(kernels))
-
-
 def encoded(light: Tensor) -> Tensor:
     """As a display shows it: the sRGB curve of what lies in [0, 1]."""
     light = light.double().clamp(0, 1)
@@ -70,49 +56,38 @@ def rms(first: Tensor, second: Tensor) -> float:
 
 
 @EVERY_WAY
-@pytest.mark.parametrize("coc", [0.501, -0.7, 1.0, -1.37, 2.5, 3.999, -7.3, 12.75])
-def test_a_plane_is_the_convolution_with_its_kernel(coc: float, way: dict[str, Any]) -> None:
-    image = 10 * torch.rand(1, 3, 14, 19) ** 4
-    out = blur_by_coc(image, constant_map(coc, image), **way)
-    kernels = TABLES["disc"].kernels(torch.tensor([coc], dtype=torch.float32), 19)[0]
-    assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", TABLES)
-@pytest.mark.parametrize("coc", [-2.6, 4.3])
-def test_a_plane_is_convolved_with_the_kernel_of_the_table(name: str, coc: float) -> None:
-    image = torch.rand(1, 3, 13, 16)
-    kernels = TABLES[name].kernels(torch.tensor([coc]), 16)[0]
-    for way in WAYS:
-        out = blur_by_coc(image, constant_map(coc, image), table=TABLES[name], **way)
-        assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
+def test_a_plane_is_the_convolution_with_the_kernel_of_its_table(name: str, way: dict[str, Any]) -> None:
+    image = 10 * torch.rand(1, 3, 14, 19) ** 4
+    for coc in (0.501, -0.7, -2.6, 3.999, *([12.75] if name == "disc" else [])):  # others reach beyond the frame
+        values = constant_map(coc, image)
+        out = blur_by_coc(image, values, table=TABLES[name], **way)
+        assert_close(out.double(), disc(image, values, TABLES[name]), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("coc", [-17.21, 24.3, 44.44])
+@pytest.mark.parametrize("coc", [-17.21, 44.44])
 def test_a_strongly_blurred_plane_is_the_convolution_at_any_size(coc: float) -> None:
     image = 10 * torch.rand(1, 1, 90, 120) ** 4
-    out = blur_by_coc(image, constant_map(coc, image))
-    kernels = TABLES["disc"].kernels(torch.tensor([coc]), 120)[0]
-    assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
+    values = constant_map(coc, image)
+    assert_close(blur_by_coc(image, values).double(), disc(image, values), rtol=1e-5, atol=1e-6)
 
 
 def test_a_plane_in_depth_is_convolved_with_the_disc_of_the_thin_lens() -> None:
     camera = Camera(focal_length_mm=85.0, f_number=2.0, focus_m=1.5, sensor_width_mm=4.0)
     image, depth = torch.rand(1, 3, 15, 20), torch.full((1, 1, 15, 20), 6.0)
     radius = 0.085 / 2.0 / 2 * (1.5 * 0.085 / (1.5 - 0.085)) / (0.004 / 20) * (1 / 1.5 - 1 / 6.0)
-    out = DepthOfField(camera)(image, depth)
     assert 4 < radius < 20
-    kernels = BlurTable.disc().kernels(torch.tensor([radius], dtype=torch.float64), 20)[0]
-    assert_close(out.double(), convolved(image, kernels), rtol=1e-5, atol=1e-6)
+    expected = disc(image, constant_map(radius, image, torch.float64))
+    assert_close(DepthOfField(camera)(image, depth).double(), expected, rtol=1e-5, atol=1e-6)
 
 
-def test_a_plane_equals_a_plain_loop_over_its_pixels(loops: ModuleType) -> None:
+def test_a_plane_equals_a_plain_loop_over_its_pixels() -> None:
     image = torch.rand(1, 2, 6, 7, dtype=torch.float64)
     kernels = TABLES["disc"].kernels(torch.tensor([2.3], dtype=torch.float64), 7)[0]
     half = kernels.shape[-1] // 2
     wide = continued(image, None, None, (half,) * 4, half)
     expected = functional.pad(loops.normalised_convolution(wide, kernels), (-half,) * 4)
-    for way in WAYS:
+    for way in WAYS.values():
         out = blur_by_coc(image, constant_map(2.3, image, torch.float64), **way)
         assert_close(out, expected, rtol=1e-10, atol=1e-12)
 
@@ -125,7 +100,8 @@ def test_a_plane_equals_a_plain_loop_over_its_pixels(loops: ModuleType) -> None:
 def test_in_focus_plane_is_returned_bit_exact(way: dict[str, Any], dtype: torch.dtype) -> None:
     image = (torch.rand(2, 3, 7, 9) * 1000).to(dtype)
     depth = torch.full((1, 1, 7, 9), 2.0, dtype=dtype)
-    assert torch.equal(DepthOfField(Camera(focus_m=2.0), **way)(image, depth), image)
+    out = DepthOfField(Camera(focus_m=2.0), **way)(image, depth)
+    assert torch.equal(out, image) and out.data_ptr() != image.data_ptr()
 
 
 @EVERY_WAY
@@ -133,13 +109,6 @@ def test_what_is_blurred_less_than_a_hundredth_of_a_pixel_is_returned_bit_exact(
     image = torch.rand(1, 3, 7, 9)
     coc = 0.02 * torch.rand(1, 1, 7, 9) - 0.01
     assert torch.equal(blur_by_coc(image, coc, **way), image)
-
-
-def test_the_picture_of_a_scene_in_focus_is_not_the_image_itself() -> None:
-    image = torch.rand(1, 3, 5, 5)
-    out = blur_by_coc(image, constant_map(0.0, image))
-    out += 1.0
-    assert float(image.max()) <= 1.0
 
 
 def test_sharp_pixels_far_from_any_blur_are_untouched() -> None:
@@ -172,13 +141,8 @@ def test_a_blurred_foreground_spreads_over_a_sharp_background() -> None:
 def test_a_constant_image_stays_constant_at_any_depth(way: dict[str, Any], value: float, reach: float) -> None:
     image, coc = scene(reach=reach)
     flat = torch.full_like(image, value)
-    assert_close(blur_by_coc(flat, coc, **way), flat, rtol=1e-6, atol=0.0)
-
-
-@EVERY_WAY
-def test_a_constant_image_stays_constant_where_every_pixel_has_its_own_depth(way: dict[str, Any]) -> None:
-    flat = torch.ones(1, 3, 11, 13)
-    assert_close(blur_by_coc(flat, 5 * torch.randn(1, 1, 11, 13), **way), flat, rtol=1e-6, atol=0.0)
+    for values in (coc, min(reach, 5.0) * torch.randn(coc.shape)):
+        assert_close(blur_by_coc(flat, values, **way), flat, rtol=1e-6, atol=0.0)
 
 
 @EVERY_WAY
@@ -199,20 +163,6 @@ def test_the_plain_sum_keeps_all_light_at_any_depths() -> None:
         assert_close(out.double().sum((-2, -1)), image.double().sum((-2, -1)), rtol=1e-5, atol=0.0)
 
 
-@EVERY_WAY
-def test_light_never_turns_negative_nor_brighter_than_the_brightest(way: dict[str, Any]) -> None:
-    image, coc = scene(reach=9.0)
-    out = blur_by_coc(image, coc, **way)
-    assert (out >= 0).all() and float(out.max()) <= float(image.max()) * (1 + 1e-6)
-
-
-def test_a_border_is_not_darkened() -> None:
-    image = torch.ones(1, 1, 12, 16)
-    out = blur_by_coc(image, constant_map(5.0, image))
-    assert_close(out, image, rtol=1e-6, atol=0.0)
-    assert float(blur_by_coc(image, constant_map(5.0, image), occlusion=False, normalize=False)[..., 0, 0]) < 0.5
-
-
 # Against the paper's renderer, a plain loop
 
 
@@ -224,19 +174,17 @@ def wider(image: Tensor, coc: Tensor, beyond: int) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("normalize", [True, False])
 @pytest.mark.parametrize("method", ["layered", "fold"])
 @pytest.mark.parametrize("name", ["disc", "sato_j15"])
-def test_accumulating_billboards_equals_a_plain_loop_over_pixels(
-    name: str, method: Any, normalize: bool, loops: ModuleType
-) -> None:
-    image, coc = (x.double() for x in scene(7, 9, reach=2.6))
+def test_accumulating_billboards_equals_a_plain_loop_over_pixels(name: str, method: Any, normalize: bool) -> None:
+    image, coc = (x.double() for x in scene(5, 6, reach=1.8))
     nodes = list(Plan.of_scene(coc, 1 / 255).nodes)
     options: dict[str, Any] = {"occlusion": False, "normalize": normalize, "method": method}
     out = blur_by_coc(image, coc, table=TABLES[name], **options)
-    beyond = 12 if normalize else 0  # the plain sum is of what was seen
+    beyond = 8 if normalize else 0  # the plain sum is of what was seen
     summed = loops.accumulate(*wider(image, coc, beyond), TABLES[name], nodes, normalize)
     assert_close(out, functional.pad(summed, (-beyond,) * 4), rtol=1e-10, atol=1e-12)
 
 
-def test_kernels_between_layers_are_within_the_tolerance_of_a_kernel_for_every_pixel(loops: ModuleType) -> None:
+def test_kernels_between_layers_are_within_the_tolerance_of_a_kernel_for_every_pixel() -> None:
     image = functional.interpolate(torch.rand(1, 1, 5, 6), (10, 12), mode="bilinear")
     coc = torch.linspace(-4, 3, 120).reshape(1, 1, 10, 12)
     exact = functional.pad(loops.accumulate(*wider(image, coc, 8), TABLES["disc"]), (-8,) * 4)
@@ -245,17 +193,17 @@ def test_kernels_between_layers_are_within_the_tolerance_of_a_kernel_for_every_p
 
 
 @pytest.mark.parametrize("occlusion", [True, False])
-def test_fold_and_layered_render_the_same_picture(occlusion: bool, tolerances: Tolerances) -> None:
+def test_fold_and_layered_render_the_same_picture(occlusion: bool) -> None:
     image, coc = scene(reach=7.0)
     for dtype in (torch.float32, torch.float64):
         pair = [
             blur_by_coc(image.to(dtype), coc.to(dtype), occlusion=occlusion, method=method)
             for method in ("layered", "fold")
         ]
-        assert_close(pair[0], pair[1], **tolerances[dtype])
+        assert_close(pair[0], pair[1], **TOLERANCES[dtype])
 
 
-@pytest.mark.parametrize("way", WAYS[:2], ids=["over", "sum"])
+@pytest.mark.parametrize("way", list(WAYS.values())[:2], ids=["over", "sum"])
 def test_a_looser_tolerance_stays_within_it(way: dict[str, Any]) -> None:
     image = functional.avg_pool2d(scene(40, 56)[0], 5, 1, 2)
     coc = torch.linspace(-9, 9, 56).expand(1, 1, 40, 56).clone()
@@ -267,47 +215,16 @@ def test_a_looser_tolerance_stays_within_it(way: dict[str, Any]) -> None:
         assert rms(out, dense) <= 2 * tolerance
 
 
-# Symmetries
-
-
-@pytest.mark.parametrize(
-    "way",
-    [
-        WAYS[0],
-        WAYS[1],
-        WAYS[3],
-    ],
-    ids=["layered-over", "layered-sum", "fold-sum"],
-)
-def test_flips_and_quarter_turns_commute_with_rendering(way: dict[str, Any]) -> None:
-    image, coc = scene(reach=6.0)
-    out = blur_by_coc(image, coc, **way)
-    for move in (lambda x: x.flip(-1), lambda x: x.flip(-2), lambda x: x.rot90(1, (-2, -1)), lambda x: x.mT):
-        assert_close(blur_by_coc(move(image), move(coc), **way), move(out), rtol=1e-6, atol=1e-6)
-
-
-def test_light_scales_the_picture_of_the_paper_s_sum() -> None:
-    # with occlusion, mixed pixels are told from texture by a contrast that is an absolute number
-    image, coc = scene(reach=6.0)
-    for way in (WAYS[1], WAYS[3]):
-        assert_close(blur_by_coc(1024 * image, coc, **way), 1024 * blur_by_coc(image, coc, **way), rtol=1e-6, atol=0.0)
-
-
-def test_channels_do_not_see_each_other_in_the_paper_s_sum() -> None:
-    # with occlusion, all channels together tell where mixed pixels are split
-    image, coc = scene(reach=6.0)
-    for way in (WAYS[1], WAYS[3]):
-        together = blur_by_coc(image, coc, **way)
-        for c in range(3):
-            assert_close(blur_by_coc(image[:, c : c + 1], coc, **way), together[:, c : c + 1], rtol=1e-6, atol=1e-7)
+# Channels
 
 
 def test_channels_may_be_blurred_by_kernels_of_their_own() -> None:
     image, coc = scene(reach=5.0)
-    for way in (WAYS[1], WAYS[3]):
+    for way in (WAYS["sum"], WAYS["fold-sum"]):
         together = blur_by_coc(image, coc, table=TABLES["colours"], **way)
         for c, scale in enumerate((1.0, 1.1, 1.25)):
             alone = BlurTable("disc", [1.0], {"radius": [scale]})
+            # with occlusion, all channels together tell where mixed pixels are split
             one = blur_by_coc(image[:, c : c + 1], coc, table=alone, **way)
             assert_close(together[:, c : c + 1], one, rtol=1e-5, atol=1e-6)
 
@@ -326,12 +243,6 @@ def test_items_with_cameras_of_their_own_equal_each_alone(way: dict[str, Any]) -
         one = slice(i, i + 1)
         camera = Camera(float(focal[i]), float(stops[i]), float(focus[i]), float(sensor[i]))
         assert_close(together[one], DepthOfField(camera, **way)(image[one], depth[one]), rtol=1e-6, atol=1e-6)
-
-
-def test_one_depth_map_serves_the_whole_batch() -> None:
-    image, depth = torch.rand(2, 3, 9, 12), 0.6 + 4 * torch.rand(1, 1, 9, 12)
-    dof = DepthOfField(Camera(focus_m=1.0, sensor_width_mm=1.0))
-    assert_close(dof(image, depth), dof(image, depth.expand(2, -1, -1, -1)), rtol=0.0, atol=0.0)
 
 
 def test_focus_and_aperture_of_the_call_override_those_of_the_camera() -> None:
@@ -367,26 +278,18 @@ def test_a_plan_made_once_serves_a_whole_shot() -> None:
 
 @EVERY_WAY
 @pytest.mark.parametrize("dtype", TYPES)
-def test_the_result_has_the_type_of_the_image_and_its_precision(
-    way: dict[str, Any], dtype: torch.dtype, tolerances: Tolerances
-) -> None:
+def test_the_result_has_the_type_of_the_image_and_its_precision(way: dict[str, Any], dtype: torch.dtype) -> None:
     image, coc = scene(reach=5.0)
     image = image.to(dtype)
     out = blur_by_coc(image, coc, **way)
     assert out.dtype == dtype and out.shape == image.shape
-    limits = dict(tolerances[dtype]) if dtype.itemsize == 2 else tolerances[torch.float32]
+    limits = dict(TOLERANCES[dtype]) if dtype.itemsize == 2 else TOLERANCES[torch.float32]
     limits = {**limits, "rtol": limits["rtol"] + 1e-5}
-    assert_close(out.double(), blur_by_coc(image.double(), coc.double(), **way), **limits)
-
-
-@EVERY_WAY
-def test_double_precision_is_kept_throughout(way: dict[str, Any]) -> None:
-    image, coc = (x.double() for x in scene(reach=5.0))
-    out = blur_by_coc(image, coc, **way)
-    single = blur_by_coc(image.float(), coc.float(), **way)
-    assert_close(single.double(), out, rtol=1e-5, atol=1e-6)
-    assert_close(blur_by_coc(image.float(), coc, **way), out.float(), rtol=1e-6, atol=1e-7)
-    assert not torch.equal(single.double(), out)
+    exact = blur_by_coc(image.double(), coc.double(), **way)
+    assert_close(out.double(), exact, **limits)
+    if dtype == torch.float32:
+        assert not torch.equal(out.double(), exact)
+        assert_close(blur_by_coc(image, coc.double(), **way), exact.float(), rtol=1e-6, atol=1e-7)
 
 
 @settings(max_examples=25)
@@ -396,7 +299,7 @@ def test_double_precision_is_kept_throughout(way: dict[str, Any]) -> None:
     st.integers(1, 5),
     st.sampled_from(TYPES),
     st.sampled_from([0.0, 0.6, 2.0, 5.0]),
-    st.sampled_from(WAYS),
+    st.sampled_from(list(WAYS.values())),
     st.sampled_from(["plain", "channels_last", "transposed", "every other", "expanded"]),
 )
 def test_any_shape_type_and_stride_gives_the_picture_of_a_plain_tensor(
@@ -418,14 +321,6 @@ def test_any_shape_type_and_stride_gives_the_picture_of_a_plain_tensor(
     assert torch.isfinite(out).all()
     low, high = (float(f(image.double())) for f in (torch.min, torch.max))
     assert low * 0.99 - 1e-6 <= float(out.double().min()) and float(out.double().max()) <= high * 1.01 + 1e-6
-
-
-@EVERY_WAY
-def test_inputs_are_left_as_they_were(way: dict[str, Any]) -> None:
-    image, coc = scene()
-    kept = image.clone(), coc.clone()
-    blur_by_coc(image, coc, **way)
-    assert torch.equal(image, kept[0]) and torch.equal(coc, kept[1])
 
 
 # The module as a module
@@ -479,10 +374,10 @@ def compiled_case() -> tuple[Camera, Tensor, Tensor]:
 @pytest.mark.parametrize(
     ("backend", "way"),
     [
-        ("eager", WAYS[0]),
-        ("eager", WAYS[1]),
-        ("eager", WAYS[3]),
-        pytest.param("inductor", WAYS[0], marks=pytest.mark.hard),
+        ("eager", WAYS["over"]),
+        ("eager", WAYS["sum"]),
+        ("eager", WAYS["fold-sum"]),
+        pytest.param("inductor", WAYS["over"], marks=pytest.mark.hard),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*torch.jit.*:DeprecationWarning")  # from within inductor
@@ -497,28 +392,18 @@ def test_compiled_without_a_break_equals_eager(backend: str, way: dict[str, Any]
     assert rms(fast, dof(image, depth)) <= 2 * COMPILED["tolerance"]
 
 
-def test_modules_with_other_options_compile_one_after_the_other() -> None:
+def test_modules_with_other_options_and_cameras_compile_one_after_the_other() -> None:
     torch.compiler.reset()
     camera, image, depth = compiled_case()
-    for reach, tolerance in ((3.0, 1 / 60), (2.0, 1 / 30), (2.5, 1 / 40)):
-        dof = DepthOfField(camera, max_coc_px=reach, tolerance=tolerance, occlusion=False)
-        fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth)
-        assert_close(fast, dof(image, depth, plan=Plan.all(reach, tolerance)), rtol=1e-5, atol=1e-6)
-
-
-def test_modules_with_other_cameras_compile_one_after_the_other() -> None:
-    torch.compiler.reset()
-    camera, image, depth = compiled_case()
-    for i in range(3):
-        other = camera.replace(
-            focal_length_mm=(1 + 0.1 * i) * camera.focal_length_mm,
-            sensor_width_mm=(1 + 0.2 * i) * camera.sensor_width_mm,
-            f_number=(1 + 0.3 * i) * camera.f_number,
-        )
-        dof = DepthOfField(other, occlusion=False, **COMPILED)
-        fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth, focus_m=torch.tensor([2.0]))
-        plan = Plan.all(COMPILED["max_coc_px"], COMPILED["tolerance"])
-        assert_close(fast, dof(image, depth, focus_m=torch.tensor([2.0]), plan=plan), rtol=1e-5, atol=1e-6)
+    for i, (reach, tolerance) in enumerate(((3.0, 1 / 60), (2.0, 1 / 30), (2.5, 1 / 40))):
+        numbers = {
+            name: (1 + 0.1 * i) * getattr(camera, name) for name in ("focal_length_mm", "sensor_width_mm", "f_number")
+        }
+        dof = DepthOfField(camera.replace(**numbers), max_coc_px=reach, tolerance=tolerance, occlusion=False)
+        focus_m = torch.tensor([2.0])
+        fast = torch.compile(dof, fullgraph=True, backend="eager")(image, depth, focus_m=focus_m)
+        plan = Plan.all(reach, tolerance)
+        assert_close(fast, dof(image, depth, focus_m=focus_m, plan=plan), rtol=1e-5, atol=1e-6)
 
 
 # Refused
@@ -578,21 +463,17 @@ def test_a_wrong_option_is_refused_by_name(options: dict[str, Any], message: str
 
 
 @pytest.mark.parametrize(
-    ("coc", "message"),
+    ("coc", "options", "message"),
     [
-        (torch.full((1, 1, 4, 5), math.nan), "coc_px must be finite, got 20 of 20"),
-        (torch.full((1, 1, 4, 5), -math.inf), "coc_px must be finite"),
-        (torch.zeros(4, 5), r"coc_px must be \[1, 1, 4, 5\].* in pixels"),
+        (torch.full((1, 1, 4, 5), math.nan), {}, "coc_px must be finite, got 20 of 20"),
+        (torch.full((1, 1, 4, 5), -math.inf), {}, "coc_px must be finite"),
+        (torch.zeros(4, 5), {}, r"coc_px must be \[1, 1, 4, 5\].* in pixels"),
+        (torch.zeros(1, 1, 4, 5), {"table": TABLES["colours"]}, "the table blurs 3 channels, the image has 1"),
     ],
 )
-def test_a_wrong_coc_is_refused(coc: Tensor, message: str) -> None:
+def test_a_wrong_coc_or_table_is_refused(coc: Tensor, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        blur_by_coc(torch.rand(1, 3, 4, 5), coc)
-
-
-def test_a_table_of_other_channels_than_the_image_is_refused() -> None:
-    with pytest.raises(ValueError, match="the table blurs 3 channels, the image has 1"):
-        blur_by_coc(torch.rand(1, 1, 4, 5), torch.zeros(1, 1, 4, 5), table=TABLES["colours"])
+        blur_by_coc(torch.rand(1, 1, 4, 5), coc, **options)
 
 
 @pytest.mark.parametrize("wrong", [3, "plan", (0.0, 1.0)])

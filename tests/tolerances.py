@@ -1,8 +1,10 @@
 """How closely results are compared: one table, by the type of the values. Absolute ones are for values around 1."""
 
+from typing import Any
+
 import torch
 
-TOLERANCES: dict[torch.dtype, dict[str, float]] = {
+TOLERANCES: dict[torch.dtype, dict[str, Any]] = {
     torch.float64: {"rtol": 1e-10, "atol": 1e-12},
     torch.float32: {"rtol": 1e-5, "atol": 1e-6},
     torch.bfloat16: {"rtol": 2**-8, "atol": 1e-6},

@@ -71,51 +71,25 @@ def test_pixels_without_depth_are_nan(kind: Any, options: dict[str, float], valu
     assert depth_from_values(row(value, 1.0), kind, **options).isnan().tolist() == [[[[True, False]]]]
 
 
-@pytest.mark.parametrize(
-    ("kind", "options", "says"),
-    [
-        ("metres", {}, "must be one of z, distance, disparity, inverse, coc, got 'metres'"),
-        ("disparity", {}, "disparity needs a scale"),
-        ("distance", {}, "needs the horizontal field of view"),
-        ("distance", {"fov_x_deg": 180.0}, r"must be in \(0, 180\) degrees"),
-        ("z", {"scale": 0.0}, r"scale \(--depth-scale\) must be finite and not 0"),
-        ("z", {"offset": NAN}, r"offset \(--depth-offset\) finite"),
-    ],
-)
-def test_kind_that_lacks_something_is_refused(kind: Any, options: dict[str, float], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        depth_from_values(row(1.0), kind, **options)
+CORNER = torch.full((1, 1, 2, 3), NAN)
+CORNER[0, 0, 0, 0] = 2.0
+CROSS = torch.tensor([[[[1.0, INF, 1.0], [2.0, NAN, 3.0], [1.0, 1.0, 1.0]]]])
 
 
 @pytest.mark.parametrize(
-    ("fill", "expected"),
+    ("depth", "fill", "expected"),
     [
-        ("nearest", [1.0, 1.0, 1.0, 4.0, 4.0]),
-        ("far", [1.0, 4.0, 4.0, 4.0, 4.0]),
-        (9.0, [1.0, 9.0, 9.0, 9.0, 4.0]),
-        (INF, [1.0, INF, INF, INF, 4.0]),
+        (row(1.0, NAN, NAN, 4.0), "nearest", [1.0, 1.0, 4.0, 4.0]),
+        (row(1.0, NAN, NAN, NAN, 4.0), "far", [1.0, 4.0, 4.0, 4.0, 4.0]),
+        (row(1.0, NAN, NAN, NAN, 4.0), 9.0, [1.0, 9.0, 9.0, 9.0, 4.0]),
+        (row(1.0, NAN, NAN, NAN, 4.0), INF, [1.0, INF, INF, INF, 4.0]),
+        (row(-5.0, NAN, -2.0), "far", [-5.0, -2.0, -2.0]),  # of a map of circles of confusion
+        (CROSS, "far", [1.0, INF, 1.0, 2.0, INF, 3.0, 1.0, 1.0, 1.0]),  # up and down, too
+        (CORNER, "far", [2.0] * 6),  # the nearest where a row and a column have none
     ],
 )
-def test_holes_are_filled_as_asked(fill: Any, expected: list[float]) -> None:
-    filled = fill_holes(row(1.0, NAN, NAN, NAN, 4.0), fill)
-    if fill == "nearest":
-        filled[..., 2] = 1.0  # as near to one as to the other
-    assert filled.flatten().tolist() == expected
-
-
-def test_far_looks_up_and_down_too_and_takes_infinity() -> None:
-    depth = torch.tensor([[[[1.0, INF, 1.0], [2.0, NAN, 3.0], [1.0, 1.0, 1.0]]]])
-    assert fill_holes(depth, "far")[0, 0, 1, 1].item() == INF
-
-
-def test_far_of_a_coc_map_is_the_largest_signed_radius() -> None:
-    assert fill_holes(row(-5.0, NAN, -2.0), "far").flatten().tolist() == [-5.0, -2.0, -2.0]
-
-
-def test_hole_without_depth_in_its_row_or_column_is_filled_from_the_nearest() -> None:
-    depth = torch.full((1, 1, 5, 5), NAN)
-    depth[0, 0, 1, 1] = 2.0
-    assert fill_holes(depth, "far").unique().tolist() == [2.0]
+def test_holes_are_filled_as_asked(depth: torch.Tensor, fill: Any, expected: list[float]) -> None:
+    assert fill_holes(depth, fill).flatten().tolist() == expected
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 2**31))
@@ -134,16 +108,27 @@ def test_nearest_is_as_near_as_the_nearest_of_all_pixels(height: int, width: int
             assert math.sqrt(got) <= math.sqrt(best) + 0.5
 
 
-@pytest.mark.parametrize("fill", ["nearest", "far"])
-def test_map_without_any_depth_is_refused(fill: Any) -> None:
-    with pytest.raises(ValueError, match="no pixel has a depth; check the kind, scale and offset"):
-        fill_holes(torch.full((1, 1, 2, 2), NAN), fill)
-
-
-@pytest.mark.parametrize("fill", ["middle", 0.0, -1.0, NAN, True])
-def test_unknown_fill_is_refused(fill: Any) -> None:
-    with pytest.raises(ValueError, match="fill"):
-        fill_holes(row(1.0, NAN), fill)
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: depth_from_values(row(1.0), "metres"), "must be one of z, distance, disparity, inverse, coc, got 'me"),
+        (lambda: depth_from_values(row(1.0), "disparity"), "disparity needs a scale"),
+        (lambda: depth_from_values(row(1.0), "distance"), "needs the horizontal field of view"),
+        (lambda: depth_from_values(row(1.0), "distance", fov_x_deg=180.0), r"must be in \(0, 180\) degrees"),
+        (lambda: depth_from_values(row(1.0), "z", scale=0.0), r"scale \(--depth-scale\) must be finite and not 0"),
+        (lambda: depth_from_values(row(1.0), "z", offset=NAN), r"offset \(--depth-offset\) finite"),
+        (lambda: fill_holes(row(NAN), "nearest"), "no pixel has a depth; check the kind, scale and offset"),
+        (lambda: fill_holes(row(NAN), "far"), "no pixel has a depth; check the kind, scale and offset"),
+        (lambda: fill_holes(row(1.0, NAN), "middle"), "fill"),
+        (lambda: fill_holes(row(1.0, NAN), 0.0), "fill"),
+        (lambda: fill_holes(row(1.0, NAN), -1.0), "fill"),
+        (lambda: fill_holes(row(1.0, NAN), NAN), "fill"),
+        (lambda: fill_holes(row(1.0, NAN), True), "fill"),
+    ],
+)
+def test_what_makes_no_depth_is_refused(call: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        call()
 
 
 def test_holes_are_counted_and_refused_unless_a_fill_is_asked_for(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.tolerances import TOLERANCES
 from torchdof.depth import depth_from_values, from_relative, solve_scale
 from torchdof.depth.relative import RELATIVE_KINDS
 
@@ -51,11 +52,11 @@ def test_large_whole_numbers_that_lie_close_together_are_told_apart() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_floating_types_are_kept(dtype: torch.dtype, tolerances: dict[torch.dtype, Any]) -> None:
+def test_floating_types_are_kept(dtype: torch.dtype) -> None:
     values = torch.rand(2, 1, 4, 5).to(dtype)
     depth = from_relative(values, 1.0, 4.0)
     assert depth.dtype == dtype
-    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).to(dtype), **tolerances[dtype])
+    torch.testing.assert_close(depth, from_relative(values.double(), 1.0, 4.0).to(dtype), **TOLERANCES[dtype])
 
 
 def test_holes_stay_holes_and_do_not_stretch_the_range() -> None:

@@ -1,14 +1,20 @@
-"""Eager, exported and, in the sweep, compiled render the same picture of the ray-traced scenes."""
+"""Eager, exported and, in the sweep, compiled render the same picture: of ray-traced scenes, lamps, other sizes."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from torchdof import BlurTable
+from torchdof.export import ray_splats
+from torchdof.export.rays import kernels_of
 from torchdof.export.verification import TOLERANCE, local_range
 from torchdof.reference.scenes import read_scenes
+from torchdof.render.plan import Plan
 
 DATA = Path(__file__).parents[1] / "data" / "scenes"
 SIZE = (72, 100)
@@ -42,6 +48,54 @@ def test_eager_and_exported_agree(module: str, name: str, request: pytest.Fixtur
     exported = request.getfixturevalue(module)
     tensors, eager, unit = compared(exported, name)
     assert float(((exported.render(*tensors) - eager).abs() / unit).max()) <= TOLERANCE
+
+
+def test_items_of_another_size_have_a_focus_and_an_aperture_each(layered: Any) -> None:
+    generator = torch.Generator().manual_seed(3)
+    image = torch.rand(2, 3, 45, 71, generator=generator)
+    depth = torch.nn.functional.interpolate(torch.rand(2, 1, 5, 7, generator=generator) * 4 + 1, (45, 71))
+    tensors = image, depth, torch.tensor([1.4, 3.0]), torch.tensor([4.0, 7.0])
+    expected = layered.eager(*tensors)
+    assert (expected - image).abs().max() > 0.1
+    torch.testing.assert_close(layered.render(*tensors), expected, atol=1e-5, rtol=0)
+
+
+def street(exported: Any, lamps: int) -> tuple[Tensor, ...]:
+    """Lamps behind a post, and in front of it, that are blurred up to the largest radius of a file."""
+    depth = torch.full((1, 1, 90, 120), 6.0) + 0.1 * torch.rand(1, 1, 90, 120)
+    depth[..., 50:58], depth[..., 70:, :] = 0.8, 1.2
+    image = 0.1 * torch.rand(1, 3, 90, 120)
+    image.flatten(2)[..., torch.randperm(90 * 120)[:lamps]] = 40.0 * torch.rand(3, lamps)
+    widest = exported.dof.camera.replace(focus_m=2.0, f_number=1.0).coc_px(depth, 120).abs().amax()
+    return image, depth, torch.tensor([2.0]), (widest / exported.dof.options.max_coc_px).reshape(1)
+
+
+@pytest.mark.parametrize("lamps", [20, 1500], ids=["few", "more than rays are splatted for"])
+@pytest.mark.parametrize("module", ["layered", "plain"])
+def test_lamps_are_splatted_ray_by_ray(module: str, lamps: int, request: pytest.FixtureRequest) -> None:
+    exported = request.getfixturevalue(module)
+    tensors = street(exported, lamps)
+    eager = exported.eager(*tensors)
+    with torch.no_grad():
+        softer = exported.dof(*tensors, plan=dataclasses.replace(exported.plan, rays=False))
+    assert float((eager - softer).abs().max()) > 0.05, "no rays"
+    assert float(((exported.render(*tensors) - eager).abs() / local_range(tensors[0], 16)).max()) <= TOLERANCE
+
+
+@pytest.mark.parametrize("shape", ["disc", "polygon", "sato_j15"])
+def test_kernels_of_a_file_are_those_of_its_table(shape: str) -> None:
+    made = {"disc": BlurTable.disc, "polygon": lambda: BlurTable.polygon(blades=5, rotation_deg=10.0)}
+    table = made[shape]() if shape in made else BlurTable.load(shape)
+    plan = Plan.all(3.0, 1 / 255, rays=True)
+    values, origins, halves, is_round, per_px, *_ = kernels_of(table, plan, 1)
+    values_at: Any = ray_splats.values_at
+    for coc_px in (-2.75, 0.5, 3.0):
+        expected = table.kernels(torch.tensor([coc_px]), 1).float()[0, :, None]
+        half = expected.shape[-1] // 2 + 2  # what lies beyond a kernel is 0
+        node = np.array([len(halves) // 2 + round(coc_px * per_px)])
+        arrays = [t.numpy() for t in (values, origins, halves, is_round)]
+        got = torch.from_numpy(values_at(*arrays, node, np.arange(-half, half + 1)))
+        torch.testing.assert_close(got, torch.nn.functional.pad(expected, (2, 2, 2, 2)), rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.sweep

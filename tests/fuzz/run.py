@@ -1,4 +1,4 @@
-"""Fuzzes every reader and the engines for a time: `make fuzz`, or `python tests/fuzz/run.py --seconds 3600`.
+"""Fuzzes every reader and the engines for a time: `make fuzz`, or `python -m tests.fuzz.run --seconds 3600`.
 
 Inputs are made by seeded mutation, one target after the other, in a process of its own that is started anew when it
 dies, hangs or grows. What it finds is written to a folder and listed; copied to `found/TARGET/` it is a test.
@@ -6,7 +6,6 @@ dies, hangs or grows. What it finds is written to a folder and listed; copied to
 
 import argparse
 import hashlib
-import importlib.util
 import multiprocessing
 import os
 import random
@@ -18,30 +17,19 @@ import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from types import ModuleType
+
+import torch
+
+from tests.fuzz import targets
+from tests.fuzz.mutate import mutated
+from tests.fuzz.targets import TARGETS
 
 _LONGEST_S = 120.0  # for one input, on a busy machine
 _MEMORY = 6 * 2**30
 
 
-def beside(name: str) -> ModuleType:
-    """A module beside this file."""
-    full = f"torchdof_fuzz_{name}"
-    if full not in sys.modules:
-        spec = importlib.util.spec_from_file_location(full, Path(__file__).with_name(f"{name}.py"))
-        if spec is None or spec.loader is None:
-            raise ImportError(f"{name}.py must lie beside this file")
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[full] = module
-        spec.loader.exec_module(module)
-    return sys.modules[full]
-
-
 def work(pipe: Connection, folder: str) -> None:
     """Takes names of targets with paths, answers with what is wrong; what is printed goes to a file."""
-    targets = beside("targets").TARGETS
-    import torch
-
     torch.set_num_threads(1)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -53,7 +41,7 @@ def work(pipe: Connection, folder: str) -> None:
         name, path = pipe.recv()
         os.ftruncate(printed, 0)
         os.lseek(printed, 0, os.SEEK_SET)
-        wrong = beside("targets").finding(targets[name], Path(path))
+        wrong = targets.finding(TARGETS[name], Path(path))
         lines = os.pread(printed, 10_000, 0).decode(errors="replace").splitlines()
         lines = [line for line in lines if line and not line.startswith("libpng ")]
         if wrong is None and lines:
@@ -102,14 +90,13 @@ class Worker:
 
 def main() -> None:
     """Fuzzes for the time given; exit code 1 if something was found."""
-    targets = beside("targets").TARGETS
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--target", choices=targets, action="append", help="Repeat it for several; default: all.")
+    parser.add_argument("--target", choices=TARGETS, action="append", help="Repeat it for several; default: all.")
     parser.add_argument("--findings", type=Path, default=Path("build/fuzz"))
     arguments = parser.parse_args()
-    names = arguments.target or list(targets)
+    names = arguments.target or list(TARGETS)
     arguments.findings.mkdir(parents=True, exist_ok=True)
     rng, tried, found = random.Random(arguments.seed), dict.fromkeys(names, 0), {}
     with tempfile.TemporaryDirectory() as temporary:
@@ -117,15 +104,15 @@ def main() -> None:
         corpus = {}
         for name in names:
             (folder / name).mkdir()
-            corpus[name] = list(beside("targets").seeds(targets[name], folder / name))
+            corpus[name] = list(targets.seeds(TARGETS[name], folder / name))
         worker, end = Worker(folder), time.monotonic() + arguments.seconds
         while time.monotonic() < end:
             for name in names:
                 turn_s = min(5.0, arguments.seconds / len(names) / 2) * (4.0 if name == "engines" else 1.0)
-                target, turn = targets[name], time.monotonic() + turn_s
+                target, turn = TARGETS[name], time.monotonic() + turn_s
                 path = folder / ("capture.toml" if name == "manifest" else f"input{target.suffix}")
                 while time.monotonic() < min(turn, end):
-                    content = beside("mutate").mutated(rng.choice(corpus[name]), corpus[name], target.suffix, rng)
+                    content = mutated(rng.choice(corpus[name]), corpus[name], target.suffix, rng)
                     path.write_bytes(content)
                     tried[name] += 1
                     wrong = worker.run(name, path)

@@ -1,36 +1,24 @@
 """What fuzzing found stays mended, and the mutators do what they say."""
 
-import importlib.util
 import random
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from tests.fuzz import targets
+from tests.fuzz.mutate import mutated
+from tests.fuzz.targets import TARGETS
 from torchdof.io.images import read_image
 
 pytestmark = pytest.mark.hard
 
 
-def _beside(name: str) -> ModuleType:
-    full = f"torchdof_fuzz_{name}"
-    if full not in sys.modules:
-        spec = importlib.util.spec_from_file_location(full, Path(__file__).with_name(f"{name}.py"))
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[full] = module
-        spec.loader.exec_module(module)
-    return sys.modules[full]
-
-
 FOUND = sorted(path for path in Path(__file__).with_name("found").glob("*/*") if path.is_file())
-TARGETS = _beside("targets").TARGETS
 
 
 @pytest.mark.parametrize("path", FOUND, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_what_was_found_is_taken_or_refused(path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert _beside("targets").finding(TARGETS[path.parent.name], path) is None
+    assert targets.finding(TARGETS[path.parent.name], path) is None
     printed = [line for text in capfd.readouterr() for line in text.splitlines() if not line.startswith("libpng ")]
     assert printed == []
 
@@ -39,20 +27,20 @@ def test_what_was_found_is_taken_or_refused(path: Path, capfd: pytest.CaptureFix
 def test_whole_inputs_and_changed_ones_are_no_finding(name: str, tmp_path: Path) -> None:
     target, rng = TARGETS[name], random.Random(0)
     count = 20 if target.suffix == ".scene" else 100  # of scenes each takes long
-    corpus = list(_beside("targets").seeds(target, tmp_path))
+    corpus = list(targets.seeds(target, tmp_path))
     path = tmp_path / f"input{target.suffix}"
-    inputs = corpus + [_beside("mutate").mutated(rng.choice(corpus), corpus, target.suffix, rng) for _ in range(count)]
+    inputs = corpus + [mutated(rng.choice(corpus), corpus, target.suffix, rng) for _ in range(count)]
     for content in inputs:
         path.write_bytes(content)
-        assert _beside("targets").finding(target, path) is None
+        assert targets.finding(target, path) is None
     assert len(set(inputs)) > len(corpus) + 10
 
 
 def test_changed_chunks_of_a_png_can_have_right_checksums(tmp_path: Path) -> None:
-    corpus = list(_beside("targets").seeds(TARGETS["png"], tmp_path))
+    corpus = list(targets.seeds(TARGETS["png"], tmp_path))
     path, rng, said = tmp_path / "x.png", random.Random(0), []
     for _ in range(200):
-        content = _beside("mutate").mutated(corpus[0], corpus, ".png", rng)
+        content = mutated(corpus[0], corpus, ".png", rng)
         if not content:  # refused before its parts are looked at
             continue
         path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""Every public entry under hostile conditions: autocast, types that only store, plans of other scenes, lenses."""
+"""What every public entry refuses by name: types that only store, plans and lenses that there are not."""
 
 import functools
 import math
@@ -9,73 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.scenes import CAMERA, slope, texture, whole
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
-from torchdof.depth import depth_from_values, fill_holes, repair_edges
+from torchdof.depth import depth_from_values, fill_holes
 from torchdof.io.images import Picture, write_image
 from torchdof.optics import psf
-from torchdof.reference.lens_views import lens_views
-from torchdof.reference.metrics import ssim
 from torchdof.render.plan import Plan
 
 pytestmark = pytest.mark.hard
 
-EVERY_ENGINE = pytest.mark.parametrize("engine", ["torch", "native"])
-CAMERA = Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0, sensor_width_mm=4.0)
 DOF = DepthOfField(CAMERA)
-
-
-def light(channels: int = 3) -> Tensor:
-    return torch.rand(1, channels, 24, 32, generator=torch.Generator().manual_seed(1))
-
-
-def slope() -> Tensor:
-    return torch.linspace(1.2, 6.0, 32).expand(1, 1, 24, 32)
-
-
-def posts() -> Tensor:
-    """Posts three pixels wide before a wall."""
-    depth = torch.full((1, 1, 24, 32), 2.5)
-    depth[..., 12:15] = depth[..., 4:16, 24:27] = 1.2
-    return depth
-
-
-def soft_posts() -> Tensor:
-    """The same as resampling leaves it: ramps swallow part of what is thin."""
-    return 1.0 / torch.nn.functional.avg_pool2d(1.0 / posts(), 3, 1, 1, count_include_pad=False)
-
-
-def lit_posts() -> Tensor:
-    return 0.1 * light() + (posts() < 2.0)
-
-
-ENTRIES: dict[str, Callable[[], Tensor]] = {
-    "repair_edges": lambda: repair_edges(lit_posts(), soft_posts()),
-    "forward, edges repaired": lambda: DepthOfField(CAMERA, depth_edges="repair")(lit_posts(), soft_posts()),
-    "forward, cat's eyes": lambda: DepthOfField(CAMERA, BlurTable.polygon(5, vignetting=0.4))(light(), slope()),
-    "forward": lambda: DOF(light(), slope()),
-    "forward with a plan": lambda: DOF(light(), slope(), plan=DOF.plan(light(), slope())),
-    "forward with a background": lambda: DOF(light(), slope(), background=light(), background_depth=2 * slope()),
-    "forward with attention": lambda: DOF(light(), slope(), attention=(9.0, 9.0, 3.0)),
-    "layers": lambda: DOF.layers(light(4)[:, None].expand(1, 2, -1, -1, -1), torch.tensor([1.2, 9.0])),
-    "layers, one item after the other": lambda: DOF.layers(light(8).reshape(1, 2, 4, 24, 32), torch.tensor([1.2, 9.0])),
-    "coc_px": lambda: DOF.coc_px(light(), slope()),
-    "depth_of_field": lambda: depth_of_field(light(), slope(), CAMERA, occlusion=False),
-    "blur_by_coc": lambda: blur_by_coc(light(), slope(), method="fold"),
-    "kernels": lambda: BlurTable.load("sato_j15").kernels(torch.tensor([-3.0, 7.0]), 640),
-    "lens_views": lambda: lens_views(light(), slope(), CAMERA, views=8).image,
-    "ssim": lambda: torch.as_tensor(ssim(light(), light().flip(-1))),
-}
-
-
-@EVERY_ENGINE
-@pytest.mark.parametrize("name", ENTRIES)
-def test_autocast_changes_no_number(name: str, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-    plain = ENTRIES[name]()
-    with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(ENTRIES[name](), plain)
-
-
 IMAGE, MAP = torch.ones(1, 3, 4, 5), torch.ones(1, 1, 4, 5)
 TAKES_TENSORS: dict[str, Callable[[Tensor], Any]] = {
     "image": lambda x: DOF(x.expand(1, 3, 4, 5), MAP),
@@ -111,36 +54,9 @@ def test_types_that_only_store_are_refused_by_name(name: str, dtype: torch.dtype
 # Plans
 
 
-@EVERY_ENGINE
-@pytest.mark.parametrize("occlusion", [True, False])
-@pytest.mark.parametrize(
-    ("planned", "rendered"),
-    [(0.0, 6.0), (0.0, -6.0), (-2.0, -3.0), (3.0, 20.0), (4.0, -4.0), (5.0, 0.0)],
-)
-def test_a_plan_of_a_plane_serves_another_plane(
-    planned: float, rendered: float, occlusion: bool, engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-    plan = Plan.of_scene(torch.full((1, 1, 24, 32), planned), 1 / 255)
-    plane = torch.full((1, 1, 24, 32), rendered)
-    out = blur_by_coc(light(), plane, plan=plan, occlusion=occlusion)
-    truth = blur_by_coc(light(), plane, occlusion=occlusion)
-    rms = float((out - truth).square().mean().sqrt())
-    assert rms < 1 / 255  # layers of 20 px are coarser
-
-
-@EVERY_ENGINE
-def test_a_plan_of_the_first_frame_serves_a_pull_of_focus(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
-    plan = DOF.plan(light(), torch.full((1, 1, 24, 32), 2.0))  # all in focus
-    for focus_m in (2.0, 1.9, 1.4, 1.25, 3.0, 9.0, math.inf):
-        out, truth = DOF(light(), slope(), focus_m, plan=plan), DOF(light(), slope(), focus_m)
-        assert float((out - truth).square().mean().sqrt()) < 1 / 255
-
-
 def test_a_plan_that_reaches_stays_as_it_is() -> None:
-    plan = DOF.plan(light(), slope())
-    coc = DOF.coc_px(light(), slope())
+    plan = DOF.plan(texture(), slope(1.2, 6.0))
+    coc = DOF.coc_px(texture(), slope(1.2, 6.0))
     assert plan.reaching(coc) is plan and plan.reaching(0.5 * coc) is plan
     every = Plan.all(2.0, 1 / 255)
     assert every.reaching(coc) is every  # that of a graph, which cannot look at its scene
@@ -181,7 +97,7 @@ def test_a_plan_without_a_tolerance_is_refused(tolerance: Any) -> None:
     ],
 )
 def test_a_blur_beyond_numbers_names_the_lens_and_the_depth(camera: Camera, depth: float, named: str) -> None:
-    image, depths, dof = light(), torch.full((1, 1, 24, 32), depth), DepthOfField(camera)
+    image, depths, dof = texture(), whole(depth), DepthOfField(camera)
     calls: list[Callable[[], Any]] = [
         functools.partial(dof, image, depths),
         functools.partial(dof.plan, image, depths),
@@ -195,11 +111,3 @@ def test_a_blur_beyond_numbers_names_the_lens_and_the_depth(camera: Camera, dept
         with pytest.raises(ValueError, match=f"this lens .*{named}") as refused:
             call()
         assert "coc_px" not in str(refused.value) and "check=False" not in str(refused.value)
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_bad_light_in_layers_is_refused_and_counted(bad: float) -> None:
-    rgba = torch.ones(1, 2, 4, 6, 7)
-    rgba[0, 1, 2, 3, 4:6] = bad
-    with pytest.raises(ValueError, match="rgba must be finite, got 2 of 336"):
-        DOF.layers(rgba, torch.tensor([1.0, 4.0]))

@@ -1,11 +1,12 @@
 """Long use of one process: it does not grow, and threads and workers make the same pictures."""
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.hard import soak
 
 SOAK = Path(__file__).with_name("soak.py")
 
@@ -52,9 +53,31 @@ def test_a_forked_worker_renders_after_its_parent_has_by_many_threads(engine: st
 
 @pytest.mark.hard
 def test_eight_threads_with_a_module_each_make_the_same_pictures() -> None:
-    spec = importlib.util.spec_from_file_location("torchdof_soak", SOAK)
-    assert spec is not None and spec.loader is not None
-    soak = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(soak)
     truth = [soak.rendering(seed) for seed in range(12)]
     assert soak.same(soak.in_threads(range(12), 8), truth)
+
+
+MANY = """
+import gc, resource, torch, torchdof
+image = torch.rand(1, 3, 24, 32)
+dof = torchdof.DepthOfField(torchdof.Camera(sensor_width_mm=6.0))
+def rss():
+    gc.collect()
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
+def shoot(count):
+    for i in range(count):
+        dof(image, 1.0 + 0.01 * i + torch.rand(1, 1, 24, 32))
+shoot(60)
+early = rss()
+shoot(440)
+print(early, rss())
+"""
+
+
+@pytest.mark.hard
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_500_frames_in_one_process_do_not_grow() -> None:
+    done = subprocess.run([sys.executable, "-c", MANY], capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stderr
+    early, late = (int(x) for x in done.stdout.split())
+    assert late < 1.05 * early

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The compiled engine under sanitizers: sanitize.sh PYTHON, a Python with torchdof's dependencies; needs GCC.
 # Random scenes by many threads under ThreadSanitizer and AddressSanitizer with UBSan (driver.cpp),
-# then the tests of this folder, in Python, under AddressSanitizer. A report ends it with an error.
+# then the tests of this folder and of both engines, in Python, under AddressSanitizer. A report ends it with an error.
 set -euo pipefail
 python=$(realpath --no-symlinks "$1")
 cd "$(dirname "$0")/../.."
@@ -24,7 +24,7 @@ for kind in address thread; do
     fi
 done
 
-echo "tests/native, address sanitizer"
+echo "tests of the engine, address sanitizer"
 # What throws in other libraries must be found too, so the C++ library comes with the sanitizer's.
 LD_PRELOAD="$("$CXX" -print-file-name=libasan.so) $("$CXX" -print-file-name=libstdc++.so.6)" TORCHDOF_ENGINE=native \
-    build/sanitize/address/venv/bin/python -P -m pytest -p no:cacheprovider tests/native
+    build/sanitize/address/venv/bin/python -P -m pytest -p no:cacheprovider tests/native tests/test_engines.py -k "not file"

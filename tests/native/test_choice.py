@@ -1,8 +1,9 @@
 """Which engine renders: ``TORCHDOF_ENGINE``."""
 
 import pytest
+import torch
 
-from torchdof import native
+from torchdof import blur_by_coc, native
 
 
 def test_the_compiled_engine_is_chosen_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,3 +37,5 @@ def test_an_unknown_engine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "numpy")
     with pytest.raises(ValueError, match="must be auto, native or torch, got 'numpy'"):
         native.describe()
+    with pytest.raises(ValueError, match="must be auto, native or torch, got 'numpy'"):
+        blur_by_coc(torch.rand(1, 3, 3, 4), torch.full((1, 1, 3, 4), 3.0))

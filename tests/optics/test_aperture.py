@@ -22,6 +22,7 @@ LOPSIDED = [
     BlurTable.polygon(3, 20.0, squeeze=1.6),
     BlurTable.polygon(5, 7.0, 0.4, rim=2.0),
     BlurTable.from_aperture(LETTER, squeeze=0.8),
+    BlurTable.polygon(5, vignetting=(0.3, 0.1)),
     BlurTable.load("double_gauss_50mm_f2").with_aperture(Aperture(blades=7, rotation_deg=15.0)),
 ]
 
@@ -172,6 +173,8 @@ def test_a_table_with_an_aperture_comes_back_from_its_file(tmp_path: Path) -> No
         table.save(tmp_path / "lens.json")
         loaded = BlurTable.load(tmp_path / "lens.json")
         assert loaded.fingerprint() == table.fingerprint() != table.with_aperture(None).fingerprint()
+        assert loaded.aperture is not None and table.aperture is not None
+        assert loaded.aperture.rims == table.aperture.rims
         coc = torch.tensor([-6.0, 6.0])
         assert_close(loaded.kernels(coc, 900), table.kernels(coc, 900), rtol=0, atol=0)
     written = json.loads((tmp_path / "lens.json").read_text())
@@ -192,6 +195,7 @@ def test_a_file_of_the_first_version_is_a_round_lens() -> None:
     ("make", "message"),
     [
         (lambda: BlurTable.polygon(2), "blades must be a whole number from 3 to 64, got 2"),
+        (lambda: BlurTable.polygon(5, vignetting=1.5), "vignetting must be a number from 0 to 1, got 1.5"),
         (lambda: BlurTable.polygon(5, squeeze=0.0), "squeeze must be a number from 0.1 to 10, got 0.0"),
         (lambda: BlurTable.polygon(5, torch.zeros(2)), "rotation_deg must be a number"),
         (lambda: BlurTable.polygon(5, curvature=2.0), "curvature must be a number from 0 to 1, got 2.0"),

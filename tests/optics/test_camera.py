@@ -1,4 +1,6 @@
+import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -26,13 +28,19 @@ def coc_in_millimetres(focal_mm: float, f_number: float, focus_m: float, z_m: fl
     return 1000.0 * (focal / f_number / 2) * (sensor - image) / image
 
 
+@pytest.mark.parametrize(
+    ("focal_mm", "f_number", "sensor_mm", "width"), [(50.0, 1.8, 36.0, 1920), (35.0, 5.6, 24.0, 640)]
+)
 @pytest.mark.parametrize("focus_m", [0.3, 2.0, 50.0, math.inf])
-@pytest.mark.parametrize("z_m", [0.1, 0.5, 1.99, 2.5, 1e3, math.inf])
-def test_coc_is_the_cone_of_light_on_the_sensor(focus_m: float, z_m: float) -> None:
-    camera = Camera(focal_length_mm=50.0, f_number=1.8, focus_m=focus_m, sensor_width_mm=36.0)
-    coc = camera.coc_px(depth_of(z_m), width=1920)
-    expected = coc_in_millimetres(50.0, 1.8, focus_m, z_m) * 1920 / 36.0
-    assert_close(float(coc), expected, rtol=1e-11, atol=1e-11)
+@pytest.mark.parametrize("z_m", [0.1, 0.5, 1.99, 2.5, 1e3, 1e12, math.inf])
+def test_coc_is_the_cone_of_light_on_the_sensor(
+    focal_mm: float, f_number: float, sensor_mm: float, width: int, focus_m: float, z_m: float
+) -> None:
+    camera = Camera(focal_mm, f_number, focus_m, sensor_mm)
+    coc = float(camera.coc_px(depth_of(z_m), width))
+    expected = coc_in_millimetres(focal_mm, f_number, focus_m, z_m) * width / sensor_mm
+    assert_close(coc, expected, rtol=1e-11, atol=1e-11)
+    assert coc != 0.0 or z_m == focus_m
 
 
 @given(DISTANCE_M, DISTANCE_M, st.floats(0.5, 64.0))
@@ -58,50 +66,17 @@ def test_coc_next_to_the_focus_plane_does_not_cancel(dtype: torch.dtype) -> None
     assert_close(float(near), -slope * step, rtol=1e-5, atol=0.0)
 
 
-def test_coc_at_infinity_is_exactly_that_of_inverse_depth_zero() -> None:
-    camera = Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0)
-    expected = camera.aperture_radius_m * camera.focal_px(1000) / 2.0
-    assert float(camera.coc_px(depth_of(math.inf), 1000)) == expected
-    assert float(camera.coc_px(depth_of(1e12), 1000)) == pytest.approx(expected, rel=1e-11)
-
-
-def test_focused_at_infinity_everything_is_in_front_and_infinity_is_sharp() -> None:
-    coc = Camera(focus_m=math.inf).coc_px(depth_of(1.0, 1e6, math.inf), 1000).flatten()
-    assert float(coc[2]) == 0.0
-    assert coc[0] < coc[1] < 0.0
-
-
-def test_coc_is_proportional_to_width_and_inversely_to_f_number() -> None:
-    depth = depth_of(0.7, 1.9, 30.0)
-    base = Camera(f_number=4.0).coc_px(depth, 1000)
-    assert_close(Camera(f_number=4.0).coc_px(depth, 2000), 2 * base)
-    assert_close(Camera(f_number=2.0).coc_px(depth, 1000), 2 * base)
-
-
 def test_rendering_convention_keeps_the_field_of_view_at_any_focus() -> None:
+    focal_px = 384.0 / math.tan(math.radians(20.0))
     for focus_m in (0.1, 2.0, math.inf):
         camera = Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=focus_m)
-        assert camera.focal_px(768) == pytest.approx(384.0 / math.tan(math.radians(20.0)), rel=1e-14)
+        assert camera.focal_px(768) == pytest.approx(focal_px, rel=1e-14)
         assert camera.aperture_radius_m == pytest.approx(0.012, rel=1e-14)
-
-
-def test_rendering_convention_gives_the_coc_of_inverse_depths() -> None:
-    camera = Camera.from_fov(fov_x_deg=40.0, aperture_radius_m=0.012, focus_m=2.0)
-    expected = 0.012 * 384.0 / math.tan(math.radians(20.0)) * (1 / 2.0 - 1 / 3.0)
-    assert float(camera.coc_px(depth_of(3.0), 768)) == pytest.approx(expected, rel=1e-13)
-
-
-def test_field_of_view_as_a_tensor_equals_the_float() -> None:
+        expected = 0.012 * focal_px * (1 / focus_m - 1 / 3.0)
+        assert float(camera.coc_px(depth_of(3.0), 768)) == pytest.approx(expected, rel=1e-13)
     fov = torch.tensor([40.0, 75.0], dtype=torch.float64)
-    both = Camera.from_fov(fov, 0.012, 2.0).focal_px(768)
     each = [Camera.from_fov(float(f), 0.012, 2.0).focal_px(768) for f in fov]
-    assert_close(both, torch.tensor(each, dtype=torch.float64))
-
-
-def test_a_lens_focused_nearer_sees_a_narrower_field() -> None:
-    assert Camera(focus_m=0.3).focal_px(1000) > Camera(focus_m=3.0).focal_px(1000)
-    far = Camera(focal_length_mm=50.0, sensor_width_mm=36.0, focus_m=math.inf)
-    assert far.focal_px(1000) == pytest.approx(50.0 / 36.0 * 1000)
+    assert_close(Camera.from_fov(fov, 0.012, 2.0).focal_px(768), torch.tensor(each, dtype=torch.float64))
 
 
 def test_hyperfocal_distance_is_the_textbook_one() -> None:
@@ -203,28 +178,10 @@ def test_focus_at_takes_the_median_of_a_patch_and_ignores_bad_depth() -> None:
     depth[0, 0, 5, 5] = -1.0
     assert Camera().focus_at(depth, x=4.5, y=4.2, patch=3).focus_m == 3.0
     assert Camera().focus_at(depth, x=0.0, y=8.9, patch=3).focus_m == 7.0
-
-
-def test_focus_at_counts_columns_by_x_and_rows_by_y() -> None:
-    depth = torch.ones(1, 1, 4, 8)
-    depth[0, 0, 1, 6] = 5.0
+    depth[0, 0, 1, 6] = 5.0  # columns are counted by x, rows by y
     assert Camera().focus_at(depth, x=6.5, y=1.5, patch=1).focus_m == 5.0
-
-
-def test_focus_at_gives_each_item_its_own_focus() -> None:
-    depth = torch.tensor([1.0, math.inf]).reshape(2, 1, 1, 1).expand(2, 1, 3, 3)
-    assert torch.as_tensor(Camera().focus_at(depth, 1, 1).focus_m).tolist() == [1.0, math.inf]
-
-
-@pytest.mark.parametrize(("x", "y"), [(8.0, 0.0), (0.0, 4.0), (-0.1, 0.0), (0.0, -1.0), (math.nan, 0.0)])
-def test_focus_at_refuses_a_point_outside_the_frame(x: float, y: float) -> None:
-    with pytest.raises(ValueError, match="must lie in the frame of 8 x 4 pixels"):
-        Camera().focus_at(torch.ones(1, 1, 4, 8), x, y)
-
-
-def test_focus_at_refuses_a_patch_without_depth() -> None:
-    with pytest.raises(ValueError, match="no valid depth"):
-        Camera().focus_at(torch.zeros(1, 1, 4, 8), 2, 2)
+    items = torch.tensor([1.0, math.inf]).reshape(2, 1, 1, 1).expand(2, 1, 3, 3)
+    assert torch.as_tensor(Camera().focus_at(items, 1, 1).focus_m).tolist() == [1.0, math.inf]
 
 
 @pytest.mark.parametrize("name", ["focal_length_mm", "f_number", "focus_m", "sensor_width_mm"])
@@ -234,37 +191,39 @@ def test_a_bad_number_is_refused_by_name(name: str, value: Any) -> None:
         Camera().replace(**{name: value})
 
 
-@pytest.mark.parametrize("name", ["focal_length_mm", "f_number", "sensor_width_mm"])
-def test_only_the_focus_may_be_infinite(name: str) -> None:
-    with pytest.raises(ValueError, match=f"^{name} must be positive and finite"):
-        Camera().replace(**{name: math.inf})
+FRAME, TWO = torch.ones(1, 1, 4, 8), Camera(focus_m=torch.tensor([1.0, 2.0]))
+partial: Any = functools.partial
+REFUSED: list[tuple[Callable[[], Any], str]] = [
+    *((partial(Camera().replace, **{name: math.inf}), f"^{name} must be positive and finite")
+      for name in ("focal_length_mm", "f_number", "sensor_width_mm")),
+    (lambda: Camera(focus_m=0.05), r"focus_m must be longer than the focal length \(50 mm\), got 0.05 m"),
+    (lambda: Camera().replace(focus_m=torch.tensor([1.0, 0.04])), "focus_m must be longer"),
+    (lambda: Camera.from_fov(180.0, 0.01, 1.0), "^fov_x_deg must be"),
+    (lambda: Camera.from_fov(0.0, 0.01, 1.0), "^fov_x_deg must be"),
+    (lambda: Camera.from_fov(40.0, 0.0, 1.0), "^aperture_radius_m must be"),
+    *((partial(Camera().coc_px, depth, 100), "depth must be a floating-point tensor in metres")
+      for depth in (torch.ones(1, 1, 2, 2, dtype=torch.int32), 2.0, None)),
+    (lambda: TWO.coc_px(torch.ones(3, 1, 4, 4), 100), r"depth must be \[2, 1, H, W\].* got \[3, 1, 4, 4\]"),
+    *((partial(Camera, focus_range_m=value), "^focus_range_m must")
+      for value in ((2.0, 1.0), (0.0, 1.0), (1.0,), 3.0, (1.0, "far"), (math.nan, 2.0))),
+    *((partial(Camera, **{name: angle}), f"^{name} must be")
+      for name in ("tilt_deg", "swing_deg") for angle in (90.0, math.nan, "3", torch.tensor([95.0]), True)),
+    *((partial(Camera().focus_at, FRAME, *place), "must lie in the frame of 8 x 4 pixels")
+      for place in ((8.0, 0.0), (0.0, 4.0), (-0.1, 0.0), (0.0, -1.0), (math.nan, 0.0))),
+    (lambda: Camera().focus_at(0 * FRAME, 2, 2), "no valid depth"),
+    (lambda: Camera().focus_on(FRAME, FRAME[..., :3] > 0), "must have the depth's shape"),
+    (lambda: Camera().focus_on(FRAME, FRAME < 0), "no valid depth where"),
+    (lambda: Camera().focus_on(FRAME, -FRAME), ">= 0"),
+    (lambda: Camera().focus_in(FRAME, (50, 50, 60, 60)), "hold pixels of the frame"),
+    (lambda: Camera().focus_in(FRAME, (1, 2, 3)), r"must be \(left, top"),  # type: ignore[arg-type]
+    (lambda: Camera().focus_in(FRAME, (0, 0, 9, "x")), "must be"),  # type: ignore[arg-type]
+]  # fmt: skip
 
 
-def test_focus_within_the_focal_length_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"focus_m must be longer than the focal length \(50 mm\), got 0.05 m"):
-        Camera(focal_length_mm=50.0, focus_m=0.05)
-    with pytest.raises(ValueError, match="focus_m must be longer"):
-        Camera(focal_length_mm=50.0).replace(focus_m=torch.tensor([1.0, 0.04]))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [((180.0, 0.01, 1.0), "fov_x_deg"), ((0.0, 0.01, 1.0), "fov_x_deg"), ((40.0, 0.0, 1.0), "aperture_radius_m")],
-)
-def test_a_bad_field_of_view_or_aperture_is_refused_by_name(arguments: tuple[float, float, float], name: str) -> None:
-    with pytest.raises(ValueError, match=f"^{name} must be"):
-        Camera.from_fov(*arguments)
-
-
-@pytest.mark.parametrize("depth", [torch.ones(1, 1, 2, 2, dtype=torch.int32), 2.0, None])
-def test_depth_that_is_not_floating_point_is_refused(depth: Any) -> None:
-    with pytest.raises(ValueError, match="depth must be a floating-point tensor in metres"):
-        Camera().coc_px(depth, 100)
-
-
-def test_depth_whose_batch_does_not_fit_the_camera_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"depth must be \[2, 1, H, W\].* got \[3, 1, 4, 4\]"):
-        Camera(focus_m=torch.tensor([1.0, 2.0])).coc_px(torch.ones(3, 1, 4, 4), 100)
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_what_makes_no_camera_and_no_focus_is_refused(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()
 
 
 def test_repr_tells_the_camera() -> None:
@@ -307,12 +266,6 @@ def test_a_focus_distance_beside_a_range_is_refused() -> None:
         camera.replace(focus_m=3.0)
     assert camera.replace(focus_range_m=None, focus_m=3.0).focus_m == 3.0
     assert camera.replace(f_number=2.0).focus_range_m == (1.0, 2.0)
-
-
-@pytest.mark.parametrize("value", [(2.0, 1.0), (0.0, 1.0), (1.0,), 3.0, (1.0, "far"), (math.nan, 2.0)])
-def test_what_is_no_range_is_refused(value: Any) -> None:
-    with pytest.raises(ValueError, match="^focus_range_m must"):
-        Camera(focus_range_m=value)
 
 
 def plane_in_focus(camera: Camera, x: float, y: float, size: tuple[int, int]) -> float:
@@ -372,13 +325,6 @@ def test_coc_is_differentiable_in_the_range_and_the_angles() -> None:
     assert torch.autograd.gradcheck(coc, (depth, *values))
 
 
-@pytest.mark.parametrize("angle", [90.0, math.nan, "3", torch.tensor([95.0]), True])
-def test_a_bad_angle_is_refused_by_name(angle: Any) -> None:
-    for name in ("tilt_deg", "swing_deg"):
-        with pytest.raises(ValueError, match=f"^{name} must be"):
-            Camera(**{name: angle})
-
-
 def test_a_tilted_lens_is_focused_on_what_is_pointed_at() -> None:
     camera = Camera(focal_length_mm=80.0, tilt_deg=3.0, swing_deg=-1.0)
     depth = torch.linspace(1.0, 5.0, 60 * 80, dtype=torch.float64).reshape(1, 1, 60, 80)
@@ -394,13 +340,6 @@ def test_focus_on_takes_the_median_of_the_subject() -> None:
     assert Camera().focus_on(depth, weighted).focus_m == 3.0
     both = Camera().focus_on(torch.cat([depth, depth + 1]), mask > 0).focus_m
     assert torch.as_tensor(both).tolist() == [2.0, 3.0]
-    for bad, message in (
-        (mask[..., :3] > 0, "must have the depth's shape"),
-        (mask < 0, "no valid depth where"),
-        (-weighted, ">= 0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Camera().focus_on(depth, bad)
 
 
 def test_focus_in_a_box_prefers_its_middle() -> None:
@@ -408,10 +347,3 @@ def test_focus_in_a_box_prefers_its_middle() -> None:
     depth[..., 10:30, 10:30] = 2.0  # a third of the box's pixels
     assert Camera().focus_in(depth, (2, 2, 38, 38)).focus_m == 2.0
     assert Camera().focus_in(depth, (30, 30, 40, 40)).focus_m == 6.0
-    for box, message in (
-        ((50, 50, 60, 60), "hold pixels of the frame"),
-        ((1, 2, 3), "must be \\(left, top"),
-        ((0, 0, 9, "x"), "must be"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Camera().focus_in(depth, box)  # type: ignore[arg-type]

@@ -74,26 +74,22 @@ def test_batches_backgrounds_and_gradients_go_with_attention() -> None:
     assert cocs.grad is not None and bool(torch.isfinite(cocs.grad).all()) and float(cocs.grad.abs().max()) > 0
 
 
+SAYS = r"attention must be .*radius.*, got "
+BAD = [(1, 2), (1, 2, 0), (1, 2, -3), (1, 2, "x"), "centre", torch.ones(2, 3), (1, 2, True)]
+
+
 @pytest.mark.parametrize(
-    "value", [(1, 2), (1, 2, 0), (1, 2, -3), (1, 2, "x"), "centre", torch.ones(2, 3), (1, 2, True)]
+    ("options", "says"),
+    [
+        *(({"attention": value}, SAYS) for value in BAD),
+        ({"attention": torch.full((1, 1, 32, 40), 1.5)}, "from 0 to 1"),
+        ({"attention": (3, 3, 3), "plan": torchdof.render.plan.Plan((0.0, 1.0), 1 / 255)}, "leave plan out"),
+    ],
 )
-def test_what_is_no_place_is_refused(value: Any) -> None:
+def test_what_is_no_place_is_refused(options: dict[str, Any], says: str) -> None:
     image, coc = scene(32, 40)
-    with pytest.raises(ValueError, match=r"attention must be .*radius.*, got "):
-        torchdof.blur_by_coc(image, coc, attention=value)
-
-
-def test_a_map_beyond_0_to_1_is_refused() -> None:
-    image, coc = scene(32, 40)
-    with pytest.raises(ValueError, match="from 0 to 1"):
-        torchdof.blur_by_coc(image, coc, attention=torch.full((1, 1, 32, 40), 1.5))
-
-
-def test_attention_with_a_plan_is_refused() -> None:
-    image, coc = scene(32, 40)
-    plan = torchdof.render.plan.Plan.of_scene(coc, 1 / 255)
-    with pytest.raises(ValueError, match="leave plan out"):
-        torchdof.blur_by_coc(image, coc, plan=plan, attention=(3, 3, 3))
+    with pytest.raises(ValueError, match=says):
+        torchdof.blur_by_coc(image, coc, **options)
 
 
 def test_names_stand_for_tolerances() -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof import BlurTable, blur_by_coc
 from torchdof.io.transfer import encode
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.field import Field
@@ -233,20 +233,3 @@ def test_where_the_viewer_looks_and_elsewhere_the_frame_keeps_its_tolerance() ->
     image, coc = torch.rand(1, 3, 40, 60), torch.full((1, 1, 40, 60), 2.0)
     looked_at = blur_by_coc(image, coc, table=TABLE, attention=(4.0, 4.0, 2.0))
     assert torch.equal(looked_at, blur_by_coc(image, coc, table=TABLE))
-
-
-def test_a_graph_refuses_cats_eyes() -> None:
-    image = torch.rand(1, 3, 8, 12)
-    dof = DepthOfField(Camera(), TABLE, check=False, depth_edges="as given")
-    with pytest.raises(Exception, match="take a table without vignetting"):
-        torch.export.export(dof, (image, torch.ones(1, 1, 8, 12)), strict=False)
-    with pytest.raises(ValueError, match="vignetting must be a number from 0 to 1, got 1.5"):
-        BlurTable.polygon(5, vignetting=1.5)
-
-
-def test_vignetting_is_kept_in_the_table(tmp_path: Any) -> None:
-    table = BlurTable.polygon(5, vignetting=(0.3, 0.1))
-    table.save(tmp_path / "lens.json")
-    loaded = BlurTable.load(tmp_path / "lens.json")
-    assert loaded.aperture is not None and loaded.aperture.rims == (0.3, 0.1)
-    assert loaded.fingerprint() == table.fingerprint() != BlurTable.polygon(5).fingerprint()

@@ -45,19 +45,12 @@ def test_blur_axis_and_back_is_the_coc_of_what_is_blurred_and_zero_of_what_is_no
     assert back == pytest.approx(coc if there != 0 else 0.0, abs=1e-11)
 
 
-def test_a_pixel_on_a_node_belongs_to_that_layer_alone() -> None:
-    assert_close(weights(torch.tensor(NODES)), torch.eye(len(NODES)), rtol=0.0, atol=0.0)
-
-
-def test_a_pixel_between_nodes_is_shared_linearly() -> None:
+def test_a_pixel_is_shared_linearly_by_the_layers_next_to_it() -> None:
+    assert_close(weights(torch.tensor([*NODES, -9.0, 9.0])), torch.eye(len(NODES))[:, [0, 1, 2, 3, 4, 0, -1]])
     pixels = weights(torch.tensor([-0.75, 0.8, 1.625])).T
-    assert_close(pixels[0], torch.tensor([0.0, 0.5, 0.5, 0.0, 0.0]))
-    assert_close(pixels[1], torch.tensor([0.0, 0.0, 0.0, 0.8, 0.2]))
-    assert_close(pixels[2], torch.tensor([0.0, 0.0, 0.0, 0.25, 0.75]))
-
-
-def test_pixels_beyond_the_outermost_nodes_belong_to_these() -> None:
-    assert_close(weights(torch.tensor([-9.0, 9.0])), torch.eye(len(NODES))[:, [0, -1]])
+    assert_close(
+        pixels, torch.tensor([[0.0, 0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 0.0, 0.8, 0.2], [0.0, 0.0, 0.0, 0.25, 0.75]])
+    )
 
 
 @given(st.floats(-1e6, 1e6))

@@ -2,7 +2,6 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -13,12 +12,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.testing import assert_close
 
+from tests import loops
+from tests.tolerances import TOLERANCES
 from torchdof.optics import psf
 from torchdof.render import scatter as literal
 from torchdof.render.convolution import convolve
 from torchdof.render.scatter import fold
 
-Tolerances = dict[torch.dtype, Any]
 Spread = Callable[[Tensor, Tensor], Tensor]
 BOTH = pytest.mark.parametrize("scatter", [fold, convolve], ids=["fold", "convolve"])
 REAL = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -39,16 +39,14 @@ def test_scatter_equals_a_plain_loop_over_pixels(
     dtype: torch.dtype,
     shape: tuple[int, ...],
     radius: float,
-    loops: ModuleType,
-    tolerances: Tolerances,
 ) -> None:
     light = torch.rand(shape, dtype=dtype)
     kernels = bank(*(radius * (1 + 0.1 * c) for c in range(shape[1])), dtype=dtype)
     expected = loops.scatter(light, lambda *_: kernels)
-    assert_close(scatter(light, kernels), expected.to(dtype), **tolerances[dtype])
+    assert_close(scatter(light, kernels), expected.to(dtype), **TOLERANCES[dtype])
 
 
-def test_fold_with_a_kernel_of_its_own_for_every_pixel_equals_a_plain_loop(loops: ModuleType) -> None:
+def test_fold_with_a_kernel_of_its_own_for_every_pixel_equals_a_plain_loop() -> None:
     light = torch.rand(2, 3, 5, 6, dtype=torch.float64)
     kernels = psf.disc(torch.tensor([0.0, 1.3, 2.4]), size=5).unsqueeze(1)
     weights = torch.rand(2, 3, 5, 6, dtype=torch.float64)
@@ -97,46 +95,12 @@ def test_channels_are_spread_apart_from_each_other(scatter: Spread, channels: in
         assert_close(together[:, c : c + 1], scatter(light[:, c : c + 1], kernels[c : c + 1]))
 
 
-@BOTH
-@REAL
-def test_light_far_from_the_border_keeps_its_energy(scatter: Spread, dtype: torch.dtype) -> None:
-    light = torch.zeros(1, 1, 35, 35, dtype=dtype)
-    light[..., 15:20, 15:20] = 50 * torch.rand(5, 5, dtype=dtype)
-    spread_out = scatter(light, bank(9.7, dtype=dtype))
-    assert float(spread_out.sum()) == pytest.approx(float(light.sum()), rel=1e-6 if dtype == torch.float32 else 1e-13)
-
-
-@BOTH
-def test_light_over_the_border_is_lost_and_nothing_comes_in(scatter: Spread) -> None:
-    light = torch.ones(1, 1, 6, 6, dtype=torch.float64)
-    kernels = bank(2.0)
-    out = scatter(light, kernels)
-    half = kernels.shape[-1] // 2
-    assert float(out[0, 0, 0, 0]) == pytest.approx(float(kernels[0, half:, half:].sum()), rel=1e-12)
-    assert (out <= 1.0 + 1e-12).all() and (out[..., 0, :] < 1.0).all()
-
-
-@BOTH
-def test_scatter_is_linear(scatter: Spread) -> None:
-    first, second = torch.rand(2, 1, 2, 8, 9, dtype=torch.float64)
-    kernels = bank(2.5, 1.5)
-    mixed = scatter(3.0 * first - 0.5 * second, kernels)
-    assert_close(mixed, 3.0 * scatter(first, kernels) - 0.5 * scatter(second, kernels))
-
-
 def test_the_adjoint_of_fold_is_unfold() -> None:
     light, seen = torch.rand(2, 2, 3, 9, 7, dtype=torch.float64)
     kernels = torch.rand(3, 5, 5, dtype=torch.float64)  # no symmetry: a scatter is not yet a gather
     patches = functional.unfold(seen, (5, 5), padding=2).unflatten(1, (3, 25))
     gathered = (patches * kernels.flatten(1)[None, :, :, None]).sum(2).unflatten(-1, (9, 7))
     assert_close((fold(light, kernels) * seen).sum(), (light * gathered).sum(), rtol=1e-12, atol=0.0)
-
-
-@BOTH
-def test_spreading_symmetric_kernels_is_its_own_adjoint(scatter: Spread) -> None:
-    light, seen = torch.rand(2, 2, 3, 9, 7, dtype=torch.float64)
-    kernels = bank(1.2, 2.1, 3.0)
-    assert_close((scatter(light, kernels) * seen).sum(), (light * scatter(seen, kernels)).sum(), rtol=1e-12, atol=0.0)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 5])
@@ -193,6 +157,8 @@ def test_scatter_takes_any_shape_and_stride(
 FRAME = """
 import sys, torch
 from torchdof.bench import memory
+from tests import loops
+from tests.tolerances import TOLERANCES
 from torchdof.optics import psf
 from torchdof.render.scatter import fold
 light = torch.rand(1, 3, int(sys.argv[1]), 1920)
@@ -204,7 +170,7 @@ print(before, memory.peak_mb())
 
 
 @pytest.mark.hard
-@pytest.mark.parametrize("height", [216, pytest.param(1080, marks=pytest.mark.sweep)])  # all columns: 11 GB, 54 GB
+@pytest.mark.parametrize("height", [108, pytest.param(1080, marks=pytest.mark.sweep)])  # all columns: 5 GB, 54 GB
 def test_fold_of_a_frame_1920_wide_at_radius_16_stays_within_2_gb(height: int) -> None:
     done = subprocess.run([sys.executable, "-c", FRAME, str(height)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr

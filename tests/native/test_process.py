@@ -1,0 +1,138 @@
+"""The compiled engine in a process: threads, forks, interrupts, instructions; and its convolution."""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from tests.scenes import Scene, assert_same_picture, made
+from torchdof import native
+from torchdof.render.scatter import fold
+
+
+@pytest.fixture(autouse=True)
+def _by_the_compiled_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", "native")
+
+
+def scenes() -> list[Scene]:
+    """With and without occlusion, masked pixels, a background; all with highlights."""
+    scene = made("smooth", 140, 170, 14.0, lamps=1000.0)
+    masked = torch.where(torch.rand(scene.coc_px.shape) < 0.02, torch.nan, scene.coc_px)
+    background = {"background": scene.image.flip(3), "background_coc_px": scene.coc_px + 3.3}
+    return [
+        scene,
+        Scene(scene.image, scene.coc_px, {"occlusion": False}),
+        Scene(scene.image, masked, {"check": False}),
+        Scene(scene.image, scene.coc_px, background),
+    ]
+
+
+def test_any_number_of_threads_gives_the_same_bits_and_all_instructions_the_same_picture() -> None:
+    best, before = native.describe(), torch.get_num_threads()
+    for scene in scenes():
+        wanted = scene.blurred()
+        try:
+            for threads in (1, 2, 3):
+                torch.set_num_threads(threads)
+                assert torch.equal(scene.blurred(), wanted)
+            assert native.use_instructions("baseline") and native.describe() == "native (baseline)"
+            assert_same_picture(wanted, scene.blurred(), scene.image)
+        finally:
+            native.use_instructions("avx2")
+            torch.set_num_threads(before)
+    assert native.describe() == best
+
+
+def test_threads_of_python_may_render_at_once() -> None:
+    given = [*scenes(), *scenes()]
+    wanted = [scene.blurred() for scene in given]
+    with ThreadPoolExecutor(4) as pool:
+        for picture, alone in zip(pool.map(Scene.blurred, given), wanted, strict=True):
+            assert torch.equal(picture, alone)
+
+
+def answer_of(script: str) -> str:
+    """What a fresh process prints."""
+    run = subprocess.run([sys.executable, "-P", "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert run.returncode == 0, run.stderr
+    return run.stdout.strip()
+
+
+INTERRUPTED = """
+import os, signal, sys, threading, time, torch
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background is told to ignore it
+os.environ["TORCHDOF_ENGINE"] = "native"
+import torchdof
+from torchdof.render.plan import Plan
+torch.set_num_threads(1)
+image, coc_px = torch.rand(1, 3, 3000, 4000), torch.linspace(-40.0, 40.0, 4000).expand(1, 1, 3000, 4000).contiguous()
+image[..., ::50, ::50] *= 1000.0
+plan = Plan.of_scene(coc_px, 0.1 / 255)
+torchdof.blur_by_coc(image[..., :40], coc_px[..., :40], plan=plan, tolerance=0.1 / 255)  # its kernels are kept
+sent = []
+def interrupt():
+    sent.append(time.monotonic())
+    os.kill(os.getpid(), signal.SIGINT)
+threading.Timer(1.0, interrupt).start()
+try:
+    torchdof.blur_by_coc(image, coc_px, plan=plan, tolerance=0.1 / 255)
+    print("not interrupted")
+except KeyboardInterrupt:
+    late = time.monotonic() - sent[0]
+    small = torchdof.blur_by_coc(image[..., :40, :40], coc_px[..., :40, :40])  # the engine goes on to serve
+    print("in time" if late < 1.0 and bool(small.isfinite().all()) else f"after {late} s")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a process of Windows cannot send itself Ctrl-C")
+def test_ctrl_c_ends_a_long_rendering() -> None:
+    assert answer_of(INTERRUPTED) == "in time"
+
+
+INTERRUPTED_TWICE = """
+import ctypes, os, signal, threading, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from torchdof import native
+cancelled, ended = ctypes.c_int32(0), []
+def engine():
+    while not cancelled.value:
+        time.sleep(0.01)
+    time.sleep(0.5)
+    ended.append(True)
+for seconds in (0.2, 0.4):
+    threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT)).start()
+try:
+    native._interruptible(engine, cancelled, 1 << 30)
+except KeyboardInterrupt:
+    print("after the engine" if ended else "while the engine runs")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a process of Windows cannot send itself Ctrl-C")
+def test_ctrl_c_is_raised_once_the_engine_has_stopped() -> None:
+    """What the engine reads and writes is freed when its caller returns."""
+    assert answer_of(INTERRUPTED_TWICE) == "after the engine"
+
+
+@pytest.mark.parametrize("half", [0, 1, 2, 3, 7, 8, 10])
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (5, 6), (16, 16), (19, 37)])
+def test_convolution_scatters_an_asymmetric_kernel(height: int, width: int, half: int) -> None:
+    light, kernel = torch.rand(height, width), torch.rand(2 * half + 1, 2 * half + 1)
+    wanted = torch.zeros(height + 2 * half, width + 2 * half, dtype=torch.float64)
+    for row in range(height):
+        for column in range(width):
+            wanted[row : row + 2 * half + 1, column : column + 2 * half + 1] += light[row, column] * kernel
+    wanted = wanted[half : half + height, half : half + width].float()
+    scattered = native.convolve(light, kernel)
+    torch.testing.assert_close(scattered, wanted, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(scattered, fold(light[None, None], kernel[None])[0, 0], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("half", [20, 64])
+def test_convolution_scatters_the_widest_kernels(half: int) -> None:
+    light, kernel = torch.rand(70, 90), torch.rand(2 * half + 1, 2 * half + 1)
+    scattered = native.convolve(light, kernel)
+    torch.testing.assert_close(scattered, fold(light[None, None], kernel[None])[0, 0], rtol=1e-5, atol=1e-6)

@@ -1,0 +1,415 @@
+"""Scenes that tests share: hostile ones, each with its truth, and random ones, each by its seed."""
+
+import dataclasses
+import math
+import random
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc
+from torchdof.render.border import continued
+from torchdof.render.highlights import threshold
+from torchdof.render.layer_weights import from_blur_axis
+from torchdof.render.plan import Plan
+
+HEIGHT, WIDTH = 24, 32
+CAMERA = Camera(focal_length_mm=50.0, f_number=2.0, focus_m=2.0, sensor_width_mm=4.0)  # 4 px at infinity
+WAYS: dict[str, dict[str, Any]] = {
+    "over": {"method": "layered", "occlusion": True},
+    "sum": {"method": "layered", "occlusion": False},
+    "fold-over": {"method": "fold", "occlusion": True},
+    "fold-sum": {"method": "fold", "occlusion": False},
+}
+Light = Callable[[torch.dtype], Tensor]
+
+
+def texture(dtype: torch.dtype = torch.float32, channels: int = 3) -> Tensor:
+    """Random light from 0.05 to 1."""
+    noise = torch.rand(1, channels, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    return (0.05 + 0.95 * noise).to(dtype)
+
+
+def whole(value: float, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
+    """A map of one value."""
+    return torch.full((1, 1, height, width), value)
+
+
+def slope(first: float, last: float, height: int = HEIGHT, width: int = WIDTH) -> Tensor:
+    """A map that changes evenly from the left to the right."""
+    return torch.linspace(first, last, width).expand(1, 1, height, width).clone()
+
+
+def halves(left: float, right: float) -> Tensor:
+    """A map of two planes."""
+    values = whole(left)
+    values[..., WIDTH // 2 :] = right
+    return values
+
+
+def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tensor:
+    """Closed form of a plane: the image, continued over its border, convolved with a kernel, in float64."""
+    image, radius = image.double(), coc_px.flatten()[:1].double()
+    if table is None:
+        half = max(image.shape[-2:]) - 1  # from one pixel of the frame to another
+        kernel = BlurTable.disc().kernels(radius, image.shape[-1], window=2 * half + 1)[0]
+    else:
+        kernel = table.kernels(radius, image.shape[-1])[0]
+    half = kernel.shape[-1] // 2
+    wide = continued(image, None, threshold(image), (half,) * 4, half)
+    return functional.conv2d(wide, kernel.expand(image.shape[1], -1, -1)[:, None], groups=image.shape[1])
+
+
+def mean(image: Tensor, _: Tensor) -> Tensor:
+    """Closed form of an endless blur: means over as much as lies within the frame's longer side."""
+    half = max(image.shape[-2:]) - 1
+    wide = continued(image, None, threshold(image), (half,) * 4, half)
+    return functional.avg_pool2d(wide, 2 * half + 1, stride=1)
+
+
+def itself(image: Tensor, _: Tensor) -> Tensor:
+    """The picture of what is in focus, or of even light."""
+    return image
+
+
+def darkest(image: Tensor, _: Tensor) -> Tensor:
+    """The picture of the light around a highlight."""
+    return torch.full_like(image, float(image.min()))
+
+
+def _brightest(truth: Tensor) -> Tensor:
+    return truth.abs().max()
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A hostile scene of 32 x 24 pixels, its truth, and how far from it a pixel may be, relative to that pixel.
+
+    Args:
+        name: What is hostile.
+        maps: Circles of confusion in pixels, or depths in metres where there are cameras: each is a picture.
+        truth: A closed form of image and circle of confusion; None is the same rendering in float64.
+        light: The image of a type.
+        cameras: For each of the maps, or one for all.
+        float32, float16: Limits of the error.
+        per: What the error is relative to, from the truth.
+        where: Pixels that are looked at.
+        options: Of the rendering.
+    """
+
+    name: str
+    maps: Sequence[Tensor]
+    truth: Callable[[Tensor, Tensor], Tensor] | None = None
+    light: Light = texture
+    cameras: Sequence[Camera] = ()
+    float32: float = 1e-5
+    float16: float = 2**-11 + 1e-5
+    per: Callable[[Tensor], Tensor] = Tensor.abs
+    where: Tensor | None = None
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def pairs(self, dtype: torch.dtype = torch.float32) -> Iterator[tuple[Tensor, Tensor, Camera | None]]:
+        """Image, map and camera of each picture; without a camera the map is a circle of confusion."""
+        cameras: list[Camera | None] = list(self.cameras) or [None]
+        maps = list(self.maps)
+        if len(cameras) == 1:
+            cameras *= len(maps)
+        elif len(maps) == 1:
+            maps *= len(cameras)
+        for values, camera in zip(maps, cameras, strict=True):
+            yield self.light(dtype), values, camera
+
+    def error(self, dtype: torch.dtype, **way: Any) -> float:
+        """The largest difference from the truth in any of the pictures; infinite where one is not finite."""
+        errors = []
+        for image, values, camera in self.pairs(dtype):
+            out = rendered(image, values, camera, **{**self.options, **way}).double()
+            if self.truth is None:
+                truth = rendered(image.double(), values.double(), camera, **{**self.options, **way})
+            else:
+                coc_px = values.double() if camera is None else camera.coc_px(values.double(), WIDTH)
+                truth = self.truth(image.double(), coc_px)
+            apart = torch.where(out == truth, 0.0, (out - truth).abs() / self.per(truth).clamp_min(1e-300))
+            errors.append(torch.nan_to_num(apart if self.where is None else apart[..., self.where], nan=math.inf).max())
+        return float(max(errors))
+
+    def limit(self, dtype: torch.dtype) -> float:
+        """How large the error may be."""
+        return self.float32 if dtype == torch.float32 else self.float16
+
+
+def rendered(image: Tensor, values: Tensor, camera: Camera | None, **options: Any) -> Tensor:
+    """The picture by circle of confusion, or by depth where there is a camera."""
+    if camera is None:
+        return blur_by_coc(image, values, **options)
+    return DepthOfField(camera, **options)(image, values)
+
+
+def even(value: float, channels: int = 3) -> Light:
+    """One light everywhere, or the brightest that the type has."""
+    return lambda dtype: torch.full((1, channels, HEIGHT, WIDTH), min(value, torch.finfo(dtype).max), dtype=dtype)
+
+
+def highlight(value: float, around: float = 1e-4, dtype: torch.dtype | None = None, side: int = 1) -> Light:
+    """A square of light at the middle."""
+
+    def light(given: torch.dtype) -> Tensor:
+        image = torch.full((1, 1, HEIGHT, WIDTH), around, dtype=dtype or given)
+        rows, columns = (slice(n // 2 - side // 2, n // 2 + side // 2 + 1) for n in (HEIGHT, WIDTH))
+        image[..., rows, columns] = min(value, torch.finfo(image.dtype).max)
+        return image
+
+    return light
+
+
+def beyond(radius: float) -> Tensor:
+    """Pixels farther from the middle."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    return torch.hypot((y - HEIGHT // 2).double(), (x - WIDTH // 2).double()) > radius
+
+
+def noise(seed: int) -> Tensor:
+    """A map of normal numbers."""
+    return torch.randn(1, 1, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(seed))
+
+
+def _near_a_node(offset: int) -> Tensor:
+    """Two planes; the nearer one sits on a layer's node, or some units in the last place off it."""
+    node = torch.tensor([c for c in Plan.of_scene(torch.tensor([[[[0.0, 9.0]]]]), 1 / 255).coc_px if 2 < c < 6][0])
+    for _ in range(abs(offset)):
+        node = torch.nextafter(node, torch.tensor(math.copysign(math.inf, offset)))
+    coc = halves(float(node), 9.0)
+    coc[..., 0, 0] = 0.0
+    return coc
+
+
+def _with(values: Tensor, *place: Any, value: float) -> Tensor:
+    values = values.clone()
+    values[(..., *place)] = value
+    return values
+
+
+def _hdr(dtype: torch.dtype) -> Tensor:
+    return (10 ** (-3 + 7.75 * torch.rand(1, 3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(3)))).to(dtype)
+
+
+def _bright(dtype: torch.dtype) -> Tensor:
+    return texture().mul(min(1e30, torch.finfo(dtype).max)).to(dtype)
+
+
+_CHECKERBOARD = torch.where((torch.arange(HEIGHT)[:, None] + torch.arange(WIDTH)) % 2 == 0, 1.2, 30.0)[None, None]
+_FAR = _with(_with(whole(1e-6), slice(8, 20), value=1e12), slice(20, None), value=math.inf)
+_DEPTH, _DEEP, _COC = slope(1.2, 6.0), slope(1.0, 9.0), slope(-5.0, 5.0)
+_MANY = Plan(tuple(torch.linspace(-1, 1, 2001).double().tolist()), 0.0)
+_FOCUS_ENDS = from_blur_axis(1e-12)
+_EXACT: dict[str, Any] = {"float32": 0.0, "float16": 0.0}
+_DARK: dict[str, Any] = {"truth": darkest, "float32": 1e-6, "float16": 0.0}
+_EVEN: dict[str, Any] = {"truth": itself, "float32": 1e-6, "float16": 0.0}
+
+CASES = [
+    Case("infinity, 1e12 m and 3.1 m everywhere", [whole(v) for v in (math.inf, 1e12, 3.1)], disc, cameras=[CAMERA]),
+    Case("1e-6 m everywhere: a blur of 4e6 px", [whole(1e-6)], mean, cameras=[CAMERA]),
+    Case("1e-6 m, 1e12 m and infinity side by side", [_FAR], cameras=[CAMERA]),
+    Case("all in focus", [whole(2.0)], itself, cameras=[CAMERA], **_EXACT),
+    Case("two values, half of the frame each", [halves(1.2, 9.0)], cameras=[CAMERA]),
+    Case("a step at every pixel", [_CHECKERBOARD], cameras=[CAMERA]),
+    Case("noise over four decades", [2.0 * 10 ** noise(1).clamp(-1, 3)], cameras=[CAMERA]),
+    Case("focus at one pixel's depth", [_DEPTH], cameras=[CAMERA.replace(focus_m=float(_DEPTH[0, 0, 0, 11]))]),
+    Case("focus at infinity", [_with(slope(3.0, 50.0), slice(-4, None), value=math.inf)],
+         cameras=[CAMERA.replace(focus_m=math.inf)]),
+    Case("focus in front of everything and behind", [_DEEP], cameras=[CAMERA.replace(focus_m=s) for s in (0.6, 40.0)]),
+    Case("f-number 0.5, 1, 2, 4, 1e3", [_DEPTH], cameras=[CAMERA.replace(f_number=n) for n in (0.5, 1, 2, 4, 1e3)]),
+    Case("f-number 1e6: a pinhole", [slope(0.1, 6.0)], itself, cameras=[CAMERA.replace(f_number=1e6)], **_EXACT),
+    Case("a plane exactly on a layer's node", [_near_a_node(0)]),
+    Case("one unit in the last place to either side of a node", [_near_a_node(-1), _near_a_node(1)],
+         lambda image, _: blur_by_coc(image, _near_a_node(0).double())),
+    Case("in focus by a hair", [whole(c * _FOCUS_ENDS) for c in (0.9999, -0.9999)], itself, **_EXACT),
+    Case("out of focus by a hair", [whole(c * _FOCUS_ENDS) for c in (1.0001, -1.0001)], disc),
+    Case("coc 0, 1e-7 and 0.009 px", [whole(c) for c in (0.0, 1e-7, -1e-7, 0.009, -0.009)], itself, **_EXACT),
+    Case("coc 0.6 to 23 px", [whole(c) for c in (0.625, 1.0, -1.5, 3.375, -8.75, 12.75, 23.0)], disc),
+    Case("coc larger than the frame", [whole(c) for c in (45.0, -45.0, 1e5, -1e5)], mean),
+    Case("coc from -1e5 to 1e5 px in one frame", [slope(-1e5, 1e5)]),
+    Case("two far groups of depth and nothing between", [halves(-18.0, 18.0)]),
+    Case("6.5e4 in 1e-4, outside its disc of 5 px", [whole(5.0)], light=highlight(6.5e4), where=beyond(6.0), **_DARK),
+    Case("1e6 in 1e-4, outside its disc of 5 px (image in float32)", [whole(5.0)], darkest, float32=1e-6, float16=1e-6,
+         light=highlight(1e6, dtype=torch.float32), where=beyond(6.0)),
+    Case("6.5e4 in 1e-4 on a slope, beyond its largest disc", [slope(-3, 5)], light=highlight(6.5e4),
+         where=beyond(8.0), **_DARK),
+    Case("6.5e4 in 1e-4, inside its disc of 5 px", [whole(5.0)], disc, highlight(6.5e4), where=~beyond(4.0)),
+    Case("5000 in 0.1", [whole(4.0)], disc, highlight(5000.0, 0.1)),
+    Case("a single pixel lit", [whole(4.5)], disc, highlight(1.0, 0.0), per=lambda truth: truth.clamp_min(1e-3)),
+    Case("all zero", [_COC], itself, even(0.0), **_EXACT),
+    Case("1e-30 everywhere (float16: 1e-7)", [_COC], itself, lambda d: even(1e-30 if d == torch.float32 else 1e-7)(d),
+         float32=1e-6, float16=1e-2),
+    # half a unit is lost at each of the hundred taps of a kernel
+    Case("1e-40 everywhere, in units of the smallest float32", [_COC], itself, even(1e-40, 1),
+         float32=50.0, float16=0.0, per=lambda truth: torch.full_like(truth, 2.0**-149)),
+    Case("negative light, a plane, a slope, a step", [whole(3.25), _COC, halves(-5.0, 4.0)],
+         light=lambda d: texture(d) - 0.5, per=_brightest),
+    Case("negative light, a plane, in closed form", [whole(3.25)], disc, lambda d: texture(d) - 0.5, float32=1e-6,
+         per=_brightest),
+    Case("65504 everywhere: the largest of float16", [_COC], light=even(65504.0), **_EVEN),
+    Case("3e38 everywhere (float16: 65504)", [whole(4.0)], light=even(3e38, 1), **_EVEN),
+    Case("1e30 at random beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], light=_bright),
+    Case("1e30 in 0.1, 3 x 3 pixels, beside a depth step (float16: 65504)", [halves(-5.0, 4.0)], per=_brightest,
+         light=highlight(1e30, 0.1, side=3), float32=1e-6),
+    Case("even light, slope from -20 to 20 px", [slope(-20, 20)], light=even(0.75), **_EVEN),
+    Case("even light, a depth of its own for every pixel", [r * noise(2) for r in (1.0, 8.0, 30.0)], itself, even(0.75),
+         float32=1.2e-6, float16=0.0),
+    Case("even light, one near pixel before infinity", [_with(whole(0.0), 12, 16, value=-30.0)], light=even(0.75),
+         **_EVEN),
+    Case("2001 layers accumulated", [torch.linspace(-1.5, 1.5, HEIGHT * WIDTH).reshape(1, 1, HEIGHT, WIDTH)],
+         light=lambda d: texture(d, 1), options={"plan": _MANY}),
+    Case("light from 1e-3 to 6e4 at random", [_COC], light=_hdr),
+    Case("a slope by the sum of the paper", [slope(-4, 4)], options=WAYS["sum"]),
+    Case("a slope by the literal scatter", [slope(-4, 4)], options=WAYS["fold-over"]),
+]  # fmt: skip
+
+
+# Random scenes
+
+TABLES = [BlurTable.disc(), BlurTable.gaussian(), BlurTable.load("sato_j15")]
+KINDS = ("planes", "planes", "discs", "smooth", "slope", "noise", "checkerboard", "step")
+SHARP_PX = 0.5
+
+
+@dataclasses.dataclass
+class Scene:
+    """Arguments of :func:`torchdof.blur_by_coc` in float64, by a seed that reproduces them."""
+
+    image: Tensor
+    coc_px: Tensor
+    options: dict[str, Any]
+
+    def blurred(self, dtype: torch.dtype = torch.float32, step_px: float | Tensor = 0.0, **options: Any) -> Tensor:
+        """The picture in that type, with a step added to the circle of confusion."""
+        given = {**self.options, **options}
+        given = {k: v.to(dtype) if isinstance(v, Tensor) else v for k, v in given.items()}
+        return blur_by_coc(self.image.to(dtype), (self.coc_px + step_px).to(dtype), **given)
+
+    def turned(self, turn: Callable[[Tensor], Tensor]) -> "Scene":
+        """The scene with the frame held otherwise."""
+        options = {k: turn(v).contiguous() if isinstance(v, Tensor) else v for k, v in self.options.items()}
+        return Scene(turn(self.image).contiguous(), turn(self.coc_px).contiguous(), options)
+
+    def exposed(self, times: float) -> "Scene":
+        """The scene in brighter light."""
+        options = dict(self.options)
+        if "background" in options:
+            options["background"] = options["background"] * times
+        return Scene(self.image * times, self.coc_px, options)
+
+
+def _beside_the_edge_of_focus(coc_px: Tensor) -> Tensor:
+    """What is in focus passes through, and what is blurred by a hair more does not: no scene is on that edge."""
+    return torch.where((coc_px.abs() - SHARP_PX).abs() < 0.002, coc_px + 0.01, coc_px).contiguous()
+
+
+def random_scene(
+    seed: int,
+    ways: Sequence[str] = ("filled", "background", "accumulated"),
+    lamps: bool = True,
+    multiple: int = 1,
+    side: int = 64,
+    kinds: Sequence[str] = KINDS,
+) -> Scene:
+    """Images of noise, blocks, gradients and edges; coc of planes, discs, slopes, checkerboards, steps and noise.
+
+    Args:
+        seed: Of the random numbers.
+        ways: With what is hidden filled in (``"filled"``), before a known ``"background"``, or ``"accumulated"``
+            without occlusion: one of these.
+        lamps: Whether there may be highlights.
+        multiple: Of which the sides of the frame are.
+        side: The longest.
+        kinds: Of maps.
+    """
+    draw, generator = random.Random(seed), torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    def blocks(values: Tensor, side: int) -> Tensor:
+        return values.repeat_interleave(side, -1).repeat_interleave(side, -2)[..., :height, :width]
+
+    height, width = (multiple * draw.randint(1, side // multiple) for _ in range(2))
+    colours, radius = draw.choice([1, 3]), draw.choice([0.7, 1.5, 3.0, 6.0, 12.0, 20.0])
+    y, x = torch.arange(height, dtype=torch.float64)[:, None], torch.arange(width, dtype=torch.float64)
+
+    kind = draw.choice(["noise", "gradients", "blocks", "edges"])
+    image = uniform(1, colours, height, width)
+    if kind == "gradients":
+        image = functional.interpolate(uniform(1, colours, 3, 4), size=(height, width), mode="bicubic").clamp(0, 1)
+    elif kind == "blocks":
+        image = blocks(uniform(1, colours, height // 5 + 1, width // 5 + 1), 5)
+    elif kind == "edges":
+        image = 0.05 + 0.9 * (image < 0.5).double()
+
+    kind = draw.choice(kinds)
+    if kind == "planes":
+        planes = (2.0 * uniform(draw.randint(2, 4)) - 1.0) * radius
+        which = torch.randint(len(planes), (1, 1, height // 8 + 1, width // 8 + 1), generator=generator)
+        coc_px = blocks(planes[which], 8)
+    elif kind == "quarters":  # on the very edge of many decisions
+        steps = torch.randint(-4, 5, (1, 1, height // 8 + 1, width // 8 + 1), generator=generator)
+        coc_px = blocks((steps * radius).round().double() / 4, 8)
+    elif kind == "discs":
+        coc_px = torch.full((1, 1, height, width), radius, dtype=torch.float64)
+        for _ in range(4):
+            row, column, size = draw.random() * height, draw.random() * width, draw.uniform(1, height / 3 + 2)
+            is_disc = (y - row) ** 2 + (x - column) ** 2 < size**2
+            coc_px = torch.where(is_disc, coc_px.clamp(max=draw.uniform(-radius, radius)), coc_px)
+            image = torch.where(is_disc, 0.5 * image + 0.5 * draw.random(), image)
+    elif kind == "smooth":
+        coarse = (2.0 * uniform(1, 1, 3, 4) - 1.0) * radius
+        coc_px = functional.interpolate(coarse, size=(height, width), mode="bicubic")
+    elif kind == "slope":
+        coc_px = (radius * (2.0 * y / height - 1.0) + 0.0 * x)[None, None]
+    elif kind == "noise":
+        coc_px = (2.0 * uniform(1, 1, height, width) - 1.0) * radius
+    elif kind == "checkerboard":
+        size = draw.choice([1, 3, 8])
+        ends = draw.choice([(-1.1, 0.5), (0.5, 1.5), (-2.0, 0.0), (0.5, 3.0), (-3.0, 3.0)])
+        coc_px = torch.where((y // size + x // size) % 2 > 0, *ends).double()[None, None]
+    else:
+        step = draw.choice([0.5, 0.999, 1.0, 1.5, 2.0, 2.001])
+        coc_px = (draw.uniform(-radius, radius) + step * (x > width / 2) + 0.0 * y)[None, None]
+
+    if draw.random() < 0.3 and lamps:
+        image = torch.where(uniform(1, 1, height, width) < 0.01, image * draw.choice([20.0, 200.0]), image)
+    options: dict[str, Any] = {"table": draw.choice(TABLES)}
+    way = draw.choice(ways)
+    coc_px = _beside_the_edge_of_focus(coc_px)
+    if way == "accumulated":
+        options["occlusion"] = False
+    elif way == "background":
+        options["background"] = uniform(1, colours, height, width)
+        options["background_coc_px"] = _beside_the_edge_of_focus(coc_px + radius * draw.random())
+    return Scene(image, coc_px, options)
+
+
+def made(kind: str, height: int, width: int, radius: float, **options: Any) -> Scene:
+    """Random light, brighter on a grid of pixels if ``lamps`` are given, and a smooth map or one of three planes."""
+    torch.manual_seed(3)
+    items, lamps = options.pop("items", 1), options.pop("lamps", 1.0)
+    image = torch.rand(items, 3, height, width)
+    image[..., height // 5 :: 9, width // 6 :: 13] *= lamps
+    if kind == "smooth":
+        coarse = (torch.rand(items, 1, 3, 4) * 2 - 1) * radius
+        return Scene(image, functional.interpolate(coarse, size=(height, width), mode="bicubic"), options)
+    regions = torch.randint(0, 3, (items, 1, height // 16 + 1, width // 16 + 1))
+    planes = ((torch.rand(3) * 2 - 1) * radius)[regions]
+    return Scene(image, functional.interpolate(planes, size=(height, width)), options)
+
+
+def assert_same_picture(plain: Tensor, compiled: Tensor, image: Tensor) -> None:
+    """Within 1e-5 of the light nearby."""
+    assert plain.dtype == compiled.dtype and plain.shape == compiled.shape
+    assert torch.equal(torch.isfinite(plain), torch.isfinite(compiled))
+    plain, compiled, image = (torch.nan_to_num(t.float(), 0.0, 0.0, 0.0) for t in (plain, compiled, image))
+    light = functional.pad(torch.maximum(plain.abs(), image), (8,) * 4, mode="replicate")
+    nearby = functional.max_pool2d(light, 17, 1).amax(1, keepdim=True)
+    assert float(((plain - compiled).abs() / (nearby + 1e-6)).max()) <= 1e-5

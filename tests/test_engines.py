@@ -1,0 +1,561 @@
+"""Two engines and an exported file make one picture: what each makes of hostile scenes and of random ones.
+
+Most pictures are the plain engine's, in float64, or a closed form's. `pytest -s tests/test_engines.py -k error` prints
+the errors that are measured.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+import torch.nn.functional as functional
+from torch import Tensor
+from torch.testing import assert_close
+
+from tests.scenes import (
+    CAMERA,
+    CASES,
+    HEIGHT,
+    TABLES,
+    WAYS,
+    WIDTH,
+    Case,
+    Scene,
+    assert_same_picture,
+    halves,
+    made,
+    random_scene,
+    slope,
+    texture,
+    whole,
+)
+from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field, native
+from torchdof.depth import repair_edges
+from torchdof.export.graph import Portable
+from torchdof.export.verification import session
+from torchdof.optics.aperture import Aperture
+from torchdof.optics.field import Field
+from torchdof.reference.lens_views import lens_views
+from torchdof.reference.metrics import ssim
+from torchdof.render.plan import Plan
+
+EVERY_ENGINE = pytest.mark.parametrize("engine", ["torch", "native"], indirect=True)
+EVERY_WAY = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+BY_COLOUR = BlurTable("gaussian", [1.0], {"sigma": torch.tensor([[0.4], [0.5], [0.6]])}, name="by colour")
+
+
+def _lens() -> BlurTable:
+    """A lens whose spots are random, and others across the field."""
+    coc, radius, dice = torch.tensor([-0.9, -0.3, 0.2, 0.7]), torch.tensor([0.0, 1.5, 3.5]), torch.Generator()
+    light, box = torch.rand(3, 4, 3, 16, 8, generator=dice), torch.rand(4, 3, 3, generator=dice) + 0.5
+    spots = Field(coc, radius, box * coc.abs()[:, None, None], light)
+    return BlurTable("disc", coc, {"radius": coc.abs().expand(3, -1)}, unit="mm", sensor_width_mm=6.0, field=spots)
+
+
+LENSES = {
+    **{str(table): table for table in (*TABLES, BY_COLOUR)},
+    "triangle": BlurTable.polygon(3, 20.0, squeeze=1.6),
+    "blades": BlurTable.polygon(5, 7.0, 0.4, rim=2.0),
+    "image": BlurTable.from_aperture(torch.eye(9).cumsum(0)[:, :6], squeeze=1.2),
+    "cat's eyes": BlurTable.disc().with_aperture(Aperture(vignetting=0.4)),
+    "squeezed cat's eyes": BlurTable.polygon(5, 10.0, squeeze=1.5, vignetting=(0.6, 0.2)),
+    "cat's eyes by colour": BY_COLOUR.with_aperture(Aperture(vignetting=0.5)),
+    "spots across the field": _lens(),
+}
+
+
+@pytest.fixture
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The engine that renders."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", request.param)
+    return str(request.param)
+
+
+# Hostile scenes: each within its limit of the truth
+
+
+@EVERY_ENGINE
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16], ids=["float32", "float16"])
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_the_error_of_a_hostile_scene_is_within_its_limit(case: Case, dtype: torch.dtype, engine: str) -> None:
+    error = case.error(dtype)
+    print(f"{error:.1e} of {case.limit(dtype):.1e}")
+    assert error <= case.limit(dtype)
+
+
+class File:
+    """An exported file beside the module that has its layers."""
+
+    def __init__(self, exported: Any) -> None:
+        self.camera, self.session, self.portable = exported.dof.camera, session(exported.path), Portable(exported.dof)
+
+    def render(self, image: Tensor, values: Tensor, camera: Camera | None) -> tuple[Tensor, Tensor]:
+        """The picture of the file and that of the module in float64; of a map of the coc by the depth that has it."""
+        if camera is None:
+            reach = 1.05 * float(values.max().clamp_min(1.0))  # of infinity
+            wide = self.camera.replace(f_number=1.0).coc_px(torch.full((1, 1, 1, 1), torch.inf), image.shape[-1])
+            values = float(self.camera.focus_m) / (1.0 - values.double() / reach)
+            camera = self.camera.replace(f_number=float(wide) / reach)
+        image = image.float().expand(-1, 3, -1, -1)
+        lens = [torch.full(image.shape[:1], float(number)) for number in (camera.focus_m, camera.f_number)]
+        tensors = [image.contiguous(), values.float().contiguous(), *lens]
+        names = ("image", "depth", "focus_m", "f_number")
+        (got,) = self.session.run(None, {n: t.numpy() for n, t in zip(names, tensors, strict=True)})
+        with torch.no_grad():
+            return torch.from_numpy(got), self.portable(*(tensor.double() for tensor in tensors))
+
+
+@pytest.fixture(scope="module")
+def file(layered: Any) -> File:
+    return File(layered)
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if not case.options], ids=lambda case: case.name)
+def test_the_error_of_a_file_is_within_1e_5(file: File, case: Case) -> None:
+    for image, values, camera in case.pairs():
+        got, truth = file.render(image, values, camera)
+        # of each pixel; next to light that cancels (negative values) of the brightest
+        scale = truth.abs() if float(image.min()) >= 0 else truth.abs().max()
+        apart = (got.double() - truth).abs() / scale.clamp_min(torch.finfo(torch.float32).tiny)
+        assert float(torch.where(got == truth, 0.0, apart).max()) <= 1e-5
+
+
+# Where light or depth is none
+
+
+def _hole(values: Tensor, bad: float) -> Tensor:
+    values = values.clone()
+    values[..., 9:11, 8:10] = bad
+    return values
+
+
+HOLE = _hole(torch.zeros(1, 1, HEIGHT, WIDTH), 1.0)[0, 0] > 0
+
+
+def assert_untouched_by_a_hole(render: Callable[[Tensor, Tensor], Tensor], bad: float) -> None:
+    """A bad depth passes sharp; whatever is in the hole, nobody sees it."""
+    image, other, depth = texture(), _hole(texture(), 1e6), _hole(slope(1.2, 6.0), bad)
+    out = render(image, depth)
+    assert torch.equal(out[..., HOLE], image[..., HOLE]) and torch.isfinite(out).all()
+    assert torch.equal(render(other, depth)[..., ~HOLE], out[..., ~HOLE])
+    assert not torch.allclose(out[..., ~HOLE], image[..., ~HOLE])
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
+def test_a_bad_depth_passes_sharp_and_touches_nothing_else(engine: str, way: dict[str, Any], bad: float) -> None:
+    assert_untouched_by_a_hole(DepthOfField(CAMERA, check=False, **way), bad)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -math.inf])
+def test_a_bad_depth_passes_a_file_sharp_and_touches_nothing_else(file: File, bad: float) -> None:
+    assert_untouched_by_a_hole(lambda image, depth: file.render(image, depth, CAMERA)[0], bad)
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+def test_light_around_bad_depth_keeps_its_sum(engine: str, way: dict[str, Any]) -> None:
+    dof = DepthOfField(CAMERA, check=False, **way)
+    image, flat, depth = texture(), torch.ones(1, 1, HEIGHT, WIDTH), slope(1.2, 6.0)
+    assert torch.equal(dof(image, whole(math.nan)), image)
+    depth[torch.rand(depth.shape) < 0.4] = math.nan
+    assert_close(dof(flat, depth), flat, rtol=1e-6, atol=0.0)
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
+@pytest.mark.parametrize("coc_px", [0.0, -3.0, 40.0])
+def test_bad_light_stays_within_its_disc(engine: str, way: dict[str, Any], bad: float, coc_px: float) -> None:
+    image, coc = texture(), slope(-3.0, 5.0)
+    image[0, 1, 12, 16], coc[0, 0, 12, 16] = bad, coc_px
+    touched = ~torch.isfinite(blur_by_coc(image, coc, check=False, **way)).all(1)[0]
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    assert int(touched.sum()) > 0  # it is not hidden either
+    assert not touched[torch.hypot(y - 12.0, x - 16.0) > max(abs(coc_px), 1.0) + 1].any()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf], ids=str)
+def test_bad_light_stays_where_it_is_in_a_file(file: File, bad: float) -> None:
+    image = texture()
+    image[0, 1, 12, 20] = bad
+    out, truth = file.render(image, slope(1.2, 6.0), CAMERA)
+    here = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    here[12, 20] = True
+    assert torch.equal(torch.isfinite(out).all(1)[0], ~here)
+    assert_close(out.double()[..., ~here], truth[..., ~here], rtol=1e-5, atol=0.0)
+
+
+# Light of any size
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+@pytest.mark.parametrize("light", [1e10, 2e19, 1e30, 3e38])
+@pytest.mark.parametrize("post", [False, True], ids=["step", "post one pixel wide"])
+def test_light_beside_a_step_is_as_in_float64(engine: str, way: dict[str, Any], light: float, post: bool) -> None:
+    coc, image = halves(-6.0, 5.0), texture()
+    if post:  # none of its pixels is surely unmixed
+        coc = whole(5.0)
+        coc[..., 14] = -4.0
+    image[..., 12, 8:24] = 1.0
+    image = (image * light).clamp(max=light)
+    out, truth = blur_by_coc(image, coc, **way), blur_by_coc(image.double(), coc, **way)
+    assert_close(out.double() / light, truth / light, rtol=1e-4, atol=1e-6)
+    # a part of a split pixel may be darker than its surface, not darker than nothing
+    image = image / light
+    assert_close(blur_by_coc(-image, coc, **way), -blur_by_coc(image, coc, **way), rtol=0.0, atol=5e-4)
+    mixed = torch.where(coc > 0, -1.0, -3.0).expand(1, 3, -1, -1).clone()
+    mixed[..., 16] = -2.0
+    out = blur_by_coc(mixed, coc, **way)
+    assert -3.0001 <= float(out.min()) and float(out.max()) <= -0.9999
+
+
+@EVERY_ENGINE
+@pytest.mark.parametrize("light", [2e19, 1e30, -1e30])
+def test_bright_layers_and_backgrounds_do_not_overflow(engine: str, light: float) -> None:
+    dof, depth = DepthOfField(CAMERA), halves(1.2, 2.5)
+    image, far = texture(), whole(9.0)
+    out, wide = (dof(i, depth, background=i * light, background_depth=far) for i in (image, image.double()))
+    assert_close(out.double() / light, wide / light, rtol=1e-4, atol=1e-6)
+    rgba = torch.rand(1, 2, 4, HEIGHT, WIDTH)
+    rgba[:, :, -1] = torch.tensor([1e-6, 1.0])[:, None, None]  # light over a tiny coverage is brighter still
+    rgba[:, :, :-1] *= light
+    out, wide = (dof.layers(t, torch.tensor([1.2, 9.0])) for t in (rgba, rgba.double()))
+    assert_close(out[:, :-1].double() / light, wide[:, :-1] / light, rtol=1e-4, atol=1e-6)
+    assert_close(out[:, -1].double(), wide[:, -1], rtol=1e-5, atol=1e-6)
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+@pytest.mark.parametrize("value", [6.5e4, 1e6])
+@pytest.mark.parametrize("coc_px", [-6.0, 2.5, 11.0])
+def test_a_highlight_leaves_the_dark_outside_its_disc(
+    engine: str, way: dict[str, Any], value: float, coc_px: float
+) -> None:
+    lit, around = torch.full((1, 1, 40, 48), 1e-4), torch.full((1, 1, 40, 48), 3.0)
+    around[..., 18:23, 22:27], lit[..., 20, 24] = coc_px, value
+    y, x = torch.meshgrid(torch.arange(40), torch.arange(48), indexing="ij")
+    # a layer at half resolution has more support: the pixels of its grid, and the interpolation between them;
+    # and mixed pixels within 2 of it, which are as blurred, see it when they are split
+    reach = abs(coc_px) + 1 + (8 if abs(coc_px) >= 8 else 0) + (2 * 2**0.5 if way["occlusion"] else 0)
+    out = blur_by_coc(lit, around, **way)[..., torch.hypot(y - 20.0, x - 24.0) > reach]
+    assert_close(out, torch.full_like(out, 1e-4), rtol=2e-6, atol=0.0)
+
+
+@EVERY_ENGINE
+@pytest.mark.parametrize("name", ["image", "squeezed cat's eyes", "spots across the field"])
+def test_light_of_1e30_is_as_in_float64_through_any_lens(engine: str, name: str) -> None:
+    image, coc_px = torch.full((1, 3, HEIGHT, WIDTH), 0.1), halves(-4.0, 3.0)
+    image[..., 12, 16] = 1e30
+    truth = blur_by_coc(image.double(), coc_px.double(), table=LENSES[name])
+    out = blur_by_coc(image, coc_px, table=LENSES[name])
+    assert float((out.double() - truth).abs().max() / truth.abs().max()) < 1e-5
+
+
+# The two engines
+
+
+@pytest.fixture
+def by_both(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Holds the picture of the compiled engine to within 1e-5 of the light nearby of the plain one's."""
+    served = []
+
+    def render(*arguments: Any, native_render: Any = native.render, **options: Any) -> Tensor:
+        served.append(native_render(*arguments, **options))
+        return served[-1]
+
+    monkeypatch.setattr(native, "render", render)
+
+    def compared(make: Callable[[], Tensor], image: Tensor, in_focus: bool = False) -> None:
+        monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
+        plain = make()
+        assert not served
+        monkeypatch.setenv("TORCHDOF_ENGINE", "native")
+        compiled = make()
+        assert served or in_focus
+        served.clear()
+        assert_same_picture(plain, compiled, image)
+
+    return compared
+
+
+SMOOTH = ("planes", "smooth", "noise", "slope")  # others are on the edge of decisions, where rounding decides
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_engines_agree_on_random_scenes(seed: int, by_both: Any) -> None:
+    scene, dice = random_scene(seed, side=120 if seed % 3 else 40, kinds=SMOOTH), torch.Generator().manual_seed(seed)
+    scene.options["tolerance"] = (0.0, 1 / 255, 1 / 255, 4 / 255, 8 / 255)[(seed + 1) % 5]
+    if scene.image.shape[1] == 3 and seed % 4 == 0:
+        scene.options["table"] = BY_COLOUR
+    if "occlusion" in scene.options:
+        scene.options["normalize"] = seed % 3 > 0
+    if seed % 7 == 0:  # of several items, and other numbers of channels
+        scene.image, scene.coc_px = (t.repeat(2, 1 + (seed % 5) * (t.shape[1] == 1 and t is scene.image), 1, 1)
+                                     for t in (scene.image, scene.coc_px))  # fmt: skip
+        scene.options = {k: v for k, v in scene.options.items() if not isinstance(v, Tensor) and v is not BY_COLOUR}
+    if seed % 4 == 1:
+        scene.options["check"] = False
+        scene.coc_px[torch.rand(scene.coc_px.shape, generator=dice) < 0.03] = torch.nan
+        if seed % 8 == 1:
+            scene.image[torch.rand(scene.image.shape, generator=dice) < 0.01] = torch.inf
+    by_both(scene.blurred, scene.image, in_focus=bool((torch.nan_to_num(scene.coc_px).abs() <= 1.0).all()))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("way", ["accumulated", "background"])
+def test_engines_agree_on_the_very_edge_of_decisions(way: str, seed: int, by_both: Any) -> None:
+    scene = random_scene(seed, [way], lamps=way == "accumulated", side=90, kinds=["quarters"])
+    by_both(scene.blurred, scene.image, in_focus=bool((scene.coc_px.abs() <= 1.0).all()))
+
+
+def _few_coarse(near_px: float, far_px: float, **options: Any) -> Scene:
+    scene = made("smooth", 270, 390, 2.5, **options)
+    scene.coc_px[..., 20:60, 30:75] = near_px + torch.rand(40, 45)
+    scene.coc_px[..., 200:, 310:] = far_px + torch.rand(70, 80)
+    return scene
+
+
+def _background(lamps: float, check: bool) -> Scene:
+    scene = made("planes", 70, 90, 9.0, items=2, lamps=lamps, check=check)
+    behind, behind_coc = torch.rand(2, 3, 70, 90), scene.coc_px + 7.0 * torch.rand(2, 1, 70, 90)
+    if not check:
+        behind[0, 1, 10:20, 30:50], behind_coc[1, :, 40:50, 30:50] = torch.nan, torch.inf
+    scene.options |= {"background": behind, "background_coc_px": behind_coc}
+    return scene
+
+
+def _planned(reach_px: float) -> Scene:
+    plan = Plan.of_scene(made("smooth", 50, 50, reach_px).coc_px, 1 / 255)
+    return made("planes", 60, 75, 9.0, items=3, lamps=300.0, plan=plan)
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "attention": lambda: made("smooth", 120, 150, 4.0, attention=(40, 50, 20)),
+    **{f"{size}": functools.partial(made, "smooth", *size, 6.0)
+       for size in ((1, 1), (1, 7), (9, 1), (2, 3), (16, 16), (17, 33), (64, 5))},
+    **{f"background, lamps {lamps:g}, check {check}": functools.partial(_background, lamps, check)
+       for lamps in (1.0, 50.0) for check in (True, False)},
+    **{f"the plan of {reach:g} px": functools.partial(_planned, reach) for reach in (2.3, 31.0)},
+    **{f"few coarse layers, {ends}, {occlusion}": functools.partial(_few_coarse, *ends, occlusion=occlusion)
+       for ends in ((-9.0, 11.0), (-24.0, 30.0)) for occlusion in (True, False)},
+    **{f"{kind}, {name}, {occlusion}": functools.partial(
+           made, kind, 70, 90, radius, lamps=1000.0, table=table, occlusion=occlusion)
+       for name, table in LENSES.items() for kind, radius in (("smooth", 13.0), ("planes", 5.0))
+       for occlusion in (True, False)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_engines_agree_on_scenes_of_every_kind(name: str, by_both: Any) -> None:
+    scene = SCENES[name]()
+    by_both(scene.blurred, scene.image)
+
+
+@pytest.mark.parametrize("name", ["triangle", "blades", "image"])
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_engines_and_fold_agree_on_lopsided_kernels(name: str, occlusion: bool) -> None:
+    scene = made("planes", 40, 50, 6.0, table=LENSES[name], occlusion=occlusion, tolerance=0)
+    assert_same_picture(scene.blurred(method="fold"), scene.blurred(), scene.image)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_engines_agree_on_stacks(seed: int, by_both: Any) -> None:
+    items, count, channels = 1 + seed % 2, 1 + seed % 5, 1 + seed % 4
+    size = (40 + 7 * seed, 61 + 5 * seed)
+    cover = torch.rand(items, count, 1, *size)
+    cover = torch.where(torch.rand(cover.shape) < 0.3, torch.where(cover < 0.5, 0.0, 1.0), cover)
+    rgba = torch.cat([torch.rand(items, count, channels, *size) * cover, cover], 2)
+    depth = 0.5 + 5.0 * torch.rand(items, count, 1, *(size if seed % 2 else (1, 1)))
+    dof = DepthOfField(Camera(focus_m=1.7, f_number=1.4, sensor_width_mm=8.0), check=seed != 3)
+    if seed == 3:
+        rgba[0, 0, 0, 3, 5], depth[0, 0, :, 20:25] = torch.nan, torch.nan
+    by_both(lambda: dof.layers(rgba, depth), torch.zeros_like(rgba[:, 0]))
+
+
+# Threads, batches, strides, types and contexts make no difference
+
+
+def _threads(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
+    before, is_plain = torch.get_num_threads(), "torch" in native.describe() or way["method"] == "fold"
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            assert_close(scene.blurred(**way), out, rtol=1e-6 * is_plain, atol=0.0)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _items(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
+    for plan in (None, Plan.of_scene(scene.coc_px, 1 / 255)):
+        together = scene.blurred(plan=plan, **way)
+        for i in range(len(out)):
+            alone = blur_by_coc(scene.image[i : i + 1], scene.coc_px[i : i + 1], plan=plan, **way)
+            assert_close(together[i : i + 1], alone, rtol=1e-6, atol=1e-7)
+
+
+def _again(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
+    image, coc_px = scene.image.clone(), scene.coc_px.clone()
+    for context in (torch.no_grad(), torch.inference_mode(), torch.autocast("cpu", torch.bfloat16)):
+        with context:
+            assert torch.equal(scene.blurred(**way), out)
+    assert torch.equal(image, scene.image) and torch.equal(coc_px, scene.coc_px)
+
+
+def _types(scene: Scene, way: dict[str, Any], out: Tensor) -> None:
+    for dtype in (torch.float16, torch.bfloat16):
+        image = scene.image.to(dtype)
+        expected = blur_by_coc(image.float(), scene.coc_px, **way).to(dtype)
+        assert torch.equal(blur_by_coc(image, scene.coc_px, **way), expected)
+        coc = scene.coc_px.to(dtype)
+        assert_close(blur_by_coc(image, coc, **way), blur_by_coc(image, coc.float(), **way), rtol=1e-2, atol=1e-3)
+
+
+CHECKS = [_threads, _items, _again, _types]
+
+
+@EVERY_ENGINE
+@EVERY_WAY
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__.strip("_"))
+def test_the_picture_is_the_same_whatever_the_circumstances(engine: str, way: dict[str, Any], check: Any) -> None:
+    scene = made("smooth", 18, 22, 3.0, items=2, lamps=100.0)
+    scene.coc_px[0] *= 0.1
+    check(scene, way, scene.blurred(**way))
+
+
+def posts(soft: bool = False) -> Tensor:
+    """Posts three pixels wide before a wall; soft, as resampling leaves them, ramps swallow part of what is thin."""
+    depth = whole(2.5)
+    depth[..., 12:15] = depth[..., 4:16, 24:27] = 1.2
+    return 1.0 / functional.avg_pool2d(1.0 / depth, 3, 1, 1, count_include_pad=False) if soft else depth
+
+
+DOF, REPAIRING = DepthOfField(CAMERA), DepthOfField(CAMERA, depth_edges="repair")
+PLANE_DEPTHS = torch.tensor([1.2, 9.0])
+ENTRIES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "repair_edges": lambda image, _: repair_edges(0.1 * image + (posts() < 2.0), posts(soft=True)),
+    "edges repaired": lambda i, _: REPAIRING(0.1 * i + (posts() < 2.0), posts(soft=True)),
+    "cat's eyes": DepthOfField(CAMERA, BlurTable.polygon(5, vignetting=0.4)),
+    "depth": DOF,
+    "a plan": lambda image, depth: DOF(image, depth, plan=DOF.plan(image, depth)),
+    "a background": lambda image, depth: DOF(image, depth, background=image, background_depth=2 * depth),
+    "attention": lambda image, depth: DOF(image, depth, attention=(9.0, 9.0, 3.0)),
+    "layers": lambda *_: DOF.layers(texture(channels=4)[:, None].expand(1, 2, -1, -1, -1), PLANE_DEPTHS),
+    "layers, one after the other": lambda *_: DOF.layers(texture(channels=8).unflatten(1, (2, 4)), PLANE_DEPTHS),
+    "coc_px": DOF.coc_px,
+    "depth_of_field": lambda image, depth: depth_of_field(image, depth, CAMERA, occlusion=False),
+    "kernels": lambda *_: BlurTable.load("sato_j15").kernels(torch.tensor([-3.0, 7.0]), 640),
+    "lens_views": lambda image, depth: lens_views(image, depth, CAMERA, views=8).image,
+    "ssim": lambda image, _: torch.as_tensor(ssim(image, image.flip(-1))),
+}  # fmt: skip
+
+
+@EVERY_ENGINE
+@pytest.mark.parametrize("name", ENTRIES)
+def test_autocast_changes_no_number(name: str, engine: str) -> None:
+    plain = ENTRIES[name](texture(), slope(1.2, 6.0))
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(ENTRIES[name](texture(), slope(1.2, 6.0)), plain)
+
+
+@pytest.mark.parametrize("occlusion", [True, False])
+@pytest.mark.parametrize("size", [(64, 64), (150, 200), (65, 129)])
+@pytest.mark.parametrize("reach", [3.0, 14.0, 40.0])
+def test_tiles_leave_no_seam(occlusion: bool, size: tuple[int, int], reach: float) -> None:
+    # while gradients are recorded the plain engine renders the frame whole, otherwise the compiled one renders tiles
+    image, coc = 3 * torch.rand(1, 3, *size) ** 3, slope(-reach, reach, *size)
+    coc[..., size[0] // 3 : size[0] // 2, :] = -0.8 * reach
+    plan = Plan.of_scene(coc, 1 / 255)
+    tiled = blur_by_coc(image, coc, plan=plan, occlusion=occlusion)
+    plain = blur_by_coc(image.clone().requires_grad_(), coc, plan=plan, occlusion=occlusion).detach()
+    assert_close(tiled, plain, rtol=1e-5, atol=1e-5)  # as engines agree anywhere
+    beside = [torch.tensor([min(n % 64, 64 - n % 64) <= 4 and 4 < n < side - 4 for n in range(side)]) for side in size]
+    where = beside[0][:, None] | beside[1]  # a tile has 64 pixels a side
+    assert_close(tiled[..., where], plain[..., where], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["layered", "fold"])
+def test_a_user_s_own_tiles_with_a_halo_leave_no_seam(method: Any) -> None:
+    image, coc = 3 * torch.rand(1, 3, 40, 200) ** 3, slope(-6.0, 6.0, 40, 200)
+    coc[..., 13:20, :] = -4.8
+    options: dict[str, Any] = {"plan": Plan.of_scene(coc, 1 / 255), "occlusion": False, "method": method}
+    picture = blur_by_coc(image, coc, **options)
+    halo = 8 + 4 * 8  # beyond the frame light is a mean along the border, four times as wide as the place is far
+    for left in range(0, 200, 40):
+        start, stop = max(0, left - halo), min(200, left + 40 + halo)
+        tile = blur_by_coc(image[..., start:stop], coc[..., start:stop], **options)[..., left - start :][..., :40]
+        assert_close(tile, picture[..., left : left + 40], rtol=1e-6, atol=1e-6)
+
+
+# Plans of other scenes
+
+
+@EVERY_ENGINE
+@pytest.mark.parametrize("occlusion", [True, False])
+@pytest.mark.parametrize(
+    ("planned", "shown"), [(0.0, 6.0), (0.0, -6.0), (-2.0, -3.0), (3.0, 20.0), (4.0, -4.0), (5.0, 0.0)]
+)
+def test_a_plan_of_a_plane_serves_another_plane(engine: str, planned: float, shown: float, occlusion: bool) -> None:
+    plan, plane = Plan.of_scene(whole(planned), 1 / 255), whole(shown)
+    out, truth = (blur_by_coc(texture(), plane, occlusion=occlusion, plan=p) for p in (plan, None))
+    assert float((out - truth).square().mean().sqrt()) < 1 / 255  # layers of 20 px are coarser
+
+
+@EVERY_ENGINE
+def test_a_plan_of_the_first_frame_serves_a_pull_of_focus(engine: str) -> None:
+    image, depth = texture(), slope(1.2, 6.0)
+    plan = DOF.plan(image, whole(2.0))  # all in focus
+    for focus_m in (2.0, 1.9, 1.4, 1.25, 3.0, 9.0, math.inf):
+        out, truth = DOF(image, depth, focus_m, plan=plan), DOF(image, depth, focus_m)
+        assert float((out - truth).square().mean().sqrt()) < 1 / 255
+
+
+# Which engine renders
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """The kind of each item that the compiled engine renders."""
+    kinds: list[str] = []
+
+    def render(surfaces: Any, kind: Any, native_render: Any = native.render, **options: Any) -> Tensor:
+        kinds.append(kind)
+        return native_render(surfaces, kind, **options)
+
+    monkeypatch.setattr(native, "render", render)
+    monkeypatch.setenv("TORCHDOF_ENGINE", "native")
+    yield kinds
+
+
+@pytest.mark.parametrize(("wanted", "served"), [("native", 3), ("auto", 3), ("torch", 0)])
+def test_the_environment_chooses_the_engine(
+    wanted: str, served: int, counted: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHDOF_ENGINE", wanted)
+    scene = made("smooth", 30, 40, 3.0, items=3)
+    out = scene.blurred()
+    assert counted == served * ["image"] and out.data_ptr() != scene.image.data_ptr() and not out.requires_grad
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # by PyTorch, for tangents
+def test_the_plain_engine_serves_all_else(counted: list[str]) -> None:
+    scene = made("smooth", 30, 40, 3.0)
+    image, coc = scene.image, scene.coc_px
+    assert blur_by_coc(image.clone().requires_grad_(), coc).requires_grad
+    assert blur_by_coc(image, coc.clone().requires_grad_()).requires_grad
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(image, torch.ones_like(image))
+        out = blur_by_coc(dual, coc, occlusion=False)
+        assert torch.autograd.forward_ad.unpack_dual(out).tangent is not None
+    assert blur_by_coc(image.double(), coc).dtype == torch.float64
+    blur_by_coc(image, coc.double())
+    blur_by_coc(image, coc, method="fold")
+    wide = image[..., :2, :].repeat(1, 1, 1, 18)
+    blur_by_coc(wide, torch.full((1, 1, 2, 720), 400.0))  # a Fourier transform's kernel
+    assert torch.equal(blur_by_coc(image, 0.0 * coc), image)
+    assert counted == []
