@@ -59,3 +59,33 @@ def test_a_texture_is_not_drawn_outwards(engine: str, monkeypatch: pytest.Monkey
     coc = torch.full((1, 1, 96, 96), 9.0)
     out = blur_by_coc(image, coc)
     assert float((out[..., 0, 30:66] - 0.5).abs().max()) < 0.02
+
+
+@pytest.mark.parametrize("occlusion", [True, False])
+@pytest.mark.parametrize("engine", ["native", "torch"])
+def test_a_subject_that_the_border_cuts_leaves_its_background_alone(
+    engine: str, occlusion: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A subject in focus before an even background, blurred by 21 px: beside it the background keeps its light."""
+    monkeypatch.setenv("TORCHDOF_ENGINE", engine)
+    image, coc = torch.full((1, 3, 120, 200), 60 / 255), torch.full((1, 1, 120, 200), 21.0)
+    image[..., 50:, 80:130], coc[..., 50:, 80:130] = 220 / 255, 0.0
+    out = blur_by_coc(image, coc, occlusion=occlusion)
+    assert float((out[..., :78] - 60 / 255).abs().max()) < 1 / 255
+    if occlusion:
+        assert_close(out[..., 52:, 82:128], image[..., 52:, 82:128], atol=1 / 255, rtol=0.0)
+
+
+def test_a_slope_along_the_border_is_one_surface() -> None:
+    light = torch.rand(1, 3, 8, 60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    slope = torch.linspace(-10, 10, 60, dtype=torch.float64).expand(1, 1, 8, 60)
+    ends = (0, 0, 0, 8)
+    assert_close(continued(light, None, None, ends, 8, slope), continued(light, None, None, ends, 8))
+
+
+def test_what_is_nearer_is_in_no_mean_and_what_is_farther_is() -> None:
+    light, x = torch.zeros(1, 1, 4, 40), torch.zeros(1, 1, 4, 40)
+    light[..., 20:], x[..., 20:] = 1.0, 20.0  # bright and far
+    out = continued(light, None, None, (0, 0, 0, 4), 4, x)
+    assert_close(out[..., 4:, 20:], torch.ones(1, 1, 4, 20))
+    assert float(out[..., -1, 19]) > 0.2

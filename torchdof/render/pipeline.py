@@ -143,7 +143,7 @@ def _render_item(
         stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
         # what no layer covers is seen through all of them
         stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], high)))
-        return _composite(stack, None, plan, options, ops, stacked=True)
+        return _composite(stack, None, plan, options, ops, stacked=True, image=None)
     if plan.nodes == (0.0,):
         # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
@@ -192,7 +192,8 @@ def _render_item(
             splats = highlights.splat(rays, shown, options.table, options.occlusion, plan.kernels_per_px, ops)
 
     # and all of it in layers, each scattered, far to near
-    out = _composite(surfaces, behind, plan, options, ops, behind_light is not None, limit, splats)
+    own = 0 if behind_light is None else 1
+    out = _composite(surfaces, behind, plan, options, ops, own == 1, limit, splats, own)
     out = out if has_room else out / scale
     out = out if valid is None else torch.where(valid, out, image)
     return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
@@ -228,6 +229,7 @@ def _composite(
     stacked: bool,
     limit: Tensor | None = None,
     splats: Tensor | None = None,
+    image: int | None = 0,
 ) -> Tensor:
     """Surfaces, and the light of highlights, to a picture."""
     light, layered = surfaces[0].light, options.method == "layered"
@@ -237,7 +239,7 @@ def _composite(
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)
     lit, multiple = options.occlusion or options.normalize, ops.align(margin, coarsest)
-    frame = framed(surfaces, behind, plan.nodes, margin, multiple, options.occlusion, stacked, lit, limit)
+    frame = framed(surfaces, behind, plan.nodes, margin, multiple, options.occlusion, stacked, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
     def scattered(frame: Frame) -> Tensor:

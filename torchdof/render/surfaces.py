@@ -190,6 +190,7 @@ def framed(
     stacked: bool,
     lit: bool = True,
     limit: Tensor | None = None,
+    image: int | None = 0,
 ) -> Frame:
     """Surfaces of an image as a frame: they go on beyond the border as they are at it (:mod:`torchdof.render.border`).
 
@@ -203,15 +204,18 @@ def framed(
         stacked: As in :class:`Frame`.
         lit: Light goes on beyond the border as well; False: nothing comes from there.
         limit: Largest light that is no highlight's, ``[B, 1, H, W]``; None: all of it goes on.
+        image: Which of the surfaces each pixel of the image has; None: they are layers, each seen everywhere.
     """
     size = (surfaces[0].light.shape[-2], surfaces[0].light.shape[-1])
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
     beyond = (0, width - size[1], 0, height - size[0])  # right and below, to whole blocks
     ends = (margin, margin + beyond[1], margin, margin + beyond[3])
-    placed = []
-    for light, coc, weight in surfaces:
-        light = continued(light, weight, limit, ends, margin + multiple - 1) if lit else functional.pad(light, ends)
-        x = functional.pad(blur_axis(coc).clamp(nodes[0], nodes[-1]), ends, mode="replicate")
+    places = [blur_axis(surface.coc_px).clamp(nodes[0], nodes[-1]) for surface in surfaces]
+    image_x = None if image is None else places[image]
+    farthest, placed = margin + multiple - 1, []
+    for (light, _, weight), x in zip(surfaces, places, strict=True):
+        light = continued(light, weight, limit, ends, farthest, x, image_x) if lit else functional.pad(light, ends)
+        x = functional.pad(x, ends, mode="replicate")
         placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
     if behind is not None:
         behind = functional.pad(behind, beyond, mode="replicate")

@@ -5,6 +5,11 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 
 constexpr int WIDTH = 4;  // the mean reaches so many times as far to each side as the place lies beyond the border
+constexpr int BINS = 16;  // more of them tell more surfaces apart
+constexpr double STEP = 0.5;  // difference on the blur axis of neighbours on one surface at most; from twice as much on it is a step
+
+// A difference on the blur axis that is a step from one surface to another; 0 for that of a slope.
+static double step_of(double difference) { return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0); }
 
 Border border_of(const Job &job, int farthest) {
   const Surfaces &s = job.surfaces;
@@ -23,19 +28,31 @@ Border border_of(const Job &job, int farthest) {
     border.means_[side].resize(border.start(side, s.count, 0, 0));
     border.shares_[side].resize((size_t)s.count * border.length(side));
   }
+  const float low = (float)job.scene.nodes[0], high = (float)job.scene.nodes[job.scene.layers - 1];
   job.parallel(4, [&](int which, int) {
     const auto side = (Border::Side)which;
     const bool upright = side >= Border::LEFT;
     const int length = border.length(side), C = job.channels, sums = C + 1;
-    std::vector<double> until((size_t)(length + 1) * sums);  // sums of what comes before: weighted light, weight
+    const auto row_of = [&](int at) { return upright ? at : side == Border::TOP ? 0 : job.height - 1; };
+    const auto column_of = [&](int at) { return !upright ? at : side == Border::LEFT ? 0 : job.width - 1; };
+    std::vector<double> until((size_t)(length + 1) * BINS * sums);  // in each bin sums of what comes before: weighted light, weight
+    std::vector<int> bin(length);                                   // each pixel's, which shares it with the next one,
+    std::vector<double> part(length);                               // to such a part
+    std::vector<double> image_x(length), surface(length);           // places on the blur axis; their steps, added up
     std::vector<const float *> light(C);
     const float *coc, *weight;
     for (int i = 0; i < s.count; i++) {
+      const float *const image = job.scene.kind == TORCHDOF_STACK ? s.cocs[i] : s.coc;
       for (int at = 0; at < length; at++) {
-        const int y = upright ? at : side == Border::TOP ? 0 : job.height - 1;
-        const int x = !upright ? at : side == Border::LEFT ? 0 : job.width - 1;
-        const double *before = &until[(size_t)at * sums];
-        double *after = &until[(size_t)(at + 1) * sums];
+        image_x[at] = axis(image[(size_t)row_of(at) * job.width + column_of(at)], low, high);
+        surface[at] = at ? surface[at - 1] + step_of(image_x[at] - image_x[at - 1]) : 0.0;
+      }
+      const auto ends = std::minmax_element(surface.begin(), surface.end());
+      const double least_surface = *ends.first, per_bin = (BINS - 1) / std::max(*ends.second - least_surface, 1.0);
+      for (int at = 0; at < length; at++) {
+        const int y = row_of(at), x = column_of(at);
+        double *after = &until[(size_t)(at + 1) * BINS * sums];
+        std::copy(after - BINS * sums, after, after);
         const bool there = s.row(i, y, x, light.data(), coc, weight);
         const double w = !there ? 0.0 : weight ? *weight : 1.0;
         float share = 1.0f;  // of its light that is no highlight's
@@ -46,16 +63,27 @@ Border border_of(const Job &job, int farthest) {
           if (brightest > limit) share = limit / brightest;
         }
         border.shares_[side][(size_t)i * length + at] = share;
-        for (int c = 0; c < C; c++) after[c] = before[c] + (there ? *light[c] * share * w : 0.0);
-        after[C] = before[C] + w;
+        const double step = there ? step_of(axis(*coc, low, high) - image_x[at]) : 0.0;
+        const double place = std::clamp((surface[at] + step - least_surface) * per_bin, 0.0, BINS - 1.0);
+        bin[at] = std::min((int)place, BINS - 2);
+        part[at] = place - bin[at];
+        for (int next = 0; next < 2 && there; next++) {
+          const double its_weight = w * (next ? part[at] : 1.0 - part[at]);
+          double *const to = after + (bin[at] + next) * sums;
+          for (int c = 0; c < C; c++) to[c] += *light[c] * share * its_weight;
+          to[C] += its_weight;
+        }
       }
+      for (size_t at = 1; at <= (size_t)length; at++)  // and of all farther bins
+        for (int n = (BINS - 1) * sums - 1; n >= 0; n--) until[at * BINS * sums + n] += until[at * BINS * sums + n + sums];
       for (int level = 0; level < border.levels_; level++) {
         const int half = (int)std::min<int64_t>((int64_t)WIDTH << level, length);
         for (int at = 0; at < length; at++) {
-          const double *from = &until[(size_t)std::max(at - half, 0) * sums], *to = &until[(size_t)std::min(at + half + 1, length) * sums];
-          const double total = to[C] - from[C];
-          for (int c = 0; c < C; c++)
-            border.means_[side][border.start(side, i, c, level) + at] = total > 0 ? (float)((to[c] - from[c]) / total) : 0.0f;
+          const double *from = &until[((size_t)std::max(at - half, 0) * BINS + bin[at]) * sums];
+          const double *to = &until[((size_t)std::min(at + half + 1, length) * BINS + bin[at]) * sums];
+          const auto of = [&](int n) { return (1.0 - part[at]) * (to[n] - from[n]) + part[at] * (to[n + sums] - from[n + sums]); };
+          const double total = of(C);
+          for (int c = 0; c < C; c++) border.means_[side][border.start(side, i, c, level) + at] = total > 0 ? (float)(of(c) / total) : 0.0f;
         }
       }
     }
