@@ -317,7 +317,7 @@ class Camera:
         for values, share, valid in zip(distance, weight.expand(depth.shape), depth > 0, strict=True):
             counts = valid & (share > 0)
             if not bool(counts.any()):
-                raise ValueError(f"no valid depth {where}")
+                raise ValueError(f"depth must be > 0 where the focus lies, got no valid depth {where}")
             medians.append(_weighted_median(values[counts], share[counts]))
         if not all(float(median) > 0 for median in medians):
             raise ValueError(f"no focus brings the depth {where} onto the tilted plane; tilt less")

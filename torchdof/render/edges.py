@@ -60,8 +60,7 @@ _SOFT = 0.1  # share of ramps among the pixels of edges from which on a map coun
 _WIDE = 1.5  # so wide in pixels, or
 _MIXED = 0.5  # to such a part far from both surfaces: compression leaves narrow ones near one of them
 _RELATED = 0.8  # share of clear cases in which colours must agree with a map to be heard on it
-_SAMPLED = 2**14  # pixels of a frame among which a map is calibrated, in blocks,
-_SPARSEST = 32  # or one of so many blocks of a large frame
+_SAMPLED = 12_000  # pixels: a map is calibrated in the geometric mean of this number and the frame's, in blocks
 _BLOCK = 8
 _NEVER = 1e30
 _LARGEST = 1e15  # nearness, and light, whose squares are numbers too: beyond it the one is none, the other no brighter
@@ -217,7 +216,8 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
 
     # how far the map can be trusted, at each kind of place on an edge: from part of the frame
     height, width = given.shape[-2:]
-    every = min((height * width + _SAMPLED - 1) // _SAMPLED, _SPARSEST)
+    area = torch.scalar_tensor(height * width, dtype=torch.float64, device=given.device)  # a graph's changes
+    every = (area / _SAMPLED).sqrt().ceil().long()
     rows, columns = (_from_border(n, given.device) // _BLOCK for n in (height, width))
     sampled = pixels.indices(edges.is_edge & ((rows[:, None] + columns) % every == 0))
     level = ((given - edges.far) / (edges.near - edges.far).clamp_min(1e-12)).clamp(0.0, 1.0)

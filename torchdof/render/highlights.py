@@ -42,8 +42,7 @@ _CELL = 11  # of them over which it is decided
 _LEAST_PX = 1.0  # blur from which on there are rays
 _WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, what counts of its rays
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
-_BLOCK = 16  # pixels a side, in which it is seen how many surfaces may stand in the way of a ray:
-_FREE_RANGE_PX = 2.5  # difference in coc within one from which on each ray looks at so many that fewer are affordable
+_FREE_CHANGE_PX = 1.6  # change of the coc from pixel to pixel, across and down, from which on fewer are affordable
 _TAPS = 2**21  # rays splatted together
 
 
@@ -143,13 +142,12 @@ def extract(
 def affordable_taps(coc_px: Tensor) -> Tensor:
     """Number of rays ``[]`` that are splatted in a frame ``[B, 1, H, W]`` with occlusion: 16 a pixel.
 
-    A ray looks at each surface that may stand in its way. Where the coc differs by more than 2.5 px within 16 x 16
-    pixels on average, as in a depth map of noise, the number falls in proportion.
+    A ray looks at each surface that may stand in its way. In a depth map of noise these are many: the number falls in
+    proportion to the mean change of the coc from one pixel to the next.
     """
-    coc = coc_px.detach()
-    high, low = (functional.max_pool2d(values, _BLOCK, ceil_mode=True) for values in (coc, -coc))
-    crowd = ((high + low).mean() / _FREE_RANGE_PX).clamp_min(1.0)
-    return _TAPS_PER_PIXEL * math.prod(coc_px.shape) / crowd
+    coc, area = coc_px.detach(), math.prod(coc_px.shape)
+    change = (coc.diff(dim=-1).abs().sum() + coc.diff(dim=-2).abs().sum()) / area
+    return _TAPS_PER_PIXEL * area / (change / _FREE_CHANGE_PX).clamp_min(1.0)
 
 
 def _least_peak(peak: Tensor, coc: Tensor, share: Tensor, most_taps: Tensor | float) -> Tensor:

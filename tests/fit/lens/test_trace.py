@@ -1,13 +1,13 @@
 import functools
 import math
 import re
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from tests import loops
 from torchdof import BlurTable, Camera
 from torchdof.fit import natural_psnr, trace_table
 from torchdof.fit.lens.lens import RGB_UM, Lens
@@ -30,7 +30,7 @@ read = functools.cache(Lens.read)
 
 
 @functools.cache
-def traced_kernel(loops: ModuleType, lens: Lens, f_number: float, focus_m: float, coc: float) -> np.ndarray:
+def traced_kernel(lens: Lens, f_number: float, focus_m: float, coc: float) -> np.ndarray:
     """The spot of a fan turned about the axis, in eighths of a pixel, as pixels see it: no kernel code, no fit."""
     per_dioptre = signed_coc_mm(math.inf, lens.paraxial().focal_length, f_number, focus_m) * focus_m
     dioptres = 1.0 / focus_m - coc / per_dioptre
@@ -58,20 +58,18 @@ def between(table: BlurTable, share: float = 0.5) -> np.ndarray:
     return coc[:-1] + share * np.diff(coc)
 
 
-def psnr(
-    loops: ModuleType, table: BlurTable, places: Any, lens: Lens, f_number: float, focus_m: float, *, shown: bool
-) -> np.ndarray:
+def psnr(table: BlurTable, places: Any, lens: Lens, f_number: float, focus_m: float, *, shown: bool) -> np.ndarray:
     """PSNR at signed coc in mm: of what the table shows, or of its kernels without the fade to focus."""
     found = []
     for coc in map(float, places):
         px = coc / PIXEL
         made = table.kernels(torch.tensor([px]), WIDTH)[0, 0].numpy() if shown else interpolated(table, px)
-        found.append(natural_psnr(made, traced_kernel(loops, lens, f_number, focus_m, coc)))
+        found.append(natural_psnr(made, traced_kernel(lens, f_number, focus_m, coc)))
     return np.array(found)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name, loops):
+def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name):
     # the fit saw spots at 1/4, 1/2 and 3/4 of each interval
     lens, f_number, focus_m, nodes, wanted = SHIPPED[name]
     table = BlurTable.load(name)
@@ -80,13 +78,13 @@ def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name, loop
     places = np.concatenate([between(table, share) for share in shares])
     blurs = np.abs(places) >= SHARP_PX * PIXEL
     blurred, is_middle = places[blurs], np.repeat(shares, nodes - 1)[blurs] == 0.5
-    shown = psnr(loops, table, blurred, read(lens), f_number, focus_m, shown=True)
-    plain = psnr(loops, table, places, read(lens), f_number, focus_m, shown=False)
+    shown = psnr(table, blurred, read(lens), f_number, focus_m, shown=True)
+    plain = psnr(table, places, read(lens), f_number, focus_m, shown=False)
     assert shown[is_middle].min() >= wanted
     assert shown.min() >= 55.0 and plain.min() >= 50.0
     # around focus a table is nowhere worse than the thin lens
     px = np.array([-1.3, -0.85, -0.7, -0.35, -0.1, 0.1, 0.35, 0.7, 0.85, 1.3])
-    near, thin = (psnr(loops, t, px * PIXEL, read(lens), f_number, focus_m, shown=True) for t in (table, DISC))
+    near, thin = (psnr(t, px * PIXEL, read(lens), f_number, focus_m, shown=True) for t in (table, DISC))
     assert (near - np.minimum(thin, 55.0)).min() > 0.0 and near[np.abs(px) > SHARP_PX].min() >= 50.0
     assert table.provenance["prescription"].split("; ") == read(lens).lines()
     assert (table.provenance["f_number"], table.provenance["focus_m"]) == (f_number, focus_m)
@@ -95,24 +93,24 @@ def test_shipped_table_matches_traced_spots_and_says_where_it_is_from(name, loop
     assert len(str(table.to_dict())) < 150_000
 
 
-def test_a_table_takes_as_many_nodes_as_50_db_need(lens_of, loops):
+def test_a_table_takes_as_many_nodes_as_50_db_need(lens_of):
     lens = lens_of("50 5 1.5168 20\n0 1 0 18\n-50 0 1 20\n")
     given = {"f_number": 6.0, "nodes": None, "points": 33, "rays": 500}
     coarse, fine = (small(lens, **given, width_px=width) for width in (480, WIDTH))
     assert len(coarse.coc) < len(fine.coc) < 33
     places = between(fine)
     places = places[np.abs(places) < 2 * PIXEL]
-    assert psnr(loops, fine, places, lens, 6.0, 2.0, shown=False).min() >= 50.0
+    assert psnr(fine, places, lens, 6.0, 2.0, shown=False).min() >= 50.0
 
 
-def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch, loops):
+def test_fitting_all_nodes_at_once_beats_fitting_each_alone(monkeypatch):
     lens = read("double_gauss_50mm")
     found = {}
     for sweeps in (0, 6):
         monkeypatch.setattr("torchdof.fit.lens.nodes._SWEEPS", sweeps)
         table = small(lens, f_number=4.0, nodes=9, points=33)
         places = between(table)
-        found[sweeps] = psnr(loops, table, places[np.abs(places) > PIXEL], lens, 4.0, 2.0, shown=True)
+        found[sweeps] = psnr(table, places[np.abs(places) > PIXEL], lens, 4.0, 2.0, shown=True)
     assert found[6].min() > found[0].min() + 3.0
 
 
@@ -165,12 +163,12 @@ def test_off_axis_table_states_its_asymmetry():
 
 
 @pytest.mark.parametrize(("family", "wanted"), [("softm", 55.0), ("disc", 40.0), ("gaussian", 25.0), ("ring", 35.0)])
-def test_named_shapes_follow_a_stopped_down_lens(family, wanted, loops):
+def test_named_shapes_follow_a_stopped_down_lens(family, wanted):
     lens = read("double_gauss_50mm")
     table = small(lens, f_number=4.0, family=family, rays=1_000)
     assert table.family == family
     ends = table.coc.numpy()[[0, -1]]
-    assert psnr(loops, table, ends, lens, 4.0, 2.0, shown=True).min() > wanted
+    assert psnr(table, ends, lens, 4.0, 2.0, shown=True).min() > wanted
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ namespace {
 constexpr int RINGS = 3, REACH = 5, RAMP_REACH = 6, LEVELS = 6, PLACES = 2 * RINGS + LEVELS, DIRECTIONS = 5, KINDS = DIRECTIONS * PLACES, ROUNDS = 10;
 constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, PRIOR_COUNT = 30.0f, EXACT = 0.025f, DOUBTFUL = 0.05f, RELATED = 0.8f, SOFT = 0.1f, WIDE = 1.5f, MIXED = 0.5f, SHARPNESS = 1.6f, MOST = 4.0f, CLIMBED = 0.35f, PIXEL = 0.2f, BETTER = 0.5f, LEAN = 2.0f;
 constexpr float NOISES = 12.0f;
-constexpr int NOISE_SAMPLED = 1 << 13, SAMPLED = 1 << 14, SPARSEST = 32, SAMPLE_BLOCK = 8, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
+constexpr int NOISE_SAMPLED = 1 << 13, SAMPLED = 12000, SAMPLE_BLOCK = 8, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8, ROWS_AHEAD = 8;
 // What a pixel shows depends on what is so far around it; without ramps, and with them.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
@@ -270,7 +270,7 @@ class Repair {
   bool run() {
     allocate();
     noise_step_ = NOISES * noise();
-    const int every = (int)std::min(((int64_t)area_ + SAMPLED - 1) / SAMPLED, (int64_t)SPARSEST);
+    const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
     const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
     const auto is_sampled = [&](int y, int x) { return (block_of(y, height_) + block_of(x, width_)) % every == 0; };
     std::vector<Group> groups, sampled;

@@ -321,6 +321,7 @@ struct Job {
   void fill_hidden();                     // disocclusion.cpp
   void put_before_background();           // matting.cpp
   void extract_highlights();              // highlights.cpp
+  double change_of_coc() const;
 };
 
 // Least highlight threshold of a block.

@@ -14,7 +14,7 @@ constexpr float LEAST_PX = 1.0f;        // blur from which on there are rays
 constexpr float NEARER_PX = 1.0f;       // difference in coc from which on a surface is another one, in front
 constexpr float WHOLE = 4.0f;           // times the share of a highlight that is splatted is what counts of its rays
 constexpr int TAPS_PER_PIXEL = 16;      // of the frame: rays beyond this number are left to the layers,
-constexpr float FREE_RANGE_PX = 2.5f;   // or a smaller one in inverse proportion where the coc differs by more within a block
+constexpr double FREE_CHANGE_PX = 1.6;  // or a smaller one in proportion where the coc of neighbours differs by more
 constexpr int STEPS_PER_PX = 32;        // of radius: kernels of rays
 constexpr int PATCH = 16;               // rays a side that are looked at together
 
@@ -128,12 +128,23 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
   return cover + going_on(cover) * (stopped * is_dark * is_step);
 }
 
+// Mean change of the coc from a pixel to the next one, across and down together.
+double Job::change_of_coc() const {
+  std::vector<double> changes(height);
+  parallel(height, [&](int y, int) {
+    const float *row = surfaces.coc + (size_t)y * width, *above = y ? row - width : row;
+    double sum = 0;
+    for (int x = 0; x < width; x++) sum += std::fabs(row[x] - above[x]) + (x ? std::fabs(row[x] - row[x - 1]) : 0.0f);
+    changes[y] = sum;
+  });
+  double sum = 0;
+  for (const double change : changes) sum += change;
+  return sum / surfaces.area();
+}
+
 void Job::extract_highlights() {
   const size_t area = surfaces.area();
   const float from_px = scene.occlusion ? LEAST_PX : std::max(scene.crisp_px - 1.0f, LEAST_PX);
-  double range = 0;
-  for (size_t block = 0; block < surfaces.blocks.size(); block++) range += block_high[block] - block_low[block];
-  const double crowd = scene.occlusion ? std::max(range / surfaces.blocks.size() / FREE_RANGE_PX, 1.0) : 1.0;
   // bright pixels of each surface
   const int count = surfaces.count;
   std::vector<std::vector<Candidate>> bands((size_t)surfaces.block_rows * count);
@@ -178,7 +189,7 @@ void Job::extract_highlights() {
       const double side = 2.0 * std::fabs(p.coc) + 1;
       return side * side * std::min(WHOLE * (1.0f - p.limit / p.peak) * fades(p), 1.0f);
     };
-    const double budget = (double)TAPS_PER_PIXEL * area / crowd;
+    const double budget = (double)TAPS_PER_PIXEL * area / (scene.occlusion ? std::max(change_of_coc() / FREE_CHANGE_PX, 1.0) : 1.0);
     double taps_of_all = 0;
     for (const Candidate &p : all) taps_of_all += taps(p);
     if (taps_of_all > budget) {  // too many: the brightest of them, and only what they are brighter by
