@@ -280,9 +280,9 @@ def render(
         highlights,
         crisp_px,
         len(nodes),
-        (ctypes.c_double * len(nodes))(*nodes),
-        (ctypes.c_int32 * len(nodes))(*(scale for _, scale in layers)),
-        (ctypes.c_int32 * len(nodes))(*(kernel.shape[-1] // 2 for kernel in kernels)),
+        _array(ctypes.c_double, len(nodes))(*nodes),
+        _array(ctypes.c_int32, len(nodes))(*(scale for _, scale in layers)),
+        _array(ctypes.c_int32, len(nodes))(*(kernel.shape[-1] // 2 for kernel in kernels)),
         colours,
         bank.data_ptr(),
         _shares(shares) if shares else None,
@@ -300,7 +300,7 @@ def render(
             steps = ctypes.POINTER(ctypes.c_int32)()
             count = engine.torchdof_radii(job, ctypes.byref(steps))
             rays = [psf.contiguous() for psf in psfs(steps[:count])] if count else []
-            halves = (ctypes.c_int32 * max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
+            halves = _array(ctypes.c_int32, max(1, count))(*(psf.shape[-1] // 2 for psf in rays))
             spots = ray_shares(steps[:count]) if count and shares else []
             of_rays = _shares(spots) if spots else None
             _check(engine.torchdof_finish(job, _pointers(rays), halves, of_rays, len(spots), out.data_ptr()))
@@ -391,7 +391,7 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
     """
     coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(tolerance), ctypes.c_int32(), 256
     while True:
-        nodes = (ctypes.c_double * capacity)()
+        nodes = _array(ctypes.c_double, capacity)()
         size = (coc_px.shape[0], *coc_px.shape[-2:])
         kept.value = tolerance
         arguments = (*size, ctypes.byref(kept), torch.get_num_threads(), nodes, capacity, ctypes.byref(count))
@@ -425,8 +425,8 @@ def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool
     reach, fade = (list(itertools.chain.from_iterable(each)) for each in (spots.reach, spots.fade))
     index = list(itertools.chain.from_iterable(spots.which))
     lists: list[list[int]] = [cells, index, list(map(int, spots.flipped)), spots.half]
-    whole = [(ctypes.c_int32 * max(1, len(each)))(*each) for each in lists]
-    numbers = [(ctypes.c_double * len(each))(*each) for each in (spots.part, spots.finer, reach, fade)]
+    whole = [_array(ctypes.c_int32, max(1, len(each)))(*each) for each in lists]
+    numbers = [_array(ctypes.c_double, len(each))(*each) for each in (spots.part, spots.finer, reach, fade)]
     arrays = [*whole[:2], *numbers, *whole[2:]]
     scene = _Spots(count, colours, _pointers(spots.templates), *arrays, squeeze, is_round, is_even)
     _check(_engine().torchdof_kernels(ctypes.byref(scene), torch.get_num_threads(), _pointers(made)))
@@ -507,11 +507,17 @@ def _shares(shares: Sequence[FieldShares]) -> Any:
     for each in shares:
         colours, _, rows, columns = each.values.shape
         made.append(_Shares(each.values.data_ptr(), each.boxes.data_ptr(), each.coc_px, colours, rows, columns))
-    return (_Shares * len(made))(*made)
+    return _array(_Shares, len(made))(*made)
 
 
 def _pointers(tensors: Sequence[Tensor | None]) -> Any:
-    return (ctypes.c_void_p * max(1, len(tensors)))(*(None if t is None else t.data_ptr() for t in tensors))
+    return _array(ctypes.c_void_p, max(1, len(tensors)))(*(None if t is None else t.data_ptr() for t in tensors))
+
+
+@functools.lru_cache(maxsize=1024)
+def _array(kind: Any, count: int) -> Any:
+    """The type of so many numbers. To make one takes 20 microseconds, and ctypes forgets it at once."""
+    return kind * count
 
 
 def _engine() -> ctypes.CDLL:
