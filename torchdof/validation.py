@@ -218,9 +218,13 @@ def same_aspect(image: Tensor, depth: Tensor) -> None:
     """
     if 0 in depth.shape or not _is_same_aspect(image, depth):
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
+        if 0 not in depth.shape and _is_same_aspect(image, depth.transpose(-1, -2)):
+            hint = "turned by 90 degrees it fits: one of the two lies on its side"
+        else:
+            hint = "crop one of the two, so that both show the same"
         raise ValueError(
             f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
-            "but must have the same aspect ratio; crop one of the two, so that both show the same"
+            f"but must have the same aspect ratio; {hint}"
         )
 
 

@@ -339,3 +339,22 @@ def test_a_link_to_itself_is_refused_in_one_sentence(scene: Path, run: Run, link
     (scene / link).symlink_to(link)
     assert run(ONE, code=2).startswith(f"error: {link}: is a link that leads back to itself")
     assert (scene / link).is_symlink()
+
+
+def test_a_phones_photograph_is_rendered_as_it_is_seen(run: Run, image: Tensor, depth: Tensor) -> None:
+    """Held upright, a phone stores lines from the bottom to the top (orientation 6); estimators' depth is upright."""
+    spec = oiio.ImageSpec(24, 16, 3, "uint8")
+    spec.attribute("Orientation", 6)
+    stored = (255 * image[0].permute(1, 2, 0)).byte().contiguous().numpy()
+    output = oiio.ImageOutput.create("phone.png")
+    assert output.open("phone.png", spec) and output.write_image(stored) and output.close()
+    upright = torch.rot90(depth, -1, (-2, -1))  # 24 rows of 16, 2 m above and 6 m below
+    np.save("upright.npy", upright.numpy())
+    line = run(f"render phone.png upright.npy -o out.png --focus-at 8,20 {LENS}")
+    assert "16 x 24" in line
+    out = read_image("out.png")
+    assert out.pixels.shape == (1, 3, 24, 16) and out.metadata["Orientation"][1] == 1
+    seen = read_image("phone.png").pixels
+    torch.testing.assert_close(out.pixels[..., 16:, :], seen[..., 16:, :], rtol=0.0, atol=0.01)  # in focus
+    said = run(f"render phone.png depth.npy -o out.png --focus-m 2 {LENS}", code=2)
+    assert "turned by 90 degrees it fits" in said

@@ -123,7 +123,7 @@ def _read_picture(path: Path) -> None:
         else:
             if isinstance(found, Picture):
                 assert torch.isfinite(found.pixels).all(), "pixels that are not finite"
-                camera_facts(found.metadata, found.pixels.shape[-1])
+                camera_facts(found.metadata, found.pixels.shape[-1], found.pixels.shape[-2])
 
 
 def _array_seeds(suffix: str) -> Callable[[Path], None]:

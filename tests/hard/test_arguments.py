@@ -70,7 +70,7 @@ TAGS = ("Exif:FocalLength", "FNumber", "Exif:SubjectDistance", "Exif:FocalLength
 
 
 def facts(**tags: Any) -> dict[str, float]:
-    return camera_facts({name: (None, value) for name, value in zip(TAGS, tags.values(), strict=True)}, 100)
+    return camera_facts({name: (None, value) for name, value in zip(TAGS, tags.values(), strict=True)}, 100, 80)
 
 
 def rendered(image: Tensor, **others: Any) -> None:

@@ -1,7 +1,11 @@
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import OpenImageIO as oiio
 import pytest
 
+from torchdof.io.images import read_image, read_values, write_image
 from torchdof.io.metadata import camera_facts
 
 FOCAL, FILM, DISTANCE = "Exif:FocalLength", "Exif:FocalLengthIn35mmFilm", "Exif:SubjectDistance"
@@ -33,5 +37,54 @@ FULL = {"sensor_width_mm": 36.0}
     ],
 )
 def test_camera_facts_are_those_of_the_tags(tags: dict[str, Any], facts: dict[str, float]) -> None:
-    found = camera_facts({name: (None, value) for name, value in tags.items()}, width=6000)
+    found = camera_facts({name: (None, value) for name, value in tags.items()}, 6000, 4000)
     assert found == pytest.approx(facts)
+
+
+def test_the_film_of_the_equivalent_focal_length_lies_along_the_longer_side() -> None:
+    tags = {FOCAL: (None, 4.2), FILM: (None, 27)}
+    assert camera_facts(tags, 3000, 4000)["sensor_width_mm"] == pytest.approx(5.6 * 3 / 4)
+
+
+# EXIF 2.32, 4.6.4 A: where the pixel at row r and column c of a stored H x W picture is seen
+SEEN: dict[int, Any] = {
+    1: lambda r, c, h, w: (r, c),
+    2: lambda r, c, h, w: (r, w - 1 - c),
+    3: lambda r, c, h, w: (h - 1 - r, w - 1 - c),
+    4: lambda r, c, h, w: (h - 1 - r, c),
+    5: lambda r, c, h, w: (c, r),
+    6: lambda r, c, h, w: (c, h - 1 - r),
+    7: lambda r, c, h, w: (w - 1 - c, h - 1 - r),
+    8: lambda r, c, h, w: (w - 1 - c, r),
+}
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg"])
+@pytest.mark.parametrize("orientation", SEEN)
+def test_a_picture_is_read_as_it_is_seen_and_written_upright(orientation: int, suffix: str, tmp_path: Path) -> None:
+    height, width = 16, 24
+    stored = np.zeros((height, width, 3), np.uint8)
+    stored[0:8, 8:16] = 255
+    spec = oiio.ImageSpec(width, height, 3, "uint8")
+    tags = {"Orientation": orientation, FILM: 26, "Make": "A", WIDTH: width, "Exif:PixelYDimension": height}
+    for name, value in tags.items():
+        spec.attribute(name, value)
+    path, copy = str(tmp_path / f"stored{suffix}"), str(tmp_path / f"copy{suffix}")
+    output = oiio.ImageOutput.create(path)
+    assert output.open(path, spec) and output.write_image(stored) and output.close()
+
+    picture = read_image(path)
+    seen = np.zeros((16, 24) if orientation < 5 else (24, 16), bool)
+    for r in range(8):
+        for c in range(8, 16):
+            seen[SEEN[orientation](r, c, height, width)] = True
+    assert np.array_equal(picture.pixels[0, 0].numpy() > 0.5, seen)
+    assert np.array_equal(read_values(path)[0, 0].numpy() > 127, seen)
+
+    write_image(copy, picture)
+    again = read_image(copy)
+    assert np.array_equal(again.pixels[0, 0].numpy() > 0.5, seen)
+    kept = {name: again.metadata[name][1] for name in ("Orientation", FILM, "Make") if name in again.metadata}
+    assert kept == {"Orientation": 1, FILM: 26, "Make": "A"}
+    if suffix == ".jpg" and WIDTH in again.metadata:
+        assert again.metadata[WIDTH][1] == seen.shape[1]

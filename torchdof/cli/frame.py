@@ -81,7 +81,8 @@ def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> 
             return at_size_of(pixels, values)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-    view_deg = scene.lens.view_deg(picture.metadata, pixels.shape[-1]) if kind == "distance" else None
+    height, width = pixels.shape[-2:]
+    view_deg = scene.lens.view_deg(picture.metadata, width, height) if kind == "distance" else None
     metres = depth_from_values(
         values, kind, scale=said.depth_scale, offset=said.depth_offset, unknown=said.depth_unknown, fov_x_deg=view_deg
     )

@@ -94,19 +94,19 @@ class Lens(Sensor):
         if len(self.focus_m or []) > 1:
             raise ValueError("--focus-m has keyframes but IMAGE is a single image; give one distance in metres")
 
-    def view_deg(self, metadata: Mapping[str, Any], width: int) -> float:
+    def view_deg(self, metadata: Mapping[str, Any], width: int, height: int) -> float:
         """Horizontal field of view, stated or by focal length and sensor, which the file may know."""
-        known = self._known(metadata, width)
+        known = self._known(metadata, width, height)
         if self.fov_deg is not None:
             return self.fov_deg
         if not {"focal_length_mm", "sensor_width_mm"} <= set(known):
             raise ValueError("--depth-kind distance needs --fov-deg, or --focal-length-mm and --sensor-width-mm")
         return 2 * math.degrees(math.atan2(known["sensor_width_mm"], 2 * known["focal_length_mm"]))
 
-    def _known(self, metadata: Mapping[str, Any], width: int) -> dict[str, float]:
+    def _known(self, metadata: Mapping[str, Any], width: int, height: int) -> dict[str, float]:
         """Numbers of the camera that the user or else the file states."""
         stated = {name: value for name in _ASSUMED if (value := getattr(self, name)) is not None}
-        return camera_facts(metadata, width) | stated
+        return camera_facts(metadata, width, height) | stated
 
     def camera(
         self, metadata: Mapping[str, Any], depth: "Tensor", frame: int = 0, median: bool = False
@@ -118,7 +118,8 @@ class Lens(Sensor):
         """
         from ..optics.camera import Camera
 
-        known, remarks, focus_m = self._known(metadata, depth.shape[-1]), list[str](), math.inf
+        height, width = depth.shape[-2:]
+        known, remarks, focus_m = self._known(metadata, width, height), list[str](), math.inf
         if self.focus_m is not None:
             focus_m = focus_at_frame(self.focus_m, frame)
         elif not self.has_focus and median:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..validation import show
 from .memory import free_bytes
-from .metadata import kept_metadata
+from .metadata import Metadata, kept_metadata, upright
 
 __all__ = ["MOST_ATTRIBUTES", "Part", "PixelType", "check_chunks", "existing", "first_line", "named_in_utf8"]
 __all__ += ["read_array", "read_parts"]
@@ -42,7 +42,7 @@ class Part:
     kinds: tuple[str, ...]  # what each channel was stored as, as OpenImageIO calls it: "uint8", "half", ...
     is_exr: bool = False  # names may carry a layer before a dot, and whole numbers are no parts of white
     straight_alpha: bool = False  # colour is not multiplied by alpha yet
-    metadata: dict[str, tuple[Any, Any]] = dataclasses.field(default_factory=dict)  # name -> (OpenImageIO type, value)
+    metadata: Metadata = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
 
 
@@ -117,15 +117,19 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
             names = tuple(spec.channelnames)
             if not is_exr and len(names) <= 4:
                 names = tuple(("Y", "YA", "RGB", "RGBA")[len(names) - 1])
+            values, metadata = values.reshape(spec.height, spec.width, len(names)), kept_metadata(spec.extra_attribs)
+            window = (spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height)
+            if not is_exr:
+                values, metadata = upright(values, metadata)
             yield Part(
                 label=spec.get_string_attribute("name"),
                 names=names,
-                values=values.reshape(spec.height, spec.width, len(names)),
+                values=values,
                 kinds=tuple(map(str, spec.channelformats)) or (str(spec.format),) * len(names),
                 is_exr=is_exr,
                 straight_alpha=bool(spec.get_int_attribute("oiio:UnassociatedAlpha")),
-                metadata=kept_metadata(spec.extra_attribs),
-                window=(spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height),
+                metadata=metadata,
+                window=window if values.shape[:2] == (spec.height, spec.width) else None,
             )
             number += 1
     finally:

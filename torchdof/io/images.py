@@ -1,4 +1,4 @@
-"""Images in and out of files, in linear light: EXR, PNG, TIFF, JPEG, HDR and PFM, through OpenImageIO.
+"""Images in and out of files, in linear light: EXR, PNG, TIFF, JPEG, WebP, HDR and PFM, through OpenImageIO.
 
 The transfer curve is stated, never guessed from a tag: files of integers (PNG, JPEG, TIFF of 8 or 16 bits) are taken as
 sRGB and files of floats (EXR, HDR, PFM, TIFF of floats) as linear light, unless the caller says otherwise.
@@ -30,14 +30,14 @@ _SAMPLES: dict[str, tuple[PixelType, ...]] = {  # what each type of file can hol
     ".exr": ("half", "float"),
     ".png": ("8", "16"),
     **dict.fromkeys((".tif", ".tiff"), ("8", "16", "float")),
-    **dict.fromkeys((".jpg", ".jpeg"), ("8",)),
+    **dict.fromkeys((".jpg", ".jpeg", ".webp"), ("8",)),
     **dict.fromkeys((".hdr", ".pfm"), ("float",)),
 }
 _SUFFIXES = tuple(_SAMPLES)
 _OIIO_SAMPLE: dict[PixelType, str] = {"8": "uint8", "16": "uint16", "half": "half", "float": "float"}
 _STORED: dict[str, PixelType] = {name: sample for sample, name in _OIIO_SAMPLE.items()} | {"double": "float"}
 _WHITE = {"8": 255.0, "16": 65535.0, "half": 1.0, "float": 1.0}
-_HOLDS_ALPHA = (".exr", ".png", ".tif", ".tiff")
+_HOLDS_ALPHA = (".exr", ".png", ".tif", ".tiff", ".webp")
 _HOLDS_GREY = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pfm")
 _LOSSLESS_EXR = ("none", "rle", "zip", "zips", "piz")
 
@@ -79,14 +79,15 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
     """Reads an image into linear light.
 
     Args:
-        path: An EXR, PNG, TIFF, JPEG, HDR or PFM file; HEIC and raw files where OpenImageIO was built to read them.
+        path: An EXR, PNG, TIFF, JPEG, WebP, HDR or PFM file; HEIC and raw files where OpenImageIO was built to read
+            them.
         transfer: "linear" or "srgb"; None takes "srgb" for integers and "linear" for floats, whatever the file's tags
             say.
         layer: Name of the part or layer of an EXR file to read; None takes the first that has colour.
 
     Returns:
         The picture, with its depth channel where the file has one (any part of an EXR file; names like ``Z``, ``depth``
-        or ``ViewLayer.Depth.Z``). Pixels are as stored: the orientation tag of a camera is kept, not applied.
+        or ``ViewLayer.Depth.Z``). A picture that a camera's orientation tag turns is turned, and the tag is then 1.
 
     Raises:
         OSError: If the file is missing, empty, truncated, not an image, or memory for it cannot be had.
@@ -180,7 +181,7 @@ def write_image(
     """Writes a picture whole or not at all: to a new file in the same folder, renamed once it is complete.
 
     Args:
-        path: Where to; the type follows from the suffix (.exr .png .tif .tiff .jpg .jpeg .hdr .pfm).
+        path: Where to; the type follows from the suffix (.exr .png .tif .tiff .jpg .jpeg .webp .hdr .pfm).
         picture: Pixels in linear light; its metadata goes into the file, as far as the type can hold it.
         transfer: "linear" or "srgb"; None takes the picture's own where both it and the new file are integers, or both
             floats, and otherwise "srgb" for integers and "linear" for floats.
@@ -236,7 +237,10 @@ def write_image(
             if suffix == ".exr" and value in _LOSSLESS_EXR:
                 spec.attribute(name, value)
         elif name != "ICCProfile" or transfer == picture.transfer:
-            spec.attribute(name, kind, value)
+            if isinstance(value, int):  # OpenImageIO passes over one of 16 bits that is said to be so
+                spec.attribute(name, value)
+            else:
+                spec.attribute(name, kind, value)
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene" if transfer == "srgb" else "lin_rec709_scene")
     if transfer == "linear" and suffix != ".exr":
         spec.attribute("Exif:ColorSpace", 65535)  # "uncalibrated"; OpenImageIO cannot write a TIFF without any EXIF
@@ -245,6 +249,8 @@ def write_image(
     if suffix in (".jpg", ".jpeg"):
         spec.attribute("compression", "jpeg:95")
         spec.attribute("jpeg:subsampling", "4:4:4")
+    if suffix == ".webp":
+        spec.attribute("compression", "webp:95")
 
     with whole_file(path) as part:
         with part.open("wb") as file:

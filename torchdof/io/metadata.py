@@ -1,10 +1,16 @@
-"""Metadata of an image file: what a copy keeps, and what it says about the camera."""
+"""Metadata of an image file: what a copy keeps, which way up it is, and what it says about the camera."""
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["camera_facts", "kept_metadata"]
+if TYPE_CHECKING:
+    import numpy as np
+
+__all__ = ["Metadata", "camera_facts", "kept_metadata", "upright"]
+
+Metadata = dict[str, tuple[Any, Any]]
+"""Name -> (OpenImageIO type, value)."""
 
 # Facts about how one file was stored, which are wrong for the next.
 _STORAGE_PREFIXES = ("oiio:", "tiff:", "openexr:", "png:", "pnm:", "jpeg:", "rgbe:", "thumbnail", "Exif:ExifVersion")
@@ -13,7 +19,39 @@ _STORAGE_NAMES += ("Exif:FlashPixVersion", "Exif:ColorSpace")
 _MM_PER_UNIT: dict[float, float] = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF FocalPlaneResolutionUnit
 
 
-def kept_metadata(attributes: Iterable[Any]) -> dict[str, tuple[Any, Any]]:
+_FLIPPED: dict[Any, tuple[int, ...]] = {2: (1,), 3: (0, 1), 4: (0,), 5: (), 6: (1,), 7: (0, 1), 8: (0,)}
+"""EXIF orientation (0x0112) -> axes that are flipped, after rows and columns have changed places from 5 on."""
+_OF_AXES = (
+    ("Exif:PixelXDimension", "Exif:PixelYDimension"),
+    ("Exif:FocalPlaneXResolution", "Exif:FocalPlaneYResolution"),
+)
+
+
+def upright(values: "np.ndarray", metadata: Metadata) -> "tuple[np.ndarray, Metadata]":
+    """An image ``[H, W, C]`` turned as its orientation tag says, and its metadata, in which the tag is then 1.
+
+    Example:
+        >>> import numpy as np
+        >>> lying = np.arange(6).reshape(2, 3, 1)
+        >>> upright(lying, {"Orientation": ("uint16", 6)})[0][..., 0].tolist()
+        [[3, 0], [4, 1], [5, 2]]
+    """
+    kind, orientation = metadata.get("Orientation", (None, 1))
+    if orientation not in _FLIPPED:
+        return values, metadata
+    turned = metadata | {"Orientation": (kind, 1)}
+    if orientation >= 5:
+        values = values.swapaxes(0, 1)
+        for across, down in _OF_AXES:
+            for name, other in ((across, down), (down, across)):
+                turned.pop(name, None)
+                if other in metadata:
+                    turned[name] = metadata[other]
+    rows, columns = (slice(None, None, -1 if axis in _FLIPPED[orientation] else 1) for axis in (0, 1))
+    return values[rows, columns], turned
+
+
+def kept_metadata(attributes: Iterable[Any]) -> Metadata:
     """What a copy of an image should keep of OpenImageIO's ``extra_attribs``.
 
     Returns:
@@ -26,22 +64,24 @@ def kept_metadata(attributes: Iterable[Any]) -> dict[str, tuple[Any, Any]]:
     }
 
 
-def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int) -> dict[str, float]:
+def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int, height: int) -> dict[str, float]:
     """What the metadata says about the camera, under the names of ``torchdof.Camera``; only what it says.
 
     The width of the sensor follows from the resolution of the focal plane (EXIF 0xA20E), or from the focal length's
     equivalent on 35 mm film where that is missing or contradicts it, as in a picture scaled down after it was taken.
+    The 36 mm of that film are the picture's longer side.
 
     Args:
         metadata: As in ``Picture.metadata``.
         width: Width of the image in pixels.
+        height: Its height.
 
     Returns:
         Any of ``focal_length_mm``, ``f_number``, ``focus_m``, ``sensor_width_mm``.
 
     Example:
         >>> tags = {"Exif:FocalLength": 50.0, "FNumber": 1.8, "Exif:FocalLengthIn35mmFilm": 75}
-        >>> camera_facts({name: (None, value) for name, value in tags.items()}, width=6000)
+        >>> camera_facts({name: (None, value) for name, value in tags.items()}, 6000, 4000)
         {'focal_length_mm': 50.0, 'f_number': 1.8, 'sensor_width_mm': 24.0}
     """
 
@@ -64,7 +104,7 @@ def camera_facts(metadata: Mapping[str, tuple[Any, Any]], width: int) -> dict[st
         facts["focus_m"] = math.inf if focus_m > 1e6 else focus_m  # EXIF writes infinity as 2^32 - 1
     by_film = number("Exif:FocalLengthIn35mmFilm")
     if by_film is not None and focal_length_mm is not None:
-        width_mm = 36.0 * focal_length_mm / by_film
+        width_mm = 36.0 * focal_length_mm / by_film * (width / max(width, height))
         if 0 < width_mm < math.inf:
             facts["sensor_width_mm"] = width_mm
     per_unit = number("Exif:FocalPlaneXResolution")
