@@ -3,6 +3,7 @@
 import contextlib
 import os
 import threading
+import warnings
 from collections.abc import Sequence
 from typing import Any, Unpack
 
@@ -199,6 +200,8 @@ class DepthOfField(nn.Module):
         """
         check = self.options.check
         if not is_traced() and validation.is_resizable(image, depth):
+            if stretch := validation.stretch(image, depth):
+                warnings.warn(f"{name} is stretched by {stretch:.1%} to the shape of the image", stacklevel=3)
             depth = at_size_of(image, depth)
         validation.image_and_depth(image, depth, values=check, name=name)
         changes = {"focus_m": focus_m, "f_number": f_number}

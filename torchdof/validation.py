@@ -29,6 +29,7 @@ __all__ = [
     "same_aspect",
     "show",
     "stack",
+    "stretch",
     "tolerance_of",
     "whole",
 ]
@@ -36,6 +37,8 @@ __all__ = [
 
 NAMED_TOLERANCES = {"draft": 8 / 255, "preview": 4 / 255, "final": 1 / 255}
 """For looking around, for judging a picture, and one that differs by less than a display shows."""
+
+_MOST_STRETCH = 0.03  # of a depth map: estimators work at multiples of 14 or 64 pixels
 
 WHOLE_NUMBERS = (
     *(torch.uint8, torch.uint16, torch.uint32, torch.uint64),
@@ -201,30 +204,36 @@ def is_resizable(image: Any, depth: Any) -> bool:
     maps = all(isinstance(t, Tensor) and t.ndim == 4 and t.is_floating_point() and t.numel() for t in (image, depth))
     if not maps or image.shape[-2:] == depth.shape[-2:] or image.device != depth.device:
         return False
-    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and _is_same_aspect(image, depth)
+    return depth.shape[0] in (1, image.shape[0]) and depth.shape[1] == 1 and stretch(image, depth) <= _MOST_STRETCH
 
 
-def _is_same_aspect(image: Tensor, depth: Tensor) -> bool:
-    """Whether two aspect ratios differ by less than a pixel of the smaller of the two."""
+def stretch(image: Tensor, depth: Tensor) -> float:
+    """By which part a depth map is stretched along one axis to the shape of an image; 0 for less than a pixel.
+
+    Example:
+        >>> round(stretch(torch.rand(1, 3, 1080, 1920), torch.rand(1, 1, 294, 518)), 4)  # multiples of 14
+        0.009
+    """
     (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-    return abs(rows * width - height * columns) < max(width, columns)
+    across, down = height * columns, width * rows
+    return abs(across - down) / min(across, down) if abs(across - down) >= max(width, columns) else 0.0
 
 
 def same_aspect(image: Tensor, depth: Tensor) -> None:
     """Refuse a depth map that cannot show what an image ``[..., H, W]`` of another size shows.
 
     Raises:
-        ValueError: If the aspect ratios differ by a pixel or more of the smaller of the two.
+        ValueError: If the aspect ratios differ by more than 3 %.
     """
-    if 0 in depth.shape or not _is_same_aspect(image, depth):
+    if 0 in depth.shape or stretch(image, depth) > _MOST_STRETCH:
         (height, width), (rows, columns) = image.shape[-2:], depth.shape[-2:]
-        if 0 not in depth.shape and _is_same_aspect(image, depth.transpose(-1, -2)):
+        if 0 not in depth.shape and stretch(image, depth.transpose(-1, -2)) <= _MOST_STRETCH:
             hint = "turned by 90 degrees it fits: one of the two lies on its side"
         else:
             hint = "crop one of the two, so that both show the same"
         raise ValueError(
             f"depth is {columns} x {rows} pixels and the image {width} x {height}: a depth map may have another size, "
-            f"but must have the same aspect ratio; {hint}"
+            f"but must have the same aspect ratio, to within 3 %; {hint}"
         )
 
 

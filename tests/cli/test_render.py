@@ -358,3 +358,10 @@ def test_a_phones_photograph_is_rendered_as_it_is_seen(run: Run, image: Tensor, 
     torch.testing.assert_close(out.pixels[..., 16:, :], seen[..., 16:, :], rtol=0.0, atol=0.01)  # in focus
     said = run(f"render phone.png depth.npy -o out.png --focus-m 2 {LENS}", code=2)
     assert "turned by 90 degrees it fits" in said
+
+
+def test_depth_of_nearly_the_shape_is_stretched_and_said_so(run: Run, image: Tensor, depth: Tensor) -> None:
+    write_image("large.exr", Picture(torch.nn.functional.interpolate(image, (64, 96)), sample="float"))
+    np.save("near.npy", torch.nn.functional.interpolate(depth, (132, 194), mode="nearest").numpy())
+    said = run(f"render large.exr near.npy -o out.exr --focus-m 2 {LENS}")
+    assert "depth stretched by 2.1%" in said and "96 x 64" in said

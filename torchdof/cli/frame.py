@@ -23,7 +23,7 @@ from ..optics.blur_table import BlurTable
 from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
-from ..validation import coc_of_lens, same_aspect
+from ..validation import coc_of_lens, same_aspect, stretch
 from .options import Scene, pick_device, refuse_input
 from .printed import Bar, WarnOnce, tell
 
@@ -45,6 +45,7 @@ class Frame:
     values: Tensor  # [1, 1, H, W], depth in metres, or signed pixels for coc
     holes: int  # pixels that were filled
     seconds: float
+    stretch: float  # by which part the depth was stretched along one axis to the shape of the image
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
@@ -54,14 +55,14 @@ def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = Fals
     """
     start, name, fill = time.perf_counter(), str(depth or image), scene.depth_map.fill_depth
     picture, filled = read_image(image, **encoding), 0
-    values = _metres(image, depth, picture, scene)
+    values, stretched = _metres(image, depth, picture, scene)
     if fill is not None or not holes:
         values, filled = resolve_holes(values, name, fill)  # type: ignore[arg-type]
-    return Frame(name, picture, values, filled, time.perf_counter() - start)
+    return Frame(name, picture, values, filled, time.perf_counter() - start, stretched)
 
 
-def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> Tensor:
-    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes."""
+def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> tuple[Tensor, float]:
+    """Depth in metres (signed pixels for coc), ``[1, 1, H, W]`` of the image's size, NaN in holes; its stretch."""
     said, name, pixels = scene.depth_map, str(depth or image), picture.pixels
     kind = said.depth_kind
     if depth is not None or said.depth_channel is not None:
@@ -75,10 +76,11 @@ def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> 
         raise ValueError(f"{name}: coc is {sizes[0]} pixels but the image is {sizes[1]}; they must be the same")
     try:
         same_aspect(pixels, values)
+        stretched = stretch(pixels, values)
         if kind == "relative":
             ends, relative = (said.near_m or 0.0, said.far_m or 0.0), said.relative_kind or "disparity"
             values = from_relative(values, *ends, relative, value_range=said.value_range, unknown=said.depth_unknown)
-            return at_size_of(pixels, values)
+            return at_size_of(pixels, values), stretched
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
     height, width = pixels.shape[-2:]
@@ -86,7 +88,7 @@ def _metres(image: Path, depth: Path | None, picture: Picture, scene: Scene) -> 
     metres = depth_from_values(
         values, kind, scale=said.depth_scale, offset=said.depth_offset, unknown=said.depth_unknown, fov_x_deg=view_deg
     )
-    return metres if kind == "coc" else at_size_of(pixels, metres)
+    return (metres if kind == "coc" else at_size_of(pixels, metres)), stretched
 
 
 def coc_of(
@@ -102,6 +104,7 @@ def coc_of(
         warned.warn(frame.name, coc_mistakes(values))
         return values, None, []
     camera, remarks = scene.lens.camera(frame.picture.metadata, values, number, median)
+    remarks += [f"depth stretched by {frame.stretch:.1%}"] * (frame.stretch > 0)
     coc_px = camera.coc_px(values, values.shape[-1])
     coc_of_lens(coc_px, values, scene.lens.stated(camera))
     warned.warn(frame.name, depth_mistakes(values, camera, said.depth_kind, said.depth_scale))

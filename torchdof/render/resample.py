@@ -15,16 +15,16 @@ def at_size_of(image: Tensor, depth: Tensor) -> Tensor:
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        depth: ``[B, 1, h, w]`` or ``[1, 1, h, w]``, metres, ``inf`` allowed, of the image's field of view. Pixels
-            without depth (NaN, zero or negative) stay without it and touch no other.
+        depth: ``[B, 1, h, w]`` or ``[1, 1, h, w]``, metres, ``inf`` allowed, of the image's field of view. One whose
+            aspect ratio is off by up to 3 % is stretched. Pixels without depth (NaN, zero or negative) stay without it
+            and touch no other.
 
     Returns:
         ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres; a map that has the image's size as it is. Gradients flow to the
         depth but where an edge was repaired.
 
     Raises:
-        ValueError: If the shapes are not as described, or the aspect ratios differ by a pixel or more of the smaller of
-            the two.
+        ValueError: If the shapes are not as described, or the aspect ratios differ by more than 3 %.
 
     Example:
         >>> at_size_of(torch.rand(1, 3, 8, 12), torch.full((1, 1, 4, 6), 2.0)).shape
