@@ -15,6 +15,7 @@ from tests.scenes import WAYS, disc
 from tests.tolerances import TOLERANCES
 from torchdof import BlurTable, Camera, DepthOfField, blur_by_coc, depth_of_field
 from torchdof.render.border import continued
+from torchdof.render.layer_weights import blur_axis
 from torchdof.render.plan import Plan
 
 TYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
@@ -168,7 +169,8 @@ def test_the_plain_sum_keeps_all_light_at_any_depths() -> None:
 
 def wider(image: Tensor, coc: Tensor, beyond: int) -> tuple[Tensor, Tensor]:
     """An image and its coc with so many pixels on each side."""
-    return continued(image, None, None, (beyond,) * 4, beyond), functional.pad(coc, (beyond,) * 4, mode="replicate")
+    light = continued(image, None, None, (beyond,) * 4, beyond, blur_axis(coc))
+    return light, functional.pad(coc, (beyond,) * 4, mode="replicate")
 
 
 @pytest.mark.parametrize("normalize", [True, False])

@@ -83,9 +83,7 @@ def read_frame(
     if white is not None:
         pixels[high] = white
         light[high.any(axis=0)] = white  # one clipped colour clips the mean
-    facts = camera_facts(picture.metadata, width)
-    if height > width and "sensor_width_mm" in facts:  # turned upright: EXIF speaks of the longer side
-        facts["sensor_width_mm"] *= width / height
+    facts = camera_facts(picture.metadata, width, height)
     return Frame(
         file=path,
         light=light,

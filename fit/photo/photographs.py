@@ -111,11 +111,11 @@ def read_photographs(
         except FitError as error:
             advice.append(f"{path.name}: left out, {str(error).split(': ', 1)[1]}")
             continue
-        width = light.shape[1]
+        height, width = light.shape
         if pictures and width != pictures[0].light.shape[1]:
             text = f"is {width} px wide, the others {pictures[0].light.shape[1]}: all from one camera"
             raise FitError(text, file=str(path))
-        facts = facts or camera_facts(picture.metadata, width)
+        facts = facts or camera_facts(picture.metadata, width, height)
         whole = picture.sample in ("8", "16")
         integers = integers and whole
         clipped = whole and target.white > 0.98

@@ -347,7 +347,7 @@ def test_a_phones_photograph_is_rendered_as_it_is_seen(run: Run, image: Tensor, 
     spec.attribute("Orientation", 6)
     stored = (255 * image[0].permute(1, 2, 0)).byte().contiguous().numpy()
     output = oiio.ImageOutput.create("phone.png")
-    assert output.open("phone.png", spec) and output.write_image(stored) and output.close()
+    assert output is not None and output.open("phone.png", spec) and output.write_image(stored) and output.close()
     upright = torch.rot90(depth, -1, (-2, -1))  # 24 rows of 16, 2 m above and 6 m below
     np.save("upright.npy", upright.numpy())
     line = run(f"render phone.png upright.npy -o out.png --focus-at 8,20 {LENS}")

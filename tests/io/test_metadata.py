@@ -71,7 +71,7 @@ def test_a_picture_is_read_as_it_is_seen_and_written_upright(orientation: int, s
         spec.attribute(name, value)
     path, copy = str(tmp_path / f"stored{suffix}"), str(tmp_path / f"copy{suffix}")
     output = oiio.ImageOutput.create(path)
-    assert output.open(path, spec) and output.write_image(stored) and output.close()
+    assert output is not None and output.open(path, spec) and output.write_image(stored) and output.close()
 
     picture = read_image(path)
     seen = np.zeros((16, 24) if orientation < 5 else (24, 16), bool)

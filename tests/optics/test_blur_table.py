@@ -424,3 +424,10 @@ def test_steep_tilts_have_kernels_at_any_blur(m: float, sigma: float, coc: float
     kernels = table.kernels(torch.tensor([coc, -coc]), 640)
     assert torch.isfinite(kernels).all() and float(kernels.min()) >= 0
     assert torch.allclose(kernels.sum((-2, -1)), torch.ones(1, dtype=torch.float64))
+
+
+def test_a_number_that_requires_a_gradient_is_a_number() -> None:
+    sigma = torch.tensor(0.5, requires_grad=True)
+    table, same = BlurTable.gaussian(sigma), BlurTable.gaussian(0.5)  # type: ignore[arg-type]
+    coc = torch.tensor([3.0], dtype=torch.float64)
+    assert torch.equal(table.kernels(coc, 10), same.kernels(coc, 10))

@@ -637,6 +637,8 @@ class BlurTable:
 
 def _numbers(name: str, value: Any) -> Tensor:
     """Finite numbers as a float64 tensor on the CPU, or a refusal by name."""
+    if isinstance(value, list | tuple):
+        value = [each.detach() if isinstance(each, Tensor) else each for each in value]
     try:
         numbers = torch.as_tensor(value)
         if not (floating(numbers) or numbers.dtype in WHOLE_NUMBERS) or numbers.layout != torch.strided:
