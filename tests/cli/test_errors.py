@@ -30,7 +30,7 @@ shot.####.exr depth.npy --focus-m 2 -o o.#.exr --frames 5-2   | --frames must no
 shot.%099999999d.exr depth.npy --focus-m 2            | must have at most 18 digits
 image.exr depth.npy --focus-m 2 -o ./image.exr        | is one of the inputs
 image.exr depth.npy --focus-m 2 -o depth.npy          | depth.npy: is one of the inputs
-image.exr depth.npy --focus-m 2 -o nowhere/out.exr    | there is no folder
+image.exr depth.npy --focus-m 2 -o depth.npy/out.exr  | its folder cannot be made
 image.exr depth.npy --focus-m 2 -o out.gif            | cannot write files of type '.gif'
 image.exr depth.npy                                   | where is the focus? give --focus-m METRES or --focus-at X,Y
 image.exr depth.npy --focus-m near                    | --focus-m expects metres (2.0) or keyframes

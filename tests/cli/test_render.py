@@ -365,3 +365,10 @@ def test_depth_of_nearly_the_shape_is_stretched_and_said_so(run: Run, image: Ten
     np.save("near.npy", torch.nn.functional.interpolate(depth, (132, 194), mode="nearest").numpy())
     said = run(f"render large.exr near.npy -o out.exr --focus-m 2 {LENS}")
     assert "depth stretched by 2.1%" in said and "96 x 64" in said
+
+
+def test_the_folder_of_the_output_is_made(run: Run) -> None:
+    run(f"render image.exr depth.npy -o new/folder/out.exr --focus-m 2 {LENS}")
+    assert read_image("new/folder/out.exr").pixels.shape[-1] == 24
+    run(f"inspect image.exr depth.npy -o other/sheet.png --focus-m 2 {LENS}")
+    assert Path("other/sheet.png").is_file()

@@ -24,7 +24,7 @@ from ..optics.camera import CAMERA_NUMBERS, Camera
 from ..options import Options
 from ..render.resample import at_size_of
 from ..validation import coc_of_lens, same_aspect, stretch
-from .options import Scene, pick_device, refuse_input
+from .options import Scene, make_folder_of, pick_device, refuse_input
 from .printed import Bar, WarnOnce, tell
 
 if TYPE_CHECKING:
@@ -46,6 +46,11 @@ class Frame:
     holes: int  # pixels that were filled
     seconds: float
     stretch: float  # by which part the depth was stretched along one axis to the shape of the image
+
+    @property
+    def remarks(self) -> list[str]:
+        """What was done to the depth that nobody asked for."""
+        return [f"depth stretched by {self.stretch:.1%}"] if self.stretch else []
 
 
 def read_frame(image: Path, depth: Path | None, scene: Scene, holes: bool = False, **encoding: Any) -> Frame:
@@ -104,7 +109,7 @@ def coc_of(
         warned.warn(frame.name, coc_mistakes(values))
         return values, None, []
     camera, remarks = scene.lens.camera(frame.picture.metadata, values, number, median)
-    remarks += [f"depth stretched by {frame.stretch:.1%}"] * (frame.stretch > 0)
+    remarks += frame.remarks
     coc_px = camera.coc_px(values, values.shape[-1])
     coc_of_lens(coc_px, values, scene.lens.stated(camera))
     warned.warn(frame.name, depth_mistakes(values, camera, said.depth_kind, said.depth_scale))
@@ -169,6 +174,7 @@ class Renderer:
     def write(self, rendered: Rendered) -> None:
         """Writes the picture, whole or not at all, and prints one line."""
         start, files, out = time.perf_counter(), self.command.files, str(rendered.out)
+        make_folder_of(rendered.out)
         write_image(rendered.out, rendered.picture, files.out_transfer, files.bits)
         seconds = rendered.seconds + time.perf_counter() - start
         facts = {"out": out, **rendered.facts, "seconds": seconds}

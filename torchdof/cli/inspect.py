@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from .command import argument, option
-from .options import Scene, json_option, refuse_input
+from .options import Scene, json_option, make_folder_of, refuse_input
 from .printed import WarnOnce, tell
 
 __all__ = ["Inspect"]
@@ -48,7 +48,9 @@ class Inspect:
         if not bool((metres > 0).any()):
             raise ValueError(f"{frame.name}: no pixel has a depth; check the kind, scale and offset of the depth map")
         camera, notes = self.scene.lens.camera(frame.picture.metadata, metres, median=True)
+        notes += frame.remarks
         report = inspect_depth(light, metres, camera)
+        make_folder_of(target)
         write_sheet(target, panels(light, report))
         height, width = metres.shape[-2:]
         lines = [f"image         {width} x {height} px, {', '.join(frame.picture.channels)}"]

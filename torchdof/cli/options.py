@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..optics.camera import Camera
 
 __all__ = ["Accuracy", "Blur", "DepthMap", "Lens", "Opening", "Scene", "Sensor"]
-__all__ += ["edges_option", "json_option", "pick_device", "refuse_input"]
+__all__ += ["edges_option", "json_option", "pick_device", "make_folder_of", "refuse_input"]
 
 _ASSUMED = {"focal_length_mm": 50.0, "f_number": 2.8, "sensor_width_mm": 36.0}
 _SPELLED = {"focus_range_m": "--focus-range", "tilt_deg": "--tilt", "swing_deg": "--swing", "fov_x_deg": "--fov-deg"}
@@ -331,6 +331,18 @@ def _by_option(names: Mapping[str, str]) -> Iterator[None]:
     except ValueError as error:
         pattern = re.compile(r"\b(" + "|".join(names) + r")\b")
         raise ValueError(pattern.sub(lambda found: names[found.group()], str(error))) from None
+
+
+def make_folder_of(path: Path) -> None:
+    """The folder in which a file is to be written, made where it is missing.
+
+    Raises:
+        OSError: If it cannot be made.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{path}: its folder cannot be made ({error.strerror})") from None
 
 
 def refuse_input(out: Path, *sources: Path | None) -> None:
