@@ -63,6 +63,9 @@ def read_frame(
         if len(pixels) != 1:
             text = f"bayer = {bayer!r} is for pictures with one colour a pixel, got {len(pixels)} colours"
             raise FitError(text, "manifest", file=str(path))
+        if picture.orientation != 1:
+            text = f"bayer = {bayer!r} is for pictures as the sensor is read, got one of EXIF orientation "
+            raise FitError(f"{text}{picture.orientation}; remove the tag", "manifest", file=str(path))
         pixels = demosaiced(pixels[0], bayer)
     height, width = pixels.shape[1:]
     left, top, columns, rows = crop or (0, 0, width, height)

@@ -79,6 +79,7 @@ def test_a_picture_is_read_as_it_is_seen_and_written_upright(orientation: int, s
         for c in range(8, 16):
             seen[SEEN[orientation](r, c, height, width)] = True
     assert np.array_equal(picture.pixels[0, 0].numpy() > 0.5, seen)
+    assert picture.orientation == orientation
     assert np.array_equal(read_values(path)[0, 0].numpy() > 127, seen)
 
     write_image(copy, picture)

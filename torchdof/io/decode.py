@@ -44,6 +44,7 @@ class Part:
     straight_alpha: bool = False  # colour is not multiplied by alpha yet
     metadata: Metadata = dataclasses.field(default_factory=dict)
     window: tuple[int, int, int, int, int, int] | None = None  # x, y, full x, full y, full width, full height
+    orientation: int = 1  # EXIF's, as stored; the values are turned by it
 
 
 def existing(path: str | os.PathLike[str], suffixes: tuple[str, ...], what: str) -> Path:
@@ -119,6 +120,7 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
                 names = tuple(("Y", "YA", "RGB", "RGBA")[len(names) - 1])
             values, metadata = values.reshape(spec.height, spec.width, len(names)), kept_metadata(spec.extra_attribs)
             window = (spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height)
+            orientation = 1 if is_exr else spec.get_int_attribute("Orientation", 1)
             if not is_exr:
                 values, metadata = upright(values, metadata)
             yield Part(
@@ -130,6 +132,7 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
                 straight_alpha=bool(spec.get_int_attribute("oiio:UnassociatedAlpha")),
                 metadata=metadata,
                 window=window if values.shape[:2] == (spec.height, spec.width) else None,
+                orientation=orientation,
             )
             number += 1
     finally:

@@ -54,6 +54,7 @@ class Picture:
         sample: What a pixel was stored as: "8", "16", "half" or "float".
         transfer: How the file was encoded, "linear" or "srgb".
         window: Where the pixels lie in the full frame (EXR data window): x, y, full x, full y, full width, full height.
+        orientation: The file's EXIF orientation, by which the pixels are turned already.
     """
 
     pixels: Tensor
@@ -63,6 +64,7 @@ class Picture:
     sample: PixelType = "float"
     transfer: Transfer = "linear"
     window: tuple[int, int, int, int, int, int] | None = None
+    orientation: int = 1
 
     @property
     def has_alpha(self) -> bool:
@@ -120,7 +122,7 @@ def read_image(path: str | os.PathLike[str], transfer: Transfer | None = None, l
         depth_place = depth_channel([(p.label, p.names) for p in same_size])
         if depth_place is not None:
             depth = _map(same_size[depth_place[0]].values[..., depth_place[1]])
-    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window)
+    return Picture(pixels, names, depth, source.metadata, sample, transfer, source.window, source.orientation)
 
 
 @contextlib.contextmanager

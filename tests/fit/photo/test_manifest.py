@@ -1,10 +1,14 @@
 """Folders of photographs: reading, windows, and every refusal with its file and number."""
 
+from pathlib import Path
+
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 
 from torchdof.fit import Capture, Captures, FitError, FitWarning, fit_pair, read_captures
+from torchdof.fit.photo.frame import read_frame
 from torchdof.io.images import Picture, read_image, write_image
 
 
@@ -169,3 +173,14 @@ def test_captures_from_arrays_are_checked():
     ):
         with pytest.raises(FitError, match=match):
             Captures(pairs, focus_m=0.5, width_px=100, **more)
+
+
+def test_a_mosaic_that_a_tag_turns_is_refused(tmp_path: Path) -> None:
+    """Turned, its upper left pixels would have other colours."""
+    spec = oiio.ImageSpec(8, 6, 1, "uint16")
+    spec.attribute("Orientation", 6)
+    output = oiio.ImageOutput.create(str(tmp_path / "mosaic.tif"))
+    assert output is not None and output.open(str(tmp_path / "mosaic.tif"), spec)
+    assert output.write_image(np.ones((6, 8, 1), np.uint16)) and output.close()
+    with pytest.raises(FitError, match="got one of EXIF orientation 6; remove the tag"):
+        read_frame(tmp_path / "mosaic.tif", "linear", bayer="RGGB")
