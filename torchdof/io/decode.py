@@ -120,8 +120,9 @@ def _parts(path: Path, name: str) -> Iterator[Part]:
                 names = tuple(("Y", "YA", "RGB", "RGBA")[len(names) - 1])
             values, metadata = values.reshape(spec.height, spec.width, len(names)), kept_metadata(spec.extra_attribs)
             window = (spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height)
-            orientation = 1 if is_exr else spec.get_int_attribute("Orientation", 1)
+            orientation = 1
             if not is_exr:
+                orientation = spec.get_int_attribute("Orientation", 1)
                 values, metadata = upright(values, metadata)
             yield Part(
                 label=spec.get_string_attribute("name"),

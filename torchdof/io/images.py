@@ -239,7 +239,7 @@ def write_image(
             if suffix == ".exr" and value in _LOSSLESS_EXR:
                 spec.attribute(name, value)
         elif name != "ICCProfile" or transfer == picture.transfer:
-            if isinstance(value, int):  # OpenImageIO passes over one of 16 bits that is said to be so
+            if isinstance(value, int):  # OpenImageIO drops an integer given with a 16-bit type
                 spec.attribute(name, value)
             else:
                 spec.attribute(name, kind, value)

@@ -1,4 +1,4 @@
-"""Metadata of an image file: what a copy keeps, which way up it is, and what it says about the camera."""
+"""Metadata of an image file: tags that a copy keeps, orientation, and facts about the camera."""
 
 import math
 from collections.abc import Iterable, Mapping

@@ -516,7 +516,7 @@ def _pointers(tensors: Sequence[Tensor | None]) -> Any:
 
 @functools.lru_cache(maxsize=1024)
 def _array(kind: Any, count: int) -> Any:
-    """The type of so many numbers. To make one takes 20 microseconds, and ctypes forgets it at once."""
+    """Array type of ``count`` elements, cached: making one takes 20 microseconds, and ctypes does not keep it."""
     return kind * count
 
 

@@ -22,8 +22,8 @@ from torch import Tensor
 __all__ = ["continued"]
 
 _WIDTH = 4  # the mean reaches so many times as far to each side as the place lies beyond the border
-_BINS = 16  # more of them tell more surfaces apart
-_STEP = 0.5  # difference on the blur axis of neighbours on one surface at most; from twice as much on it is a step
+_BINS = 16  # number of bins; a larger one separates more surfaces
+_STEP = 0.5  # largest difference of neighbours on one surface, on the blur axis; twice that is a whole step
 
 
 def continued(

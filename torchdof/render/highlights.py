@@ -42,7 +42,7 @@ _CELL = 11  # of them over which it is decided
 _LEAST_PX = 1.0  # blur from which on there are rays
 _WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, what counts of its rays
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
-_FREE_CHANGE_PX = 1.6  # change of the coc from pixel to pixel, across and down, from which on fewer are affordable
+_FREE_CHANGE_PX = 1.6  # mean change of the coc between neighbours, in pixels, above which fewer rays are affordable
 _TAPS = 2**21  # rays splatted together
 
 

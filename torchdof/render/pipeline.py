@@ -143,7 +143,7 @@ def _render_item(
         stack = [Surface(light[:, i], coc[:, i], cover[:, i]) for i in range(light.shape[1])]
         # what no layer covers is seen through all of them
         stack.append(Surface(torch.zeros_like(light[:, 0]), torch.full_like(coc[:, 0], high)))
-        return _composite(stack, None, plan, options, ops, stacked=True, image=None)
+        return _composite(stack, None, plan, options, ops, image=None)
     if plan.nodes == (0.0,):
         # in focus: nothing changes, but whoever asks for the gradient of the coc is told that it is 0
         return light + 0.0 * torch.nan_to_num(coc) if is_differentiated(coc) else light.clone()
@@ -193,7 +193,7 @@ def _render_item(
 
     # and all of it in layers, each scattered, far to near
     own = 0 if behind_light is None else 1
-    out = _composite(surfaces, behind, plan, options, ops, own == 1, limit, splats, own)
+    out = _composite(surfaces, behind, plan, options, ops, own, limit, splats)
     out = out if has_room else out / scale
     out = out if valid is None else torch.where(valid, out, image)
     return ops.choose(lambda: blur_axis(coc).abs().max() > 0, out, image)
@@ -226,12 +226,11 @@ def _composite(
     plan: Plan,
     options: Options,
     ops: Ops,
-    stacked: bool,
+    image: int | None,
     limit: Tensor | None = None,
     splats: Tensor | None = None,
-    image: int | None = 0,
 ) -> Tensor:
-    """Surfaces, and the light of highlights, to a picture."""
+    """Surfaces, and the light of highlights, to a picture; ``image`` is the image's own surface, None of layers."""
     light, layered = surfaces[0].light, options.method == "layered"
     size = (light.shape[-2], light.shape[-1])
     blurs = plan.blurs(options.table, size, light.dtype, light.device, layered, ops.lens_width, ops.kernels)
@@ -239,7 +238,7 @@ def _composite(
     margin = -(-max(blur.halo for blur in blurs) // coarsest) * coarsest
     behind = None if behind is None else behind_pixels(behind, size)
     lit, multiple = options.occlusion or options.normalize, ops.align(margin, coarsest)
-    frame = framed(surfaces, behind, plan.nodes, margin, multiple, options.occlusion, stacked, lit, limit, image)
+    frame = framed(surfaces, behind, plan.nodes, margin, multiple, options.occlusion, image != 0, lit, limit, image)
     scatter = functools.partial(convolve, turned=not options.table.is_round) if layered else fold
 
     def scattered(frame: Frame) -> Tensor:

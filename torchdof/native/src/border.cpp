@@ -5,8 +5,8 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 
 constexpr int WIDTH = 4;  // the mean reaches so many times as far to each side as the place lies beyond the border
-constexpr int BINS = 16;  // more of them tell more surfaces apart
-constexpr double STEP = 0.5;  // difference on the blur axis of neighbours on one surface at most; from twice as much on it is a step
+constexpr int BINS = 16;  // number of bins; a larger one separates more surfaces
+constexpr double STEP = 0.5;  // largest difference of neighbours on one surface, on the blur axis; twice that is a whole step
 
 // A difference on the blur axis that is a step from one surface to another; 0 for that of a slope.
 static double step_of(double difference) { return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0); }
@@ -35,9 +35,9 @@ Border border_of(const Job &job, int farthest) {
     const int length = border.length(side), C = job.channels, sums = C + 1;
     const auto row_of = [&](int at) { return upright ? at : side == Border::TOP ? 0 : job.height - 1; };
     const auto column_of = [&](int at) { return !upright ? at : side == Border::LEFT ? 0 : job.width - 1; };
-    std::vector<double> until((size_t)(length + 1) * BINS * sums);  // in each bin sums of what comes before: weighted light, weight
+    std::vector<double> until((size_t)(length + 1) * BINS * sums);  // of each bin, sums over earlier pixels: weighted light, weight
     std::vector<int> bin(length);                                   // each pixel's, which shares it with the next one,
-    std::vector<double> part(length);                               // to such a part
+    std::vector<double> part(length);                               // by this part
     std::vector<double> image_x(length), surface(length);           // places on the blur axis; their steps, added up
     std::vector<const float *> light(C);
     const float *coc, *weight;

@@ -177,6 +177,9 @@ void Job::extract_highlights() {
       }
     }
   });
+  const bool any = std::any_of(bands.begin(), bands.end(), [](const std::vector<Candidate> &band) { return !band.empty(); });
+  const double crowd = any && scene.occlusion ? std::max(change_of_coc() / FREE_CHANGE_PX, 1.0) : 1.0;
+  const double budget = (double)TAPS_PER_PIXEL * area / crowd;
   for (int i = 0; i < count; i++) {
     std::vector<Candidate> all;
     for (int by = 0; by < surfaces.block_rows; by++) {
@@ -189,7 +192,6 @@ void Job::extract_highlights() {
       const double side = 2.0 * std::fabs(p.coc) + 1;
       return side * side * std::min(WHOLE * (1.0f - p.limit / p.peak) * fades(p), 1.0f);
     };
-    const double budget = (double)TAPS_PER_PIXEL * area / (scene.occlusion ? std::max(change_of_coc() / FREE_CHANGE_PX, 1.0) : 1.0);
     double taps_of_all = 0;
     for (const Candidate &p : all) taps_of_all += taps(p);
     if (taps_of_all > budget) {  // too many: the brightest of them, and only what they are brighter by
