@@ -30,8 +30,6 @@ class GraphOps(Ops):
         lens_width: Width in pixels of the image whose kernels these are, for a table with lengths.
     """
 
-    looks_everywhere = True
-
     def __init__(self, plan: Plan, table: BlurTable, layered: bool, lens_width: int | None) -> None:
         self.lens_width = lens_width
         self.kernels = plan.constants(table, layered, lens_width or 1)
@@ -46,16 +44,10 @@ class GraphOps(Ops):
         return by_parts(look, pixels)
 
     def seen(
-        self,
-        look: Callable[..., Seen],
-        levels: Sequence[Level],
-        coc_px: Tensor,
-        mask: Tensor,
-        step: int = 1,
-        farthest: bool = False,
+        self, look: Callable[[Sequence[Level], Tensor], Seen], levels: Sequence[Level], coc_px: Tensor, mask: Tensor
     ) -> Seen:
-        """Whole maps, tile by tile, instead of lists of pixels."""
-        return seen(levels, coc_px, mask, self, step, farthest)
+        """Tile by tile."""
+        return seen(levels, coc_px, mask, self)
 
     def splat(
         self,

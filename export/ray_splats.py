@@ -93,7 +93,7 @@ def hidden_of(
     cells: Floats,
     nearest: Floats,
 ) -> Floats:
-    """Share of each ray that nearer surfaces take, ``[m, k, k]``; as ``_Hiding`` of the plain engine."""
+    """Share of each ray that nearer surfaces take, ``[m, k, k]``; as ``_Occluders`` of the plain engine."""
     axis_1 = op.Constant(value_ints=[1])
     axis_2 = op.Constant(value_ints=[2])
     axes = op.Constant(value_ints=[1, 2])

@@ -8,12 +8,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as functional
 from torch import Tensor
 
 from torchdof import pixels
 from torchdof.optics.blur_table import BlurTable
-from torchdof.render.highlights import COARSE_CELL
+from torchdof.render.highlights import covered_cells
 from torchdof.render.plan import Plan
 from torchdof.render.surfaces import Highlights
 
@@ -104,25 +103,9 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
     if obstacles:
         places = [(coc - nearest, cover) for coc, cover in obstacles]
         maps = [torch.stack([t.flatten() for t in part], 1) for part in zip(*places, strict=True)]
-        maps.append(_covered_cells(places, bins))
+        maps.append(covered_cells(places, bins))
     else:  # in no bin is there anything
         maps = [coc_px.new_zeros(1, 1), coc_px.new_zeros(1, 1), coc_px.new_zeros(0, 1, 1, 1)]
     inputs = [blank, *lists, *lens, *sizes, *maps, nearest]
     splats = operator("splat", inputs, blank.shape)
     return splats.transpose(0, 1).narrow(-2, margin, height).narrow(-1, margin, width)
-
-
-def _covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:
-    """How many cells above and left of each show something in a bin: ``[bins, B, rows + 1, columns + 1]``."""
-    batch, _, height, width = places[0][0].shape
-    rows, columns = ((n + COARSE_CELL - 1) // COARSE_CELL for n in (height, width))
-    item, row, column = (torch.arange(n) for n in (batch, height, width))
-    cell = (item[:, None, None] * rows + row[:, None] // COARSE_CELL) * columns + column // COARSE_CELL
-    shown = places[0][0].new_zeros((bins + 2) * batch * rows * columns)
-    for place, cover in places:  # in the bins before and after it; what covers nothing, beyond all
-        before = torch.where(cover > 0, place, float(bins)).long()[:, 0]
-        for bin_of in (before, before + 1):
-            index = (bin_of * (batch * rows * columns) + cell).flatten()
-            shown = shown.scatter(0, index, torch.ones_like(place).flatten())
-    shown = shown.unflatten(0, (bins + 2, batch, rows, columns))[:bins]
-    return functional.pad(shown.cumsum(-1).cumsum(-2), (1, 0, 1, 0))

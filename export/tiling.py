@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from torchdof.render.disocclusion import BEHIND_PX, search
+from torchdof.render.disocclusion import BEHIND_PX, search, shown_behind
 from torchdof.render.ops import Level, Ops, Seen
 from torchdof.render.surfaces import Frame, Placed
 
@@ -56,40 +56,31 @@ def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> T
     return _joined(pieces, (batch, rows, columns))[..., : frame.size[0], : frame.size[1]]
 
 
-def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops, step: int, farthest: bool) -> Seen:
-    """What levels of a pyramid show behind the surfaces of a map, as :mod:`torchdof.render.disocclusion` looks for it.
+def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> Seen:
+    """What levels of a pyramid show behind the pixels of an image, as :mod:`torchdof.render.disocclusion` looks for it.
 
-    Behind cells it is looked for at once, behind pixels tile by tile, and only in those behind which there may be
-    something.
+    It is looked for tile by tile, and only in tiles that have pixels in the mask ``[B, 1, H, W]`` behind which there
+    may be something.
     """
-    zero, size = coc_px.new_zeros(()), (coc_px.shape[-2], coc_px.shape[-1])
-    if step > 1:  # cells and levels have one centre
-        around = [_around(level.values, level.step / step) for level in levels]
-        lists = [samples(v, size, lv.step / step, (zero, zero)) for v, lv in zip(around, levels, strict=True)]
-        shown, total = search(levels, lists, coc_px, farthest)
-        found = torch.cat([shown, total * mask], 1)
-        found = ops.choose(lambda: mask.any(), found, torch.zeros_like(found))
-        return found[:, :-1], found[:, -1:]
-
+    size = (coc_px.shape[-2], coc_px.shape[-1])
     whole = [levels[0].step * n for n in levels[0].values.shape[-2:]]  # both have one centre
     more = [(n + _SIDE - 1) // _SIDE * _SIDE - n for n in whole]  # below and right, to whole tiles
     top, left = ((w - n) // 2 for w, n in zip(whole, size, strict=True))
     halves = [torch.scalar_tensor((w - n) % 2, dtype=coc_px.dtype) for w, n in zip(whole, size, strict=True)]
     ends = [left, whole[1] + more[1] - size[1] - left, top, whole[0] + more[0] - size[0] - top]
-    looking = functional.pad(torch.cat([coc_px, mask.to(coc_px.dtype)], 1), ends, mode="replicate")
+    looking = functional.pad(torch.cat([coc_px, mask], 1), ends, mode="replicate")
     coc_px, mask = window(looking, _SIDE, 0).split(1, 1)
-    pieces = []
+    pieces, shown = [], []
     for level in levels:
         ends = [1, 1 + more[1] // level.step, 1, 1 + more[0] // level.step]
         values = window(functional.pad(level.values, ends, mode="replicate"), _SIDE // level.step, 1)
-        pieces.append(level._replace(values=values))
-    sizes = (_SIDE, _SIDE)
-    lists = [samples(level.values, sizes, float(level.step), (halves[0], halves[1])) for level in pieces]
-    shown, total = search(pieces, lists, coc_px, farthest)
-    found = torch.cat([shown, total * mask], 1)
+        pieces.append(values)
+        shown.append(shown_behind(*samples(values, (_SIDE, _SIDE), level.step, (halves[0], halves[1])), coc_px))
+    lights, weights = (torch.stack(parts, 1) for parts in zip(*shown, strict=True))
+    found = torch.cat(search(levels, lights, weights, coc_px), 1)
 
     def hides() -> Tensor:
-        most = torch.stack([level.values[:, -2].max() for level in pieces]).max()
+        most = torch.stack([values[:, -2].max() for values in pieces]).max()
         return (mask.max() > 0) & (most > coc_px.min() + (BEHIND_PX - 0.5))
 
     tile = ops.choose(hides, found, torch.zeros_like(found))
@@ -99,11 +90,6 @@ def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops, step: 
     # narrowed, not sliced: so tracing knows the sizes of what is left
     maps = _joined(tiles, (batch, rows, columns)).narrow(-2, top, size[0]).narrow(-1, left, size[1])
     return maps[:, :-1], maps[:, -1:]
-
-
-def _around(values: Tensor, ratio: float) -> Tensor:
-    """A level of a pyramid with the samples around all pixels of a map that are at every so many of its own."""
-    return values if ratio <= 1 else functional.pad(values, (1, 1, 1, 1), mode="replicate")
 
 
 def _joined(tiles: Tensor, counts: tuple[int, int, int]) -> Tensor:

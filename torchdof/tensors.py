@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-__all__ = ["floating", "has_storage", "is_differentiated", "is_in_memory", "is_traced"]
+__all__ = ["floating", "has_storage", "is_differentiated", "is_fake", "is_in_memory", "is_traced"]
 
 _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 """Types of number that PyTorch computes with; of smaller ones it only stores."""
@@ -15,6 +15,11 @@ _FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 def is_traced() -> bool:
     """Whether this code is being compiled or exported: tensors then have no numbers that could be looked at."""
     return torch.compiler.is_compiling() or torch.compiler.is_exporting()
+
+
+def is_fake() -> bool:
+    """Whether new tensors have no memory, as under ``FakeTensorMode``."""
+    return torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.FAKE) is not None
 
 
 def is_differentiated(values: Tensor) -> bool:
@@ -36,8 +41,7 @@ def is_in_memory(values: Tensor) -> bool:
     """
     if values.device.type != "cpu" or torch._C._functorch.is_functorch_wrapped_tensor(values):
         return False
-    is_fake = torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.FAKE) is not None
-    return not is_fake and has_storage(values) and not is_differentiated(values)
+    return not is_fake() and has_storage(values) and not is_differentiated(values)
 
 
 def has_storage(values: Tensor) -> bool:

@@ -4,6 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
+from torch.testing import assert_close
 
 from torchdof.render.composite import over
 from torchdof.render.convolution import convolve
@@ -114,3 +115,20 @@ def test_a_hole_between_all_layers_shows_what_is_behind_them(size: tuple[int, in
         frame = framed(surfaces, behind_pixels(cells, size), (0.0, 1.0), 0, 1, occlusion=True, stacked=False)
         shown = over(frame, blurs, convolve)
         torch.testing.assert_close(shown, 0.2 * cover + (1 - cover) * behind, rtol=0, atol=1e-6)
+
+
+def test_gradients_of_a_compiled_graph_are_those_of_eager_code() -> None:
+    image, coc = edge(0.7, near_px=-4.0, far_px=2.0)
+    limit = threshold(image)
+
+    def hidden_light(light: Tensor) -> Tensor:
+        (own, other), behind = surfaces_of_image(light, coc, None, limit, 3)
+        return torch.cat([own.light, other.light], 1).square().sum() + behind.square().sum()
+
+    gradients = []
+    for function in (hidden_light, torch.compile(hidden_light, backend="aot_eager", fullgraph=True)):
+        light = image.clone().requires_grad_()
+        function(light).backward()
+        gradients.append(light.grad)
+    assert gradients[0] is not None and float(gradients[0].abs().max()) > 0.0
+    assert_close(*gradients)

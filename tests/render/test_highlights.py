@@ -75,8 +75,8 @@ def test_a_ray_meets_every_nearer_surface_in_its_way(stretch: float, half: int) 
     others = torch.where(covers < 0.3, 0.9 - covers, HIDDEN_WEIGHT)  # what is hidden covers nothing
     nothing = torch.zeros_like(coc_px)
     shown = [Surface(nothing, coc_px, covers), Surface(nothing, other_px, others)]
-    hiding = highlights._Hiding(highlights._obstacles(shown))
-    hidden = hiding.hidden(torch.zeros_like(source), row, column, coc, step, 9.0 * stretch)
+    hiding = highlights._Occluders(highlights._obstacles(shown))
+    hidden = hiding.hidden(torch.zeros_like(source), row, column, coc, step)
 
     wanted = torch.zeros_like(hidden)
     for k in range(int(20 * stretch)):

@@ -1,17 +1,23 @@
 """What is computed once of a lens and kept: bounded by bytes, not by entries, for a kernel takes bytes or megabytes."""
 
+import functools
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["KernelCache"]
+from ..tensors import is_fake, is_traced
+
+__all__ = ["KernelCache", "kept"]
 
 _ENTRY_BYTES = 512  # of a key and what belongs to it
 
+_CONSTANT_BYTES = 16 * 2**20  # of all functions that are kept
+
+_Arguments = ParamSpec("_Arguments")
 _Key = TypeVar("_Key", bound=Hashable)
 Kept = TypeVar("Kept", Tensor, tuple[Tensor, ...], float)
 
@@ -75,3 +81,23 @@ def _unwrapped(made: Any) -> Any:
 def _bytes(made: Tensor | tuple[Tensor, ...] | float) -> int:
     tensors = made if isinstance(made, tuple) else (made,)
     return sum(t.untyped_storage().nbytes() for t in tensors if isinstance(t, Tensor))
+
+
+_CONSTANTS = KernelCache(_CONSTANT_BYTES)
+
+
+def kept(make: Callable[_Arguments, tuple[Tensor, ...]]) -> Callable[_Arguments, tuple[Tensor, ...]]:
+    """Keeps the tensors that a function makes of numbers alone: index tables and the like, the same in every frame.
+
+    In traced code, and under ``FakeTensorMode``, the function is called each time.
+    """
+    whole = torch.inference_mode(False)(make)  # what is kept must serve autograd as well
+
+    @functools.wraps(make)
+    def called(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> tuple[Tensor, ...]:
+        if is_traced() or is_fake():
+            return make(*args, **kwargs)
+        key = (make.__module__, make.__qualname__, args, tuple(sorted(kwargs.items())))
+        return _CONSTANTS.get(key, lambda: whole(*args, **kwargs))
+
+    return called

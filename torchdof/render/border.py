@@ -19,6 +19,8 @@ import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
+from ..optics.kernel_cache import kept
+
 __all__ = ["continued"]
 
 _WIDTH = 4  # the mean reaches so many times as far to each side as the place lies beyond the border
@@ -34,52 +36,50 @@ def continued(
     farthest: int,
     x: Tensor | None = None,
     image_x: Tensor | None = None,
+    surfaces: int = 1,
 ) -> Tensor:
-    """Light ``[B, C, H, W]`` of a surface with so many pixels more at the left, right, top and bottom.
+    """Adds pixels to light ``[B, C, H, W]`` at the left, right, top and bottom.
 
     Beyond a corner the continuations of the two rows that meet there are mixed by how far each goes.
 
     Args:
-        light: Of the surface.
-        weight: How much of each pixel it covers, ``[B, 1, H, W]``: the weight in means. None is 1.
-        limit: Largest light that is no highlight's, ``[B, 1, H, W]``: a highlight is nowhere else but in its place.
-            None: there are none.
+        light: Of one surface; or of several, one after the other along the batch, B items altogether.
+        weight: Share of each pixel that the surface covers, ``[B, 1, H, W]``: the weight in means. None is 1.
+        limit: Largest light of a pixel that is not a highlight, ``[B / surfaces, 1, H, W]``: highlights are not
+            continued. None: there are no highlights.
         ends: Pixels to add; in traced code they may be symbols.
         farthest: Number that none of them exceeds.
-        x: Place of its pixels on the blur axis, ``[B, 1, H, W]``; None: all of them are one surface.
-        image_x: The same of the image, of which this is one of two surfaces; None: it is the image's only one.
+        x: Place of the pixels on the blur axis, ``[B, 1, H, W]``; None: all of them are one surface.
+        image_x: The same of the image, ``[B / surfaces, 1, H, W]``; None: the image has the one surface.
+        surfaces: Number of surfaces.
     """
-    weight = torch.ones_like(light[:, :1]) if weight is None else weight
+    image = limit, image_x
+    rows, columns = (
+        _beyond(
+            *(None if map_ is None else _both(map_, dim, 1) for map_ in (light, weight, x)),
+            *(None if map_ is None else _both(map_, dim, surfaces) for map_ in image),
+            farthest,
+        )
+        for dim in (-2, -1)
+    )  # [2, B, C, farthest, W]: top and bottom; [2, B, C, farthest, H]: left and right
+    # the corners: the row's own continuation and the column's
+    outwards = torch.stack([rows[..., 0], rows[..., -1]], 1)[..., None]  # [top or bottom, left or right, ..., 1]
+    sideways = torch.stack([columns[..., 0], columns[..., -1]])[..., None, :]
+    far, across = _distances(rows, farthest)[:, None], _distances(rows, farthest)
+    corners = (outwards * far + sideways * across) / (far + across)
+    left, right, top, bottom = ends
+    before, after = columns[0, ..., :left, :], columns[1, ..., :right, :]
+    lines = [torch.cat([before.flip(-2).transpose(-1, -2), light, after.transpose(-1, -2)], -1)]
+    for side, count in ((0, top), (1, bottom)):
+        parts = (corners[side, 0, ..., :left].flip(-1), rows[side], corners[side, 1, ..., :right])
+        lines.append(torch.cat(parts, -1)[..., :count, :])
+    return torch.cat([lines[1].flip(-2), lines[0], lines[2]], -2)
 
-    def beyond(dim: int, index: int, reach: int) -> Tensor:
-        line = light.select(dim, index)
-        if limit is not None:
-            brightest, most = line.amax(1, keepdim=True), limit.select(dim, index)
-            is_bright = brightest > most
-            line = line * torch.where(is_bright, most / torch.where(is_bright, brightest, 1.0), 1.0)
-        bins = None
-        if x is not None:
-            places = x.select(dim, index)
-            bins = _bins(places, places if image_x is None else image_x.select(dim, index))
-        return _beyond(line, weight.select(dim, index), bins, reach, farthest)
 
-    left, right = (beyond(-1, index, reach) for index, reach in zip((0, -1), ends[:2], strict=True))  # [B, C, reach, H]
-    top, bottom = (beyond(-2, index, reach) for index, reach in zip((0, -1), ends[2:], strict=True))  # [B, C, reach, W]
-    rows = []
-    for above, index in ((top.flip(-2), 0), (light, None), (bottom, -1)):
-        sides = []
-        for side, column in ((left, 0), (right, -1)):
-            if index is None:
-                sides.append(side.transpose(-1, -2))
-                continue
-            # the corner: the row's own continuation and the column's
-            one, other = above[..., column, None], side[..., index][..., None, :]
-            far = _distances(above, above.shape[-2])[:, None]
-            far = far.flip(0) if index == 0 else far
-            across = _distances(above, side.shape[-2])
-            sides.append((one * far + other * across) / (far + across))
-        rows.append(torch.cat([sides[0].flip(-1), above, sides[1]], -1))
-    return torch.cat(rows, -2)
+def _both(values: Tensor, dim: int, times: int) -> Tensor:
+    """First and last line of maps ``[B, c, H, W]`` along an axis, several times: ``[2, times B, c, n]``."""
+    lines = torch.stack([values.select(dim, 0), values.select(dim, -1)])
+    return lines if times == 1 else lines.repeat(1, times, 1, 1)
 
 
 def _distances(like: Tensor, reach: int) -> Tensor:
@@ -88,14 +88,14 @@ def _distances(like: Tensor, reach: int) -> Tensor:
 
 
 def _bins(x: Tensor, image_x: Tensor) -> Tensor:
-    """Place of each pixel of a line among the bins less the bin, ``[B, bins, n]``, from the blur axis ``[B, 1, n]``."""
+    """Place of each pixel of a line among the bins less the bin, ``[..., 1, bins, n]``, from ``[..., 1, n]``."""
     x, image_x = x.double(), image_x.double()
     surface = functional.pad(_step(image_x.diff()).cumsum(-1), (1, 0))
     low, high = surface.amin(-1, keepdim=True), surface.amax(-1, keepdim=True)
     per_bin = (_BINS - 1) / (high - low).clamp_min(1.0)
     place = ((surface + _step(x - image_x) - low) * per_bin).clamp(0.0, _BINS - 1.0)
     bins = torch.arange(_BINS, device=x.device, dtype=x.dtype)[:, None]
-    return place - bins
+    return place.unsqueeze(-2) - bins
 
 
 def _step(difference: Tensor) -> Tensor:
@@ -103,29 +103,48 @@ def _step(difference: Tensor) -> Tensor:
     return difference * (difference.abs() / _STEP - 1.0).clamp(0.0, 1.0)
 
 
-def _beyond(line: Tensor, weight: Tensor, bins: Tensor | None, reach: int, farthest: int) -> Tensor:
-    """What follows on a line ``[B, C, n]`` at the border, nearest first: ``[B, C, reach, n]``.
+def _beyond(
+    line: Tensor, weight: Tensor | None, x: Tensor | None, most: Tensor | None, image_x: Tensor | None, farthest: int
+) -> Tensor:
+    """Continues lines ``[..., C, n]`` at the border by ``farthest`` pixels, nearest first: ``[..., C, farthest, n]``.
 
-    ``bins`` is what :func:`_bins` gives; None: all pixels lie in one bin.
+    The other arguments are lines of the maps that :func:`continued` has, ``[..., 1, n]``.
     """
+    if most is not None:
+        brightest = line.amax(-2, keepdim=True)
+        is_bright = brightest > most
+        line = line * torch.where(is_bright, most / torch.where(is_bright, brightest, 1.0), 1.0)
+    weight = torch.ones_like(line[..., :1, :]) if weight is None else weight
+    values = torch.cat([line * weight, weight], -2).double()[..., None, :]  # [..., C + 1, 1, n]
+    bins = None if x is None else _bins(x, x if image_x is None else image_x)
+    values = values if bins is None else values * (1.0 - bins.abs()).clamp_min(0.0)
+    sums = functional.pad(values.cumsum(-1), (1, 0))  # of the pixels before each
     # means for distances that are powers of two; between them linear
-    at = torch.arange(line.shape[-1], device=line.device)
-    values = torch.cat([line * weight, weight], 1).double()[:, :, None]  # [B, C + 1, 1, n]
-    values = values if bins is None else values * (1.0 - bins.abs()).clamp_min(0.0)[:, None]
-    sums = functional.pad(values.cumsum(-1), (1, 0))  # of what comes before
     levels = farthest.bit_length() + 1
-    half = torch.tensor([_WIDTH * 2**level for level in range(levels)], device=line.device)[:, None]
-    start, stop = (at - half).clamp_min(0), (at + (half + 1)).clamp_max(line.shape[-1])  # [levels, n]
-    window = sums.index_select(-1, stop.flatten()) - sums.index_select(-1, start.flatten())
-    window = window.unflatten(-1, (levels, -1))  # [B, C + 1, bins, levels, n]
+    start, stop, octave, part = _windows(line.shape[-1], farthest, levels, line.dtype, line.device)
+    window = (sums.index_select(-1, stop) - sums.index_select(-1, start)).unflatten(-1, (levels, -1))
     if bins is not None:  # those of its own surface, and of farther ones
-        window = window * (1.0 - bins).clamp(0.0, 1.0)[:, None, :, None]
-    window = window.sum(2)
-    total = window[:, -1:]
-    means = (window[:, :-1] / torch.where(total > 0, total, 1.0)).to(line.dtype)
-    distance = torch.arange(1, reach + 1, device=line.device)
-    powers = torch.tensor([2**level for level in range(1, levels)], device=line.device)
+        window = window * (1.0 - bins).clamp(0.0, 1.0).unsqueeze(-2)
+    window = window.sum(-3)  # [..., C + 1, levels, n]
+    total = window[..., -1:, :, :]
+    means = (window[..., :-1, :, :] / torch.where(total > 0, total, 1.0)).to(line.dtype)
+    mean = torch.lerp(means.index_select(-2, octave), means.index_select(-2, octave + 1), part)
+    return torch.lerp(line[..., None, :], mean, 0.5)
+
+
+@kept
+def _windows(
+    length: int, farthest: int, levels: int, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where the window of each pixel of a line starts and stops, ``[levels n]``; level l is that of 2^l pixels.
+
+    And for each distance up to the farthest the level before it ``[farthest]``, and its share of the way to the next
+    level ``[farthest, 1]``.
+    """
+    at = torch.arange(length, device=device)
+    half = torch.tensor([_WIDTH * 2**level for level in range(levels)], device=device)[:, None]
+    start, stop = (at - half).clamp_min(0), (at + (half + 1)).clamp_max(length)
+    distance = torch.arange(1, farthest + 1, device=device)
+    powers = torch.tensor([2**level for level in range(1, levels)], device=device)
     octave = (distance[:, None] >= powers).sum(1)
-    part = (distance / 2**octave - 1.0).to(line.dtype)[:, None]
-    mean = torch.lerp(means.index_select(2, octave), means.index_select(2, octave + 1), part)
-    return torch.lerp(line[:, :, None], mean, 0.5)
+    return start.flatten(), stop.flatten(), octave, (distance / 2**octave - 1.0).to(dtype)[:, None]

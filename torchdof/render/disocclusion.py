@@ -4,14 +4,14 @@ Where a foreground blurs, what is behind it shows through, and no pixel of the i
 with a weight so small that it speaks only where nothing visible does.
 """
 
-import functools
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterator, Sequence
 
 import torch
 import torch.nn.functional as functional
 from torch import Tensor
 
-from .. import pixels
+from ..optics.kernel_cache import kept
 from .downsampling import downsampled
 from .matting import NEVER_PX, attribute_emitters, matte
 from .ops import EAGER, Level, Ops, Seen
@@ -25,6 +25,7 @@ __all__ = [
     "behind_size",
     "fill_hidden",
     "search",
+    "shown_behind",
     "surfaces_of_image",
 ]
 
@@ -36,9 +37,6 @@ _CERTAIN = 0.01  # votes from which on a hidden sample has all of its weight, or
 
 BEHIND_STEP = 2**_FINE_LEVELS
 """Light behind both surfaces is known at every so many pixels, counted from the image's centre."""
-
-Samples = Iterable[tuple[Tensor, Tensor]]
-"""Samples around places, ``[P, C + 2]`` or maps ``[B, C + 2, h, w]``, and their shares of the linear mean of them."""
 
 
 def surfaces_of_image(
@@ -97,20 +95,44 @@ def behind_size(size: int, levels: int) -> int:
 
 
 def behind_pixels(behind: Tensor, size: tuple[int, int]) -> Tensor:
-    """The map of what lies behind both surfaces at the pixels of an image of that size: ``[B, C, H, W]``."""
+    """Interpolates the light behind both surfaces at the pixels of an image of ``size``: ``[B, C, H, W]``."""
     for dim, length in ((-1, size[1]), (-2, size[0])):
-        samples = behind.shape[dim]
-        place = _place(torch.arange(length, device=behind.device).to(behind.dtype), length, samples, BEHIND_STEP)
-        before = place.clamp(0, samples - 2).long()
-        part = (place - before).clamp(0.0, 1.0)
-        part = part[:, None] if dim == -2 else part
-        behind = torch.lerp(behind.index_select(dim, before), behind.index_select(dim, before + 1), part)
+        whole = behind.shape[dim] * BEHIND_STEP
+        samples, shares = _axis(length, 1, whole, (BEHIND_STEP,), behind.dtype, behind.device)
+        part = shares[0, 1, :, None] if dim == -2 else shares[0, 1]
+        before, after = behind.index_select(dim, samples[0]).chunk(2, dim)
+        behind = torch.lerp(before, after, part)
     return behind
 
 
-def _place(pixel: Tensor, size: int, samples: int, step: int) -> Tensor:
-    """Where pixels of an axis of the image lie on that of a map at every ``step``-th pixel. Both have one centre."""
-    return (pixel - _centre(size, pixel)) / step + _centre(samples, pixel)
+@kept
+def _axis(
+    length: int, step: int, whole: int, steps: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """For each place of an axis the samples before it and after it on levels of a pyramid, and the share of each.
+
+    The axis and those of the levels have one centre.
+
+    Args:
+        length: Number of places, n.
+        step: Distance of two places in pixels.
+        whole: Pixels that each level covers.
+        steps: Distance of two samples of each of the L levels in pixels.
+        dtype: Of the shares.
+        device: Of both results.
+
+    Returns:
+        Samples ``[L, 2 n]``, all those before first; shares of linear interpolation ``[L, 2, n]``.
+    """
+    place = torch.arange(length, device=device).to(dtype)
+    middle = torch.scalar_tensor(whole, dtype=dtype, device=device) / 2.0
+    distance = torch.tensor(steps, dtype=dtype, device=device)[:, None]
+    last = 2.0 * middle / distance - 1.0
+    place = ((place - _centre(length, place)) * step + middle) / distance - 0.5
+    place = torch.minimum(place.clamp_min(0.0), last)
+    before = torch.minimum(place.floor(), last - 1.0)
+    part, before = place - before, before.long()
+    return torch.cat([before, before + 1], 1), torch.stack([1.0 - part, part], 1)
 
 
 def _centre(size: int, like: Tensor) -> Tensor:
@@ -118,24 +140,25 @@ def _centre(size: int, like: Tensor) -> Tensor:
     return 0.5 * torch.scalar_tensor(size - 1, dtype=like.dtype, device=like.device)
 
 
-def _window(size: int, samples: int, step: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """The pixels that each sample of a map at every ``step``-th pixel covers, and how much: ``[samples, step + 1]``.
+@kept
+def _window(size: int, samples: int, step: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The pixels that each sample of a map at every ``step``-th pixel covers, ``[samples (step + 1)]``, and how much.
 
-    On an axis of odd size a sample covers half of its first and last pixel; of even size, none of the last, which is
-    named once more.
+    The shares are ``[samples, step + 1]``. On an axis of odd size a sample covers half of its first and last pixel; of
+    even size, all of its first and none of its last one, in whose place the one before it is named again.
     """
     twice = (size - 1) + 2 * step * torch.arange(samples, device=device) - step * (samples - 1)  # of the centre
     first, last = (twice - step + 1) // 2, (twice + step) // 2
     pixel = first[:, None] + torch.arange(step + 1, device=device)
     share = ((step + 1) / 2 - (pixel - twice[:, None] / 2).abs()).clamp(0.0, 1.0)
-    return torch.minimum(pixel, last[:, None]).clamp(0, size - 1), share
+    return torch.minimum(pixel, last[:, None]).clamp(0, size - 1).flatten(), share.to(dtype)
 
 
 def _largest(values: Tensor, height: int, width: int, step: int) -> Tensor:
     """Largest value of the pixels that each of ``height x width`` samples covers."""
     for dim, samples in ((-2, height), (-1, width)):
-        pixel, _ = _window(values.shape[dim], samples, step, values.device)
-        taken = values.index_select(dim, pixel.flatten()).unflatten(dim, (-1, step + 1))
+        pixel, _ = _window(values.shape[dim], samples, step, values.dtype, values.device)
+        taken = values.index_select(dim, pixel).unflatten(dim, (-1, step + 1))
         values = taken.amax(-1) if dim == -1 else taken.amax(-2)
     return values
 
@@ -175,7 +198,7 @@ def fill_hidden(
         The second sample, mixed or hidden: light, coc and weight (0 where there is none); and light behind both, at
         every :data:`BEHIND_STEP`-th pixel ``[B, C, h, w]``, for somewhat more than the image.
     """
-    height, width = coc_px.shape[-2:]
+    (height, width), colours = coc_px.shape[-2:], light.shape[1]
     whole = tuple(_continued(n, 2**levels) for n in (height, width))  # centred on the image, which goes on to its ends
 
     # the farther surface of each pixel, dimmed to no highlight
@@ -196,21 +219,25 @@ def fill_hidden(
     pyramid[_FINE_LEVELS - 1] = torch.where(weight > 0, light, mean), coc, weight
     searched = [Level(torch.cat(level, 1), 2**i, _FALL**i, _least_px(i)) for i, level in enumerate(pyramid, 1)]
 
-    # what coarse levels show behind cells is one level of such cells; and the farthest of all is behind both surfaces
-    size = (height, width)
-    wanted = (coc_px.abs() > 0.5) & (other_weight < HIDDEN_WEIGHT)
-    may_hide = wanted if ops.looks_everywhere else _may_hide(coc_px, [far_coc for _, far_coc, _ in pyramid])
+    # the farthest surface around each cell of 4 x 4 pixels is behind both surfaces; what the coarse levels show around
+    # the cells becomes one level, of the cells
     cell_rows, cell_columns = whole[0] // BEHIND_STEP, whole[1] // BEHIND_STEP
-    nearest = -_largest(-coc_px, cell_rows, cell_columns, BEHIND_STEP)
-    cells = torch.cat([may_hide, wanted], 1).to(coc_px.dtype)
-    cells = _largest(cells, cell_rows, cell_columns, BEHIND_STEP).amin(1, keepdim=True) > 0
-    look = functools.partial(ops.seen, functools.partial(_seen, size))
-    shown, total = look(searched, nearest, cells, step=BEHIND_STEP, farthest=True)
-    behind = torch.where(total > 0, shown[:, :-1], pyramid[_FINE_LEVELS - 1][0])
+    wanted = ((coc_px.abs() > 0.5) & (other_weight < HIDDEN_WEIGHT)).to(coc_px.dtype)
+    cells = _largest(torch.cat([-coc_px, wanted], 1), cell_rows, cell_columns, BEHIND_STEP)
+    nearest, is_wanted = -cells[:, :1], cells[:, 1:] > 0
+    samples, shares = zip(*_samples(searched, (cell_rows, cell_columns), BEHIND_STEP), strict=True)
+    shown = shown_behind(_in_pairs(torch.stack(samples, 1)), torch.stack(shares), nearest[:, None])
+    farthest = search(searched, *shown, nearest, farthest=True)
+    coarse: tuple[Tensor, ...] = ()
     if len(searched) > _FINE_LEVELS:
-        coarse = torch.cat(look(searched[_FINE_LEVELS:], nearest, cells, step=BEHIND_STEP), 1)
-        searched = [*searched[:_FINE_LEVELS], Level(coarse, BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)]
-    seen, total = look(searched, coc_px, may_hide & wanted)
+        coarse = search(searched[_FINE_LEVELS:], *(part[:, _FINE_LEVELS:] for part in shown), nearest)
+    looked = torch.cat([*farthest, *coarse], 1)
+    looked = ops.choose(lambda: is_wanted.any(), looked * is_wanted, torch.zeros_like(looked))
+    behind = torch.where(looked[:, colours + 1 : colours + 2] > 0, looked[:, :colours], pyramid[_FINE_LEVELS - 1][0])
+    if coarse:
+        of_cells = Level(looked[:, colours + 2 :], BEHIND_STEP, None, searched[_FINE_LEVELS].least_px)
+        searched = [*searched[:_FINE_LEVELS], of_cells]
+    seen, total = ops.seen(_seen, searched, coc_px, wanted)
 
     # each pixel behind which these levels show something gets it as its second sample, together with a surface that is
     # hardly mixed in: the more of that, the less of what is hidden
@@ -228,105 +255,133 @@ def _first_level(
     shares, ends = [], []
     for dim, samples in ((-1, width), (-2, height)):
         size = coc_px.shape[dim]
-        shares.append(_window(size, samples, 2, coc_px.device)[1].to(coc_px.dtype))
+        shares.append(_window(size, samples, 2, coc_px.dtype, coc_px.device)[1].t())
         before = (2 * samples - size + 1) // 2
         ends += [before, 2 * samples + 2 - size - before]
     values = functional.pad(torch.cat([light, coc_px, weight], 1), ends, mode="replicate")
     planes = [values[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]  # [B, C + 2, h + 1, w + 1]
-    around = []
-    for row in range(3):
-        for column in range(3):
-            plane = planes[row % 2 * 2 + column % 2]
-            plane = plane.narrow(-2, row // 2, height).narrow(-1, column // 2, width)
-            share = shares[1][:, row, None] * shares[0][:, column]
-            around.append((plane, share / 4.0))
-    # on an axis of even size the last of three has no share
-    farthest = torch.stack([torch.where(share > 0, v[:, -2:-1], -NEVER_PX) for v, share in around]).amax(0)
-    summed = values.new_zeros(())
-    for pixel, share in around:
-        counts = pixel[:, -1:] * (1.0 - _is_behind(farthest - pixel[:, -2:-1])) * share
-        summed = summed + torch.cat([pixel[:, :-1] * counts, counts], 1)
-    total = summed[:, -1:]
-    known = total.clamp_min(1e-9)
-    return summed[:, :-2] / known, torch.where(total > 0, summed[:, -2:-1] / known, -NEVER_PX), total
+    around = torch.stack(
+        [
+            planes[row % 2 * 2 + column % 2].narrow(-2, row // 2, height).narrow(-1, column // 2, width)
+            for row in range(3)
+            for column in range(3)
+        ],
+        2,
+    )  # [B, C + 2, 9, h, w]
+    share = (shares[1][:, None, :, None] * shares[0][:, None, :]).flatten(0, 1)
+    coc = around[:, -2:-1]
+    # on an axis of even size the last of three pixels has no share
+    farthest = torch.where(share > 0, coc, -NEVER_PX).amax(2, keepdim=True)
+    counts = around[:, -1:] * (1.0 - _is_behind(farthest - coc)) * (share / 4.0)
+    summed, total = (around[:, :-1] * counts).sum(2), counts.sum(2)
+    mean = summed / total.clamp_min(1e-9)
+    return mean[:, :-1], torch.where(total > 0, mean[:, -1:], -NEVER_PX), total
 
 
 def _farthest(light: Tensor, coc_px: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """One step of the pyramid: of each four children, the mean of those that are farthest."""
     farthest = functional.interpolate(functional.max_pool2d(coc_px, 2), scale_factor=2.0, mode="nearest")
     counts = weight * (1.0 - _is_behind(farthest - coc_px))
-    total = downsampled(counts, 2)
-    known = total.clamp_min(1e-9)
-    coc_px = torch.where(total > 0, downsampled(coc_px * counts, 2) / known, -NEVER_PX)
-    return downsampled(light * counts, 2) / known, coc_px, total
+    means = downsampled(torch.cat([light * counts, coc_px * counts, counts], 1), 2)
+    total = means[:, -1:]
+    means = means[:, :-1] / total.clamp_min(1e-9)
+    return means[:, :-1], torch.where(total > 0, means[:, -1:], -NEVER_PX), total
 
 
-def _may_hide(coc_px: Tensor, farthest: list[Tensor]) -> Tensor:
-    """Pixels for which the coc of a level of the pyramid that they look at may be farther; none too few."""
-    near, (height, width) = coc_px.detach(), coc_px.shape[-2:]
-    may_hide = torch.zeros_like(near, dtype=torch.bool)
-    for level, coc in enumerate(farthest, 1):
-        around = functional.max_pool2d(coc.detach(), 5, stride=1, padding=2)  # a cell's centre lies up to 2 px away
-        for dim, size in ((-2, height), (-1, width)):
-            samples = around.shape[dim]
-            place = _place(torch.arange(size, device=near.device).to(near.dtype), size, samples, 2**level)
-            around = around.index_select(dim, place.round().clamp(0, samples - 1).long())
-        may_hide = may_hide | ((around > near + (BEHIND_PX - 0.5)) & (near.abs() > _least_px(level)))
-    return may_hide
+def _seen(levels: Sequence[Level], coc_px: Tensor) -> Seen:
+    """What levels show behind the surfaces of an image: light and coc ``[B, C + 1, H, W]``, and the sum of votes."""
+    size = (coc_px.shape[-2], coc_px.shape[-1])
+    shown = [shown_behind(_in_pairs(values), share, coc_px) for values, share in _samples(levels, size, 1)]
+    lights, weights = zip(*shown, strict=True)
+    return search(levels, torch.stack(lights, 1), torch.stack(weights, 1), coc_px)
 
 
-def _seen(
-    size: tuple[int, int], levels: Sequence[Level], coc_px: Tensor, mask: Tensor, step: int, farthest: bool
-) -> Seen:
-    """What levels show behind the surfaces of a map: light and coc ``[B, C + 1, h, w]``, and the sum of their votes.
+def _samples(levels: Sequence[Level], size: tuple[int, int], step: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """The samples of each level around the pixels of a map at every ``step``-th pixel of the image.
 
-    The map, signed coc ``[B, 1, h, w]``, is that of an image of a size at every ``step``-th pixel; there is nothing
-    outside of a mask. With ``farthest``, of two surfaces only the farther one counts.
+    Args:
+        levels: Of a pyramid.
+        size: Height and width of the map, ``h`` and ``w``. It has one centre with the levels.
+        step: Distance of two pixels of the map in pixels of the image.
+
+    Yields:
+        Samples ``[B, C + 2, 2 h, 2 w]``, those above and at the left first, and their shares ``[2, 2, h, w]``.
     """
-    height, width = coc_px.shape[-2:]
-    places = pixels.indices(mask)
-    item, row, column = pixels.places(places, height, width)
-    row = (row - _centre(height, coc_px)) * step + _centre(size[0], coc_px)
-    column = (column - _centre(width, coc_px)) * step + _centre(size[1], coc_px)
-    lists = [_samples(level, item, row, column, size) for level in levels]
-    seen, total = search(levels, lists, pixels.pick(coc_px, places).t(), farthest)
-    batch, channels = coc_px.shape[0], levels[0].values.shape[1]
-    values = pixels.put(coc_px.new_zeros(batch, channels, height, width), places, torch.cat([seen, total], 1).t())
-    return values[:, :-1], values[:, -1:]
+    values = levels[0].values
+    steps, whole = tuple(level.step for level in levels), [levels[0].step * n for n in values.shape[-2:]]
+    rows, columns = (
+        _axis(n, step, total, steps, values.dtype, values.device) for n, total in zip(size, whole, strict=True)
+    )
+    for k, level in enumerate(levels):
+        samples = level.values.index_select(-2, rows[0][k]).index_select(-1, columns[0][k])
+        yield samples, rows[1][k][:, None, :, None] * columns[1][k][:, None, :]
 
 
-def search(
-    levels: Sequence[Level], samples: Sequence[Samples], coc_px: Tensor, farthest: bool
-) -> tuple[Tensor, Tensor]:
-    """What levels show behind places ``[P, 1]`` or whole maps, given the samples of each level around each of them."""
-    total, seen = torch.zeros_like(coc_px), coc_px.new_zeros(levels[0].values.shape[1] - 1, *(1,) * (coc_px.ndim - 2))
-    for level, around in zip(levels, samples, strict=True):
-        # of the samples only those that lie behind: plain interpolation would mix in the foreground's own colour
-        behind, weight = torch.zeros_like(coc_px), torch.zeros_like(coc_px)
-        for sample, share in around:
-            part = share * sample[:, -1:] * _is_behind(sample[:, -2:-1] - coc_px)
-            behind, weight = behind + sample[:, :-1] * part, weight + part
-        weight = torch.where(weight > 1e-4, weight, 0.0)
-        behind = behind / weight.clamp_min(1e-4)
-        looked = (coc_px.abs() / level.least_px - 1.0).clamp(0.0, 1.0)
-        vote = looked * (weight if level.vote is None else level.vote * (weight / _SURE).clamp(max=1.0))
-        if farthest:
-            apart = (behind - seen)[:, -1:]
-            vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
-            total = total * (1.0 - (looked * weight / _CERTAIN).clamp(max=1.0) * _is_behind(apart))
-        total = total + vote
-        seen = seen + (behind - seen) * (vote / total.clamp_min(1e-9))
+def _in_pairs(samples: Tensor) -> Tensor:
+    """Samples ``[..., 2 h, 2 w]`` as ``[..., 2, 2, h, w]``."""
+    return samples.unflatten(-1, (2, -1)).unflatten(-3, (2, -1)).transpose(-3, -2)
+
+
+def shown_behind(samples: Tensor, shares: Tensor, coc_px: Tensor) -> Seen:
+    """Mean of the samples that lie behind a map. The foreground's own colour would be in a mean of all four.
+
+    Args:
+        samples: Two rows and two columns of them around each pixel, ``[..., C + 2, 2, 2, h, w]``: light, coc, weight.
+        shares: Of each in linear interpolation, ``[2, 2, h, w]``, or with more axes that fit.
+        coc_px: Of the map, ``[..., 1, h, w]``.
+
+    Returns:
+        Light and coc ``[..., C + 1, h, w]``, and their weight ``[..., 1, h, w]``.
+    """
+    count = samples.shape[-5] - 2
+    values, (_, coc, weight) = samples.narrow(-5, 0, count + 1), samples.split([count, 1, 1], -5)
+    part = (shares if shares.ndim == 4 else shares[:, None]) * weight * _is_behind(coc - coc_px[..., None, None, :, :])
+    total = part.sum((-4, -3))
+    total = torch.where(total > 1e-4, total, 0.0)
+    return (values * part).sum((-4, -3)) / total.clamp_min(1e-4), total
+
+
+def search(levels: Sequence[Level], shown: Tensor, weight: Tensor, coc_px: Tensor, farthest: bool = False) -> Seen:
+    """The mean of what levels show behind a map; with ``farthest``, the farthest of it.
+
+    Args:
+        levels: L of them, fine to coarse.
+        shown: Light and coc that they show, ``[B, L, C + 1, h, w]``.
+        weight: Of these, ``[B, L, 1, h, w]``, as :func:`shown_behind` gives it.
+        coc_px: Of the map, ``[B, 1, h, w]``.
+        farthest: Of two levels that show different surfaces only the farther surface counts.
+
+    Returns:
+        Light and coc ``[B, C + 1, h, w]``, and the sum of the levels' votes ``[B, 1, h, w]``.
+    """
+    rules = tuple((level.least_px, level.vote) for level in levels)
+    (numbers,) = _numbers_of(rules, coc_px.dtype, coc_px.device)
+    least, slope, most = (numbers[i, :, None, None, None] for i in range(3))
+    looked = (coc_px.abs()[:, None] / least - 1.0).clamp(0.0, 1.0)
+    votes = looked * torch.minimum(weight * slope, most)
+    if not farthest:
+        total = votes.sum(1)
+        return (shown * votes).sum(1) / total.clamp_min(1e-9), total
+    sure = (looked * weight / _CERTAIN).clamp(max=1.0)
+    total, seen = votes[:, 0], shown[:, 0]
+    for k in range(1, len(levels)):
+        beyond = shown[:, k] - seen
+        apart, vote = beyond[:, -1:], votes[:, k]
+        vote = torch.where(total > 0, vote * (1.0 - _is_behind(-apart)), vote)
+        total = total * (1.0 - sure[:, k] * _is_behind(apart)) + vote
+        seen = seen + beyond * (vote / total.clamp_min(1e-9))
     return seen, total
 
 
-def _samples(level: Level, item: Tensor, row: Tensor, column: Tensor, size: tuple[int, int]) -> Samples:
-    """The four samples of a level around places ``[P]`` of an image of a size, and their shares of the linear mean."""
-    height, width = level.values.shape[-2:]
-    row, column = _place(row, size[0], height, level.step), _place(column, size[1], width, level.step)
-    flat = level.values.movedim(1, -1).flatten(0, 2)  # a place's numbers lie together
-    corners, down, right = pixels.corners(item, row, column, height, width)
-    shares = [vertical * horizontal for vertical in (1 - down, down) for horizontal in (1 - right, right)]
-    return ((flat.index_select(0, corner), share[:, None]) for corner, share in zip(corners, shares, strict=True))
+@kept
+def _numbers_of(
+    rules: tuple[tuple[float, float | None], ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, ...]:
+    """Of levels: blur from which they are looked at, in pixels; votes for a weight; most votes. ``[3, L]``."""
+    numbers = [
+        (least_px, 1.0, math.inf) if vote is None else (least_px, vote / _SURE, vote) for least_px, vote in rules
+    ]
+    return (torch.tensor(numbers, dtype=dtype, device=device).t(),)
 
 
 def _least_px(level: int) -> float:

@@ -166,10 +166,11 @@ def repair(
     if torch.is_autocast_enabled(device):  # it would convolve in half precision
         with torch.autocast(device, enabled=False):
             return repair(image, nearness, step, auto, of_coc, ops)
+    image, nearness = image.detach(), nearness.detach()
     compiled = not is_traced() and all(map(is_in_memory, (image, nearness))) and native.chosen()
     if of_coc and not compiled:
         return -repair(image, -nearness, step, auto, ops=ops)
-    light, given = image.detach().float(), nearness.detach().float().expand(image.shape[0], -1, -1, -1)
+    light, given = image.float(), nearness.float().expand(image.shape[0], -1, -1, -1)
     step = torch.as_tensor(step, dtype=given.dtype, device=given.device)
     if is_compiled():
         repaired = _operator(light, given, step, auto)
@@ -181,7 +182,7 @@ def repair(
         repaired = _repair(light, given, step, auto, ops)
     if nearness.dtype == torch.float32:
         return repaired
-    return torch.where(repaired == given, nearness.detach(), repaired.to(nearness.dtype))
+    return torch.where(repaired == given, nearness, repaired.to(nearness.dtype))
 
 
 @torch.no_grad()
@@ -240,6 +241,8 @@ def _repair(image: Tensor, nearness: Tensor, step: Tensor, auto: bool, ops: Ops 
     if auto:
         doubtful = doubtful & is_inexact & torch.where(edges.is_ramp, is_soft, wrong > _DOUBTFUL)
     edge_pixels = pixels.indices(doubtful)
+    if auto and not is_traced() and len(edge_pixels) == 0:  # nor is any lamp lifted: a soft map has doubtful ramps
+        return nearness
     score, evidence, near, far = _judge(light, given, witness, edges, edge_pixels, ops)
     shows_near = score + torch.logit(pixels.pick(prior, edge_pixels)[0])
     if auto:  # else steps that prove right are asked as well, and would be moved

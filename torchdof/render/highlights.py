@@ -26,7 +26,7 @@ from .ops import EAGER, Ops
 from .plan import KERNELS_PER_PX, kernels_for
 from .surfaces import HIDDEN_WEIGHT, Highlights, Surface, going_on
 
-__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "affordable_taps", "extract", "splat", "threshold"]
+__all__ = ["COARSE_CELL", "FACTOR", "NEARER_PX", "affordable_taps", "covered_cells", "extract", "splat", "threshold"]
 
 FACTOR = 8.0
 """Light above so many times what is around it is a highlight's."""
@@ -44,6 +44,8 @@ _WHOLE = 4.0  # times the share of a highlight that is splatted is, up to 1, wha
 _TAPS_PER_PIXEL = 16  # of the frame: rays beyond this number are left to the layers
 _FREE_CHANGE_PX = 1.6  # mean change of the coc between neighbours, in pixels, above which fewer rays are affordable
 _TAPS = 2**21  # rays splatted together
+_PAIRS = 2**22  # of a source and a bin of nearer surfaces, looked at together
+_PAIR_TAPS = 2**19  # of these, rays looked at together
 
 
 def threshold(light: Tensor, valid: Tensor | None = None) -> Tensor:
@@ -219,10 +221,11 @@ def _splatted(
     across = width + 2 * margin
     area = (height + 2 * margin) * across
     splats = light.new_zeros(len(light), batch * area)
-    hiding = _Hiding(obstacles) if obstacles else None
+    hiding = _Occluders(obstacles) if obstacles else None
+    most = len(radii) if hiding is None else max(1, _PAIRS // hiding.bins)
     start = 0
     while start < len(radii):  # sources of increasing blur, as many as make a bounded number of taps
-        stop = min(len(radii), start + max(1, _TAPS // (2 * half_of(radii[start]) + 1) ** 2))
+        stop = min(len(radii), start + most, start + max(1, _TAPS // (2 * half_of(radii[start]) + 1) ** 2))
         stop = min(stop, start + max(1, _TAPS // (2 * half_of(radii[stop - 1]) + 1) ** 2))
         part = slice(start, stop)
         kernels = kernels_for(table, coc[part], lens_width, longest, kernels_per_px)  # [n, 1 or C, k, k]
@@ -235,7 +238,7 @@ def _splatted(
         step = torch.arange(-half, half + 1, device=light.device)
         landing = kernels * light[:, part].t()[:, :, None, None]
         if hiding is not None:
-            hidden = hiding.hidden(item[part], row[part], column[part], coc[part], step, max(radii[part]))
+            hidden = hiding.hidden(item[part], row[part], column[part], coc[part], step)
             landing = landing * (1.0 - hidden).unsqueeze(1)
         lines = item[part, None] * area + (row[part, None] + margin + step) * across
         lands = lines[:, :, None] + (column[part, None] + margin + step)[:, None, :]  # [n, k, k]
@@ -252,55 +255,75 @@ def _obstacles(surfaces: Sequence[Surface]) -> list[tuple[Tensor, Tensor]]:
     return [(s.coc_px, cover) for s, cover in zip(surfaces, covers, strict=True)]
 
 
-class _Hiding:
-    """What may stand in the way of rays: coc and cover of surfaces, in bins of 1 px of their coc."""
+class _Occluders:
+    """Surfaces that may stand in the way of rays: their coc and cover, in bins of 1 px of coc."""
 
     def __init__(self, obstacles: Sequence[tuple[Tensor, Tensor]]) -> None:
-        coc_px = obstacles[0][0]
+        coc_px = obstacles[0][0].detach()
         self.height, self.width = int(coc_px.shape[-2]), int(coc_px.shape[-1])
-        self.low = float(coc_px.detach().min())
-        self.shown = [(coc - self.low, cover) for coc, cover in obstacles]  # a place in bins
-        occupied = torch.cat([place.detach()[cover > 0] for place, cover in self.shown])
-        counts = torch.bincount(occupied.floor().long()).tolist()
-        self.bins = sorted({k for i, count in enumerate(counts) if count for k in (i, i + 1)})
-        # how many cells of 8 px above and left of each place show something in a bin
-        self.sums = []
-        for k in self.bins:
-            covered = torch.cat([((place.detach() - k).abs() < 1.0) & (cover > 0) for place, cover in self.shown], 1)
-            any_covered = covered.any(1, keepdim=True).to(torch.float32)
-            cells = functional.max_pool2d(any_covered, COARSE_CELL, ceil_mode=True)[:, 0]
-            self.sums.append(functional.pad(cells.cumsum(-1).cumsum(-2), (1, 0, 1, 0)))
+        self.low = coc_px.amin()
+        shown = [(coc - self.low, cover) for coc, cover in obstacles]  # a place in bins
+        self.bins = int(torch.stack([place.detach().amax() for place, _ in shown]).amax()) + 2
+        self.counts = covered_cells([(place.detach(), cover.detach()) for place, cover in shown], self.bins)
+        self.places, self.covers = (torch.stack([t.flatten() for t in maps]) for maps in zip(*shown, strict=True))
 
-    def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor, farthest: float) -> Tensor:
-        """Share of each ray that nearer surfaces take, ``[n, k, k]``: from sources ``[n]`` of a coc up to the farthest.
+    def hidden(self, item: Tensor, row: Tensor, column: Tensor, coc: Tensor, step: Tensor) -> Tensor:
+        """Share of each ray ``[n, k, k]`` that nearer surfaces take.
 
-        They land so many pixels ``[k]`` from their source along each axis.
+        A ray passes the surfaces of a bin at a share of its way; between four pixels their cover is interpolated.
+
+        Args:
+            item: Of each source in the batch, ``[n]``.
+            row: Of each source, ``[n]``.
+            column: Of each source, ``[n]``.
+            coc: Signed coc of each source in pixels, ``[n]``.
+            step: Pixels from the source to where its rays land, along each axis, ``[k]``.
         """
+        bins = torch.arange(self.bins, device=coc.device)
+        nearer = self.low + bins
+        scale = 1.0 - nearer / coc[:, None]  # [n, bins]
+        fades = (coc[:, None] - NEARER_PX - nearer).clamp(0.0, 1.0)
+        # pairs of a source and a bin of which some cell within reach shows something
+        reach = scale.detach().abs() * step[-1]
+        (top, bottom), (left, right) = (
+            [(place[:, None] + end).clamp(0, size - 1).long() // COARSE_CELL for end in (-reach, reach + 1.0)]
+            for place, size in ((row, self.height), (column, self.width))
+        )
+        lower, upper = bottom + 1, top
+        corners = ((lower, right + 1, 1), (upper, right + 1, -1), (lower, left, -1), (upper, left, 1))
+        count = sum(sign * self.counts[bins, item[:, None], y, x] for y, x, sign in corners)
+        pairs = ((count > 0) & (fades.detach() > 0)).nonzero()
         hidden = coc.new_zeros(len(coc), len(step), len(step))
-        for k, sums in zip(self.bins, self.sums, strict=True):
-            nearer = self.low + k
-            if farthest < nearer:
-                break
-            scale = 1.0 - nearer / coc  # a ray passes this surface so far on its way, as a share of its step
-            reach = scale.detach().abs() * step[-1]
-            (top, bottom), (left, right) = (
-                [(place + end).clamp(0, size - 1).long() // COARSE_CELL for end in (-reach, reach + 1.0)]
-                for place, size in ((row, self.height), (column, self.width))
-            )
-            count = sums[item, bottom + 1, right + 1] - sums[item, top, right + 1]
-            count = count - sums[item, bottom + 1, left] + sums[item, top, left]
-            fades = (coc - NEARER_PX - nearer).clamp(0.0, 1.0)
-            hit = ((count > 0) & (fades.detach() > 0)).nonzero()[:, 0]
-            if len(hit):
-                way = scale[hit, None] * step
-                rows, columns = (row[hit, None] + way)[:, :, None], (column[hit, None] + way)[:, None, :]
-                around, down, right = pixels.corners(item[hit, None, None], rows, columns, self.height, self.width)
-                covered = [self._covered(pixel, k) for pixel in around]
-                upper, lower = torch.lerp(covered[0], covered[1], right), torch.lerp(covered[2], covered[3], right)
-                hidden = hidden.index_add(0, hit, torch.lerp(upper, lower, down) * fades[hit, None, None])
+        for part in pairs.split(max(1, _PAIR_TAPS // len(step) ** 2)):
+            source, bin_of = part.unbind(1)
+            way = scale[source, bin_of][:, None] * step
+            rows, columns = (row[source, None] + way)[:, :, None], (column[source, None] + way)[:, None, :]
+            around, down, aside = pixels.corners(item[source, None, None], rows, columns, self.height, self.width)
+            pixel = torch.stack(around)  # [4, pairs, k, k]
+            near = (1.0 - (self.places[:, pixel] - bin_of[:, None, None]).abs()).clamp_min(0.0)
+            covered = (self.covers[:, pixel] * near).sum(0)
+            above, below = torch.lerp(covered[0::2], covered[1::2], aside)
+            hidden = hidden.index_add(0, source, torch.lerp(above, below, down) * fades[source, bin_of][:, None, None])
         return hidden.clamp(max=1.0)
 
-    def _covered(self, pixel: Tensor, k: int) -> Tensor:
-        """Part of pixels (any shape) that surfaces in a bin cover."""
-        maps = [(place.flatten()[pixel], cover.flatten()[pixel]) for place, cover in self.shown]
-        return torch.stack([cover * (1.0 - (place - k).abs()).clamp_min(0.0) for place, cover in maps]).sum(0)
+
+def covered_cells(places: Sequence[tuple[Tensor, Tensor]], bins: int) -> Tensor:
+    """Counts the cells above and left of each cell that show something in a bin: ``[bins, B, rows + 1, columns + 1]``.
+
+    Args:
+        places: Place of each pixel among the bins and its cover, ``[B, 1, H, W]``, of each surface. A pixel lies in the
+            bin before its place and in the one after it.
+        bins: Number of bins.
+    """
+    batch, _, height, width = places[0][0].shape
+    rows, columns = ((n + COARSE_CELL - 1) // COARSE_CELL for n in (height, width))
+    item, row, column = (torch.arange(n, device=places[0][0].device) for n in (batch, height, width))
+    cell = (item[:, None, None] * rows + row[:, None] // COARSE_CELL) * columns + column // COARSE_CELL
+    shown = places[0][0].new_zeros((bins + 2) * batch * rows * columns)
+    for place, cover in places:  # a pixel without cover is put beyond all bins
+        before = torch.where(cover > 0, place, float(bins)).long()[:, 0]
+        for bin_of in (before, before + 1):
+            index = (bin_of * (batch * rows * columns) + cell).flatten()
+            shown = shown.scatter(0, index, torch.ones_like(place).flatten())
+    shown = shown.unflatten(0, (bins + 2, batch, rows, columns))[:bins]
+    return functional.pad(shown.cumsum(-1).cumsum(-2), (1, 0, 1, 0))

@@ -14,6 +14,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from .. import pixels
+from ..tensors import is_traced
 
 __all__ = ["NEVER_PX", "Matted", "attribute_emitters", "matte"]
 
@@ -152,6 +153,8 @@ def attribute_emitters(
     brightest = light.amax(1, keepdim=True)
     is_bright = brightest > threshold
     bright = pixels.indices(is_bright if valid is None else is_bright & (valid > 0))
+    if not is_traced() and len(bright) == 0:
+        return surfaces
     window = pixels.around(bright, coc_px, _EMITTER_REACH)
     seen, own_coc, limit = pixels.pick(light, bright), pixels.pick(coc_px, bright)[0], pixels.pick(threshold, bright)[0]
     peaks, own_peak = pixels.pick(brightest, window)[0], pixels.pick(brightest, bright)[0]

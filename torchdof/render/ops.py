@@ -45,9 +45,6 @@ class Ops:
     kernels: Sequence[Tensor] | None = None
     """Kernels of all layers, made before; None: they are made for the frame at hand."""
 
-    looks_everywhere: bool = False
-    """Whether all pixels are looked at, where eager code first finds those that need it."""
-
     def choose(self, needed: Callable[[], Tensor], result: Tensor, given: Tensor) -> Tensor:
         """``result`` where ``needed()``, a bool ``[]``, is true; else ``given``, which then equals it.
 
@@ -60,16 +57,10 @@ class Ops:
         return look(pixels) if is_traced() else torch.cat([look(part) for part in pixels.split(_PART)], 1)
 
     def seen(
-        self,
-        look: Callable[..., Seen],
-        levels: Sequence[Level],
-        coc_px: Tensor,
-        mask: Tensor,
-        step: int = 1,
-        farthest: bool = False,
+        self, look: Callable[[Sequence[Level], Tensor], Seen], levels: Sequence[Level], coc_px: Tensor, mask: Tensor
     ) -> Seen:
-        """What levels of a pyramid show behind a map, as :mod:`torchdof.render.disocclusion` looks for it."""
-        return look(levels, coc_px, mask, step, farthest)
+        """``look(levels, coc_px)``: what levels of a pyramid show behind each pixel. A mask of 0 and 1 says where."""
+        return look(levels, coc_px)
 
     def splat(
         self, splat: Callable[[], Tensor], rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Tensor]]

@@ -210,13 +210,19 @@ def framed(
     height, width = ((n + multiple - 1) // multiple * multiple for n in size)
     beyond = (0, width - size[1], 0, height - size[0])  # right and below, to whole blocks
     ends = (margin, margin + beyond[1], margin, margin + beyond[3])
-    places = [blur_axis(surface.coc_px).clamp(nodes[0], nodes[-1]) for surface in surfaces]
-    image_x = None if image is None else places[image]
-    farthest, placed = margin + multiple - 1, []
-    for (light, _, weight), x in zip(surfaces, places, strict=True):
-        light = continued(light, weight, limit, ends, farthest, x, image_x) if lit else functional.pad(light, ends)
-        x = functional.pad(x, ends, mode="replicate")
-        placed.append(Placed(light, x, None if weight is None else functional.pad(weight, ends, mode="replicate")))
+    lights, cocs, weights = zip(*surfaces, strict=True)
+    x = blur_axis(torch.cat(cocs)).clamp(nodes[0], nodes[-1])
+    light, cover = torch.cat(lights), None
+    if any(weight is not None for weight in weights):
+        cover = torch.cat([torch.ones_like(cocs[0]) if weight is None else weight for weight in weights])
+    if lit:
+        image_x = None if image is None else x.unflatten(0, (len(surfaces), -1))[image]
+        light = continued(light, cover, limit, ends, margin + multiple - 1, x, image_x, len(surfaces))
+    else:
+        light = functional.pad(light, ends)
+    x = functional.pad(x if cover is None else torch.cat([x, cover], 1), ends, mode="replicate")
+    maps = [light, *x.split(1, 1)]
+    placed = [Placed(*parts) for parts in zip(*(t.unflatten(0, (len(surfaces), -1)) for t in maps), strict=True)]
     if behind is not None:
         behind = functional.pad(behind, beyond, mode="replicate")
     return Frame(placed, nodes, ramps(nodes, placed[0].x), behind, margin, (height, width), size, occlusion, stacked)

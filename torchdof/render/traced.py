@@ -39,9 +39,9 @@ def one_operator(
         operator = torch.library.custom_op(name, function, mutates_args=())
         operator.register_fake(empty)
 
-        def remember(context: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            context.others = [None if isinstance(value, Tensor) else value for value in inputs]
-            context.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
+        def remember(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:  # called with these names
+            ctx.others = [None if isinstance(value, Tensor) else value for value in inputs]
+            ctx.save_for_backward(*(value if isinstance(value, Tensor) else None for value in inputs))
 
         def backward(context: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
             saved = zip(context.saved_tensors, context.others, strict=True)
