@@ -12,6 +12,11 @@ constexpr double STEP = 0.5;
 // The part of a difference on the blur axis that is a step between surfaces; 0 for a slope.
 static double step_of(double difference) { return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0); }
 
+// Computes, for each side of the frame and each surface, means of the light along the border.
+//
+// 1. Place the border's pixels on an axis on which only steps between surfaces count, in BINS bins.
+// 2. Accumulate light and weight along the border for each bin and all farther ones, so that nearer surfaces are left out.
+// 3. Differences of these sums are the means over windows of doubling width, one for each level.
 Border border_of(const Job &job, int farthest) {
   const Surfaces &s = job.surfaces;
   Border border;

@@ -189,7 +189,10 @@ class Composite {
     return *scratches_[worker];
   }
 
-  // Finds the node before each pixel of each surface, and the layers that occur in each cell.
+  // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
+  //
+  // A block of one surface that lies between two neighbouring nodes is filled at once. Elsewhere each cell compares the
+  // places of its pixels with the nodes between its smallest and its largest place.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -969,6 +972,11 @@ class Composite {
     }
   }
 
+  // Renders one tile of the picture.
+  //
+  // 1. List the full-resolution layers whose blur reaches the tile, and read the window that they need.
+  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas.
+  // 3. Finish: light behind all layers, highlights.
   void tile(int tile_row, int tile_column, Scratch &b) {
     const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0), columns = std::min(TILE, W_ - x0);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));

@@ -146,6 +146,12 @@ double Job::change_of_coc() const {
   return sum / surfaces.area();
 }
 
+// Moves light above the threshold from the surfaces to rays.
+//
+// 1. Collect the bright, blurred pixels of each surface.
+// 2. If their kernels have more taps than the budget, raise the limit above which light is moved.
+// 3. Subtract the light from the surface and store it in rays.
+// 4. List the radii for which kernels are needed.
 void Job::extract_highlights() {
   const size_t area = surfaces.area();
   const float from_px = scene.occlusion ? LEAST_PX : std::max(scene.crisp_px - 1.0f, LEAST_PX);
@@ -446,6 +452,12 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
   return gains;
 }
 
+// For each ray that reaches the tile:
+//
+// 1. Interpolate its kernel between the two nearest radii and mask it by the field, patch by patch.
+// 2. Let p be a pixel of the patch and q the ray's source: the ray to p crosses a surface of coc c at
+//    q + (p - q) (1 - c / coc of the ray). Sum the coverage there over all nearer bins of coc.
+// 3. Add light * tap * (1 - blocked), with blocked at most 1.
 void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const RayKernels &ray_kernels,
            const std::vector<float> &gains, float *tile) {
   const float *const *kernels = ray_kernels.kernels;

@@ -290,7 +290,8 @@ class Around {
   float scale = 0, top = 0;  // scale: largest light around; top: largest light of both surfaces, relative to scale
 };
 
-// Assigns the light of a highlight's pixel to the surface of its emitter.
+// Assigns the light of a highlight's pixel to the surface of its emitter, which lies in front of (side -1) or behind (1)
+// the pixel's own. First the emitter's surface gets the light; then a dark surface gives back what matting gave to it.
 void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
   Surfaces &s = job.surfaces;
   const int channels = job.channels;

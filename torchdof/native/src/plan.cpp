@@ -82,6 +82,9 @@ void coc_of_depth(const float *depth, int64_t count, float scale, float nearest,
   });
 }
 
+// 1. Fixed nodes: the nearest and the farthest place, and places with much of the border, with a neighbour on each side.
+// 2. Nodes from the focus outwards, with a spacing that grows with the blur and the tolerance.
+// 3. Nodes close to a fixed one move towards it, so that the nodes change continuously with the scene.
 std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads) {
   float low, high;
   const int64_t area = (int64_t)height * width;
