@@ -1,7 +1,7 @@
-"""A module as ONNX: one file, checked against the module it came from, for pipelines that do not run torch.
+"""Exports a module as one ONNX file, verified against the module, for pipelines without PyTorch.
 
-``to_onnx`` writes the file, ``verify`` compares a file with a module, ``chain`` puts a depth estimator in front of it
-and ``describe`` tells what a file holds.
+``to_onnx`` writes the file, ``verify`` compares a file with a module, ``chain`` joins a depth estimator and the module
+in one file, and ``describe`` reads a file's metadata.
 """
 
 from .conversion import to_onnx

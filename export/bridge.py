@@ -1,8 +1,8 @@
-"""What lies between a depth estimator and a module, as two small graphs in ONNX's own notation.
+"""The conversions before and after a depth estimator, as two small graphs in ONNX's text format.
 
-``encode`` makes the picture an estimator was trained on out of linear light: clipped, display-encoded (sRGB), centred,
-resized. ``decode`` makes depth in metres at the image's size out of what the estimator gives. Sizes are resampled
-linearly in inverse depth, in which planes stay planes.
+``encode`` converts linear light to an estimator's input: clipped, sRGB-encoded, normalized, resized. ``decode``
+converts the estimator's output to depth in metres at the image's size. It resizes inverse depth linearly, because in
+inverse depth planes stay planes.
 """
 
 from collections.abc import Sequence
@@ -104,14 +104,14 @@ _INVERSE = {
 def encode(
     opset: int, ir: int, size: tuple[int, int] | None, mean: Sequence[float], std: Sequence[float]
 ) -> onnx.ModelProto:
-    """Linear light ``[B, 3, H, W]`` to an estimator's input, and the light itself once more."""
+    """A graph that converts linear light ``[B, 3, H, W]`` to an estimator's input, and also returns the light."""
     resize = _KEEP_SIZE if size is None else _FIXED_SIZE.format(height=size[0], width=size[1])
     text = _ENCODE.format(ir=ir, opset=opset, resize=resize, mean=_numbers(mean), std=_numbers(std))
     return onnx.parser.parse_model(text)
 
 
 def decode(opset: int, ir: int, kind: str, rank: int, scale: float, shift: float) -> onnx.ModelProto:
-    """An estimator's output (``[B, h, w]`` or ``[B, 1, h, w]``) and the light to depth in metres and the light."""
+    """A graph that converts an estimator's output (``[B, h, w]`` or ``[B, 1, h, w]``) to depth in metres."""
     text = _DECODE.format(
         ir=ir,
         opset=opset,

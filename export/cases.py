@@ -1,4 +1,4 @@
-"""What a file is verified on: frames, lenses and scenes other than the traced ones."""
+"""The cases on which a file is verified: frames, lenses and scenes other than the traced ones."""
 
 import dataclasses
 import math
@@ -17,11 +17,11 @@ __all__ = ["Case", "cases"]
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One call.
+    """The inputs of one call.
 
     Args:
-        name: What is special about it.
-        tensors: The inputs, in the graph's order.
+        name: Short description.
+        tensors: The inputs, in the order of the graph.
     """
 
     name: str
@@ -29,10 +29,10 @@ class Case:
 
 
 def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Case]:
-    """The calls that a file must answer as the module does.
+    """The calls for which a file must give the module's result.
 
     Args:
-        portable: The module as exported.
+        portable: The exported module.
         channels: Channels of the image.
         large: Add a frame of 960 x 540.
     """
@@ -69,11 +69,11 @@ def cases(portable: Portable, channels: int, large: bool = False) -> Iterator[Ca
         if name == "lamps":
             image = 0.1 * image
             image[:, :, 2::11, 3::13] *= 500.0
-        if name == "soft depth edges":  # of surfaces that the image tells apart
+        if name == "soft depth edges":  # between surfaces that differ in the image
             image = 0.2 * image + 0.6 * (coc < 0) + 0.1
             coc = functional.avg_pool2d(coc, (1, 5), stride=1, padding=(0, 2), count_include_pad=False)
         elif float(coc.min()) < float(coc.max()):
-            # where a depth lies midway between its neighbours, to the last bit, rounding decides whose surface it is
+            # vary the coc: at the exact mean of both neighbours, rounding would decide to which surface a pixel belongs
             coc = coc * (1.0 + 0.03 * torch.rand(coc.shape, generator=random))
         if portable.inputs == "coc_px":
             if name == "bad depths":
@@ -102,21 +102,21 @@ def _ramp(low: float, high: float) -> Callable[[int, int, int], Tensor]:
 
 
 def _steps(batch: int, height: int, width: int) -> Tensor:
-    """A wall behind, in focus to the left, with a post in front of it."""
+    """A wall behind the focus, in focus on the left, with a post in front of it."""
     coc = torch.linspace(0.0, 1.0, width).expand(batch, 1, height, width).clone()
     coc[..., width // 3 : width // 2] = -0.7
     return coc
 
 
 def _lens(camera: Camera, focus: Tensor, reach: Tensor, width: int) -> tuple[Camera, Tensor]:
-    """F-numbers at which infinity has a coc of ``reach`` pixels."""
+    """The camera with f-numbers at which infinity has a coc of ``reach`` pixels, and these f-numbers."""
     wide = camera.replace(focus_m=focus, f_number=torch.ones_like(focus))
     f_number = wide.coc_px(torch.full((len(focus), 1, 1, 1), math.inf), width).flatten() / reach
     return wide.replace(f_number=f_number), f_number
 
 
 def _depth(camera: Camera, coc: Tensor, width: int) -> Tensor:
-    """The depth that has this coc, which must be below that of infinity."""
+    """The depth with this coc, which must be smaller than that of infinity."""
     far = camera.coc_px(torch.full_like(coc[..., :1, :1], math.inf), width)
     focus = torch.as_tensor(camera.focus_m).reshape(-1, 1, 1, 1)
     return focus / (1.0 - coc / far)

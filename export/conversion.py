@@ -1,4 +1,4 @@
-"""The module to a file: traced, translated, slimmed, labelled, verified, and only then moved into place."""
+"""Converts a module to a file: traces, translates, simplifies, labels and verifies it, then moves it into place."""
 
 import contextlib
 import logging
@@ -40,38 +40,36 @@ def to_onnx(
     opset: int = OPSET,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Verification:
-    """Write a module as one ONNX file, verified against the module.
+    """Writes a module as one ONNX file, verified against the module.
 
     The graph takes ``image [B, C, H, W]`` (linear light), ``depth [B, 1, H, W]`` (metres), ``focus_m [B]`` and
-    ``f_number [B]``, or ``image`` and ``coc_px [B, 1, H, W]``, all float32, and gives ``out [B, C, H, W]``. B, H and W
-    are free, from 1 upwards; all but the image may have one item for the whole batch. A pixel whose depth is NaN, zero
-    or negative passes through sharp and touches nothing else. A camera that cannot be (focus within the focal length,
+    ``f_number [B]``, or ``image`` and ``coc_px [B, 1, H, W]``, all float32, and returns ``out [B, C, H, W]``. B, H and
+    W may be any number from 1; all inputs except the image may have one item for the whole batch. A pixel whose depth
+    is NaN, zero or negative is copied and does not affect others. An impossible camera (focus within the focal length,
     f-number or focus not positive, NaN) gives a picture of NaN.
 
     The graph has the layers of every radius up to ``dof.max_coc_px``. It renders tile by tile in an ONNX ``Loop`` and
-    skips, by ``If``, tiles that are in focus and layers that no pixel in or near a tile falls into (numbers in
-    docs/embedding.md). Highlights, where there are any, are splatted ray by ray in another ``Loop``.
+    skips, with ``If``, tiles in focus and layers without pixels in or near a tile (numbers in docs/embedding.md).
+    Highlights are rendered ray by ray in another ``Loop``.
 
     Args:
-        dof: The module: camera, table and options all go into the file. The camera's focus and f-number do not; they
-            are inputs.
-        path: The file. It is written to a temporary file beside it and moved into place after it has been verified.
-        inputs: ``"depth"``, or ``"coc_px"`` for pipelines that have the circle of confusion already.
+        dof: The module. The file contains its camera, table and options, except focus and f-number, which are inputs.
+        path: The file. It is written to a temporary file beside it, verified, and moved into place.
+        inputs: ``"depth"``, or ``"coc_px"`` for pipelines that already have the circle of confusion.
         channels: Channels of the image, C.
-        width: For a table with lengths in millimetres or fractions of the width: the image width whose kernels the file
-            holds. A radius in pixels then has this kernel at any width.
-        depth_edges: What the graph does with the edges of the map, whatever ``dof`` says: ``"as given"`` takes them as
-            they are, ``"auto"`` and ``"repair"`` do what :class:`DepthOfField` does with these, at the price of several
-            renderings (docs/embedding.md).
+        width: Required for a table with lengths in millimetres or fractions of the width: the image width for which the
+            file's kernels are made. The file uses the same kernel for a radius in pixels at any width.
+        depth_edges: Repair of the map's edges in the graph, regardless of the option of ``dof``: ``"as given"`` none,
+            ``"auto"`` and ``"repair"`` as in :class:`DepthOfField`, for the time of several renderings
+            (docs/embedding.md).
         opset: ONNX operator set, 20 or newer.
-        progress: Is called with what begins: tracing, translating, slimming, then verifying each case.
+        progress: Called with the name of each step: tracing, translating, slimming, then each verified case.
 
     Returns:
-        The comparison with the module; ``print`` shows it as a table.
+        The comparison with the module; ``print`` shows a table.
 
     Raises:
-        ValueError: If an argument is not as described, or the file does not render as the module does; nothing is
-            written then.
+        ValueError: If an argument is invalid, or the file's result differs from the module's; no file is written then.
 
     Example:
         >>> import tempfile, torchdof
@@ -104,8 +102,8 @@ def to_onnx(
 
 
 def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -> onnx_ir.Model:
-    """The module as an ONNX graph, as torch.onnx gives it: not yet slimmed."""
-    # torch.onnx would trace all of it once more, to take apart operators, most of which it can translate as they are
+    """The module as an ONNX graph, translated by torch.onnx and not yet simplified."""
+    # torch.onnx would trace everything again to decompose operators, most of which it can translate as they are
     vars(program)["run_decompositions"] = lambda _: program
     frame = {0: "B", 2: "H", 3: "W"}
     names = INPUTS[inputs]
@@ -132,7 +130,7 @@ def _translate(program: torch.export.ExportedProgram, inputs: str, opset: int) -
 
 
 def _remainder(self: Any, other: Any) -> Any:
-    """``index % width`` with a width that is known only when the graph runs; torch.onnx takes numbers only."""
+    """``index % width`` with a width known only at run time; torch.onnx accepts only numbers."""
     return opset20.Mod(self, opset20.CastLike(other, self))
 
 
@@ -174,7 +172,7 @@ def _either(self: Any, other: Any) -> Any:
 def _chosen(condition: Any, self: Any, other: Any) -> Any:
     if self.dtype != onnx_ir.DataType.BOOL:
         return opset20.Where(condition, self, other)
-    neither = opset20.And(opset20.Not(condition), other)  # onnxruntime has no Where of truth values
+    neither = opset20.And(opset20.Not(condition), other)  # onnxruntime has no Where for bool
     return opset20.Or(opset20.And(condition, self), neither)
 
 
@@ -234,24 +232,24 @@ _TRANSLATIONS: dict[Callable[..., Any], Callable[..., Any]] = {
     torch.ops.aten.rsub.Scalar: _subtracted,
     torch.ops.aten.index_copy.default: _put,
 }
-"""Operators that torch.onnx does not translate as they are."""
+"""Translations of operators that torch.onnx does not translate itself."""
 
 
-_TALKATIVE = ("torch.onnx", "torch.fx.experimental.symbolic_shapes", "onnxscript", "onnx_ir")
+_LOGGERS = ("torch.onnx", "torch.fx.experimental.symbolic_shapes", "onnxscript", "onnx_ir")
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what torch.onnx and onnxscript say about themselves and not about the module."""
-    loggers = [logging.getLogger(name) for name in _TALKATIVE]
+    """Silences messages of torch.onnx and onnxscript that do not concern the module."""
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
         # torch's own copy of its tree specs calls a constructor that torch deprecates
         warnings.filterwarnings("ignore", message=r".*isinstance\(treespec, LeafSpec\).*", category=FutureWarning)
-        # the axes of depth, focus and f-number are those of the image, which is what is meant
+        # depth, focus and f-number share the image's axes, as intended
         warnings.filterwarnings("ignore", message=r".*axis name: [BHW] will not be used", category=UserWarning)
         for logger in loggers:
-            # torchvision's operators are missed at each export, and ranges of sizes that torch cannot write down
+            # each export warns of missing torchvision operators and of size ranges that torch cannot express
             logger.setLevel(logging.ERROR)
         try:
             yield

@@ -1,4 +1,4 @@
-"""What is exported: the module with its static plan, tensors in and tensors out."""
+"""The exported module: a static plan, tensors in, tensors out."""
 
 import copy
 import dataclasses
@@ -26,17 +26,17 @@ OUTPUT = "out"
 
 
 class Portable(nn.Module):
-    """The module as its ONNX file computes it: all layers up to ``max_coc_px``, bad values passed through sharp.
+    """The module as computed by its ONNX file: all layers up to ``max_coc_px``; pixels with bad values are copied.
 
-    What its camera cannot be gives NaN.
+    An impossible camera gives NaN.
 
-    Called outside an export it renders the same thing with eager PyTorch, and that is what a file is verified against.
+    Called outside an export, it gives the same result with eager PyTorch; files are verified against it.
 
     Args:
-        dof: The module. Its camera's numbers must be floats.
-        inputs: ``"depth"`` or ``"coc_px"``: the map that the graph takes.
-        width: Image width that a table with lengths in millimetres or fractions of the width is pinned to.
-        depth_edges: What the graph does with the edges of the map.
+        dof: The module. Its camera must have floats, not tensors.
+        inputs: The map that the graph takes: ``"depth"`` or ``"coc_px"``.
+        width: Image width for the kernels of a table with lengths in millimetres or fractions of the width.
+        depth_edges: Repair of the map's edges in the graph.
 
     Raises:
         ValueError: If the camera has tensors, or the width is missing or superfluous.
@@ -70,7 +70,7 @@ class Portable(nn.Module):
         self.eval()
 
     def forward(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        """Render ``[B, C, H, W]`` with depth and ``(focus_m, f_number)``, or with a map of the coc."""
+        """Renders ``[B, C, H, W]`` from depth and ``(focus_m, f_number)``, or from a map of the coc."""
         out = self._rendered(self.dof.options, self.plan, image, map_, *lens)
         if self.inputs == "coc_px":
             return out
@@ -82,7 +82,7 @@ class Portable(nn.Module):
         return self.ops.choose(lambda: ~possible.all(), undefined, out)
 
     def as_called(self, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
-        """Render as those do who call the module: layers for the scene, highlights ray by ray, edges mended."""
+        """Renders like a call of the module: layers chosen for the scene, its own highlights and edge repair."""
         return self._rendered(self.called, None, image, map_, *lens)
 
     def _rendered(self, options: Options, plan: Plan | None, image: Tensor, map_: Tensor, *lens: Tensor) -> Tensor:
@@ -99,10 +99,10 @@ class Portable(nn.Module):
 
 
 def check_width(table: BlurTable, width: int | None) -> None:
-    """Refuse a width for a table that needs none, and a table with lengths without one.
+    """Raises an error for a width that the table does not need, or a missing width that it needs.
 
     Raises:
-        ValueError: Saying what to do.
+        ValueError: With the required change.
     """
     if table.unit == "relative":
         if width is not None:
@@ -115,7 +115,7 @@ def check_width(table: BlurTable, width: int | None) -> None:
 
 
 def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
-    """The exported program with dynamic batch, height and width.
+    """Traces the module with dynamic batch, height and width.
 
     Raises:
         ValueError: If the channels do not fit the table.
@@ -130,7 +130,7 @@ def trace(portable: Portable, channels: int) -> torch.export.ExportedProgram:
     free = torch.export.Dim.AUTO
     batch, frame = {0: free}, {0: free, 2: free, 3: free}
     shapes = (frame, frame, *((batch, batch),) * (len(example) > 2))
-    # what torch would keep of each operator, to know one like it again, takes longer than it saves: sizes are symbols
+    # the cache of fake tensor results costs more time than it saves, because sizes are symbols
     uncached = torch._dynamo.config.patch(fake_tensor_cache_enabled=False)
     with torch.no_grad(), uncached:
         return torch.export.export(traced, example, dynamic_shapes=shapes, strict=False)

@@ -1,4 +1,4 @@
-"""What a graph takes: one item for a whole batch where that makes sense, and names in the errors of runtimes."""
+"""The graph's inputs: one item for a whole batch where possible, and node names that explain runtime errors."""
 
 from typing import Any
 
@@ -10,13 +10,13 @@ from .graph import INPUTS
 __all__ = ["ITEMS", "broadcast"]
 
 ITEMS = "B_or_1"
-"""Name of the batch axis of every input but the image."""
+"""Name of the batch axis of every input except the image."""
 
 
 def broadcast(model: onnx_ir.Model, inputs: str) -> onnx_ir.Model:
-    """Let every input but the image have one item for the whole batch, in place.
+    """Lets every input except the image have one item for the whole batch, in place.
 
-    A runtime that meets a wrong shape names the node that cannot expand it.
+    For a wrong shape, a runtime's error message contains the name of the node that cannot expand it.
     """
     graph = model.graph
     inputs_in_order: list[Any] = list(graph.inputs)

@@ -1,4 +1,4 @@
-"""A depth estimator and a module in one graph, with everything between them spelled out."""
+"""Joins a depth estimator and a module, with the conversions between them, in one graph."""
 
 import os
 import tempfile
@@ -37,30 +37,31 @@ def chain(
     mean: Sequence[float] = (0.0, 0.0, 0.0),
     std: Sequence[float] = (1.0, 1.0, 1.0),
 ) -> None:
-    """Join a depth estimator's ONNX and a file of :func:`to_onnx` into one file: an image in, a photograph out.
+    """Joins a depth estimator's ONNX file and a file of :func:`to_onnx`: the result renders from an image alone.
 
-    The joint graph takes ``image [B, 3, H, W]`` in linear light, ``focus_m [B]`` and ``f_number [B]``, and gives
-    ``out`` and the ``depth [B, 1, H, W]`` in metres that was used. The estimator sees the image clipped to [0, 1] and
-    encoded as sRGB, then ``(x - mean) / std``, resized to its own size.
+    The joint graph takes ``image [B, 3, H, W]`` in linear light, ``focus_m [B]`` and ``f_number [B]``, and returns
+    ``out`` and the estimated ``depth [B, 1, H, W]`` in metres. The estimator's input is the image clipped to [0, 1] and
+    encoded as sRGB, then ``(x - mean) / std``, resized to the estimator's size.
 
     Args:
-        depth_model: The estimator, a file or a loaded model: one float32 image ``[B, 3, h, w]`` in, one map
-            ``[B, h, w]`` or ``[B, 1, h, w]`` out.
-        dof_model: A file written by :func:`to_onnx`, or one loaded; it must take depth.
-        path: The file to write; it is verified against running the parts in turn and then moved into place.
-        estimate: What the estimator gives. ``"metric"``: depth, ``scale`` of it a metre. ``"inverse"``: inverse depth,
-            ``1 / z = scale * estimate + shift``, at infinity where that is not positive. ``"relative-inverse"``:
-            inverse depth up to an unknown scale and shift (as MiDaS and Depth Anything do); the graph then has two more
-            inputs, ``near_m [B]`` and ``far_m [B]``, which the nearest and the farthest pixel are put at.
+        depth_model: The estimator, a file or a loaded model, with one float32 input ``[B, 3, h, w]`` and one output
+            ``[B, h, w]`` or ``[B, 1, h, w]``.
+        dof_model: A file written by :func:`to_onnx`, or the loaded model; its input must be depth.
+        path: The file to write. It is verified against its parts run one after another, and moved into place.
+        estimate: Meaning of the estimator's output. ``"metric"``: depth, in units of ``1 / scale`` metres.
+            ``"inverse"``: inverse depth, ``1 / z = scale * estimate + shift``; at infinity where that is not positive.
+            ``"relative-inverse"``: inverse depth up to an unknown scale and shift (as MiDaS and Depth Anything give).
+            The graph then has two more inputs, ``near_m [B]`` and ``far_m [B]``, the depths of the nearest and the
+            farthest pixel.
         scale: See ``estimate``.
         shift: See ``estimate``.
-        size: ``(h, w)`` that the estimator wants; None takes what its input declares, or the image's own size where
-            that is free.
-        mean: What the estimator wants subtracted from its display-encoded input, per channel.
-        std: What it wants it divided by then.
+        size: Input size ``(h, w)`` of the estimator; None uses the size that it declares or, if that is free, the
+            image's size.
+        mean: Subtracted from the estimator's display-encoded input, for each channel.
+        std: Divisor of the result, for each channel.
 
     Raises:
-        ValueError: If the models do not fit each other, or the joint graph is not valid or differs from its parts.
+        ValueError: If the models do not fit together, or the joint graph is invalid or differs from its parts.
         FileNotFoundError: If a file is missing.
     """
     if estimate not in ("metric", "inverse", "relative-inverse"):
@@ -94,7 +95,7 @@ def chain(
 
 
 def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, tuple[int, int] | None, int]:
-    """The estimator in our version of ONNX, the input size it declares and the rank of its output."""
+    """The estimator in the module's version of ONNX, the input size it declares, and the rank of its output."""
     model = depth_model if isinstance(depth_model, onnx.ModelProto) else load(depth_model)
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in weights]
@@ -118,12 +119,12 @@ def _prepare(depth_model: Model, opset: int, ir: int) -> tuple[onnx.ModelProto, 
     else:
         model = onnx.ModelProto.FromString(model.SerializeToString())
     model.ir_version = ir
-    del model.graph.value_info[:]  # its names of sizes are not ours
+    del model.graph.value_info[:]  # its names of sizes would clash
     return model, (shape[2], shape[3]) if shape[2] and shape[3] else None, rank
 
 
 def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
-    """Encoding, estimator, decoding and module as one graph; the names of each part get a prefix of their own."""
+    """Encoding, estimator, decoding and module as one graph; each part's names get a prefix."""
     names = ("encode/", "estimator/", "decode/", "dof/")
     encode, estimator, decode, dof = (_prefixed(part, name) for part, name in zip(parts, names, strict=True))
     estimator_input, estimator_output = f"{estimator.graph.input[0].name}", f"{estimator.graph.output[0].name}"
@@ -145,7 +146,7 @@ def _join(parts: Sequence[onnx.ModelProto]) -> onnx.ModelProto:
 
 
 def _prefixed(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
-    """Every name with a prefix; ``onnx.compose.add_prefix`` misses those that a loop's body takes from outside."""
+    """Adds a prefix to every name; ``onnx.compose.add_prefix`` misses outer names used in the body of a loop."""
     copy = onnx_ir.from_proto(onnx.ModelProto.FromString(model.SerializeToString()))  # shares tensors with its source
     for graph in (copy.graph, *copy.graph.subgraphs()):
         values = [*graph.inputs, *graph.initializers.values(), *(value for node in graph for value in node.outputs)]
@@ -155,7 +156,7 @@ def _prefixed(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
 
 
 def _compare(joint: onnx.ModelProto, path: str, parts: Sequence[onnx.ModelProto], size: tuple[int, int]) -> None:
-    """Run the joint graph and the parts in turn on noise of a size that is not the estimator's."""
+    """Compares the joint graph with its parts run in turn, on noise of another size than the estimator's."""
     frame = (size[0] + 14, 2 * size[1] - 28)
     values = {"image": np.random.default_rng(4).random((1, 3, *frame), dtype=np.float32)}
     for name, number in (("focus_m", 1.5), ("f_number", 4.0), ("near_m", 0.7), ("far_m", 30.0)):

@@ -1,6 +1,6 @@
-"""Lists of single pixels in a graph (:mod:`torchdof.pixels`), some of them at a time, for each has many neighbours.
+"""Processes lists of single pixels in a graph (:mod:`torchdof.pixels`) in parts, because each has many neighbours.
 
-A part of a list is a window of a narrow map, so that it has the loop that tiles have (:mod:`.structure`).
+Each part is a window of a narrow map, so that the loop over tiles (:mod:`.structure`) can be used.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .operators import DOMAIN, collect, operator, window
 
-if TYPE_CHECKING:  # what stands below is read, and not by Python's rules
+if TYPE_CHECKING:  # onnxscript compiles these functions, and types differ
     from typing import Any
     from typing import Any as Floats
     from typing import Any as Ints
@@ -31,7 +31,7 @@ _script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op
 
 
 def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
-    """What a function finds at pixels ``[P]``: ``[n, P]``."""
+    """Applies ``look`` to the pixels ``[P]`` in parts; returns ``[n, P]``."""
     count = pixels.shape[0]
     parts = (count + _PART - 1) // _PART
     rows = operator("parts_of", [pixels], (1, 1, _SIDE * parts, _SIDE))
@@ -42,20 +42,20 @@ def by_parts(look: Callable[[Tensor], Tensor], pixels: Tensor) -> Tensor:
 
 @_script
 def parts_of(pixels: Ints) -> Ints:
-    """A list as rows of a map ``[1, 1, n, side]``, ended by zeros where it ends within a part."""
+    """A list as rows of a map ``[1, 1, n, side]``, padded with zeros to whole parts."""
     count = op.Shape(pixels)
-    parts = op.Max((count + _PART - 1) / _PART, 1)  # runtimes do not tell the shape of what no step gave
+    parts = op.Max((count + _PART - 1) / _PART, 1)  # at least one: runtimes do not give the shape of an empty result
     ends = op.Concat(op.Constant(value_ints=[0]), parts * _PART - count, axis=0)
     return op.Reshape(op.Pad(pixels, ends), op.Constant(value_ints=[1, 1, -1, _SIDE]))
 
 
 @_script
 def whole_of(pixels: Ints, tiles: Floats) -> Floats:
-    """What was found in parts ``[n, C, side, side]``, as lists ``[C, P]``."""
+    """Joins the results of the parts ``[n, C, side, side]`` to lists ``[C, P]``."""
     lists = op.Transpose(tiles, perm=[1, 0, 2, 3])
     lists = op.Reshape(lists, op.Concat(op.Shape(lists, start=0, end=1), op.Constant(value_ints=[-1]), axis=0))
     return op.Slice(lists, op.Constant(value_ints=[0]), op.Shape(pixels), op.Constant(value_ints=[1]))
 
 
 FUNCTIONS = (parts_of, whole_of)
-"""Both, by their names in the graph."""
+"""The functions called in the graph."""

@@ -1,4 +1,4 @@
-"""What a file says about itself: producer, units of its inputs, camera, table, options."""
+"""Metadata of a file: producer, units of its inputs, camera, table, options."""
 
 import hashlib
 import json
@@ -17,9 +17,9 @@ from .graph import OUTPUT, Portable
 __all__ = ["UNITS", "describe", "facts_of", "label", "load", "shown", "table_hash", "write_facts"]
 
 PREFIX = "torchdof."
-_LONGEST, _MOST = 2**16, 100  # characters of one of the metadata, and how many there are at most
-_SHOWN = 300  # characters of a text
-_TIMES_READ = 3  # memory that reading a file takes
+_LONGEST, _MOST = 2**16, 100  # limits: characters of one value, number of values
+_SHOWN = 300  # characters of a text that are printed
+_TIMES_READ = 3  # memory needed to read a file, in file sizes
 UNITS = {
     "image": "[B, {channels}, H, W] float32, linear light, >= 0, any range",
     "depth": "[B, 1, H, W] float32, metres along the optical axis, inf allowed; NaN, zero and negative pass sharp",
@@ -32,7 +32,7 @@ UNITS = {
 
 
 def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channels: int, opset: int) -> None:
-    """Write producer and metadata into a model."""
+    """Writes producer and metadata into a model."""
     model.producer_name, model.producer_version = "torchdof", _version()
     model.doc_string = "Depth of field: an all-in-focus image and its depth in, the photograph of a real lens out."
     model.graph.name = "depth_of_field"
@@ -54,40 +54,40 @@ def label(model: onnx.ModelProto, dof: DepthOfField, portable: Portable, channel
 
 
 def write_facts(model: onnx.ModelProto, facts: dict[str, Any]) -> None:
-    """Replace a model's metadata."""
+    """Replaces a model's metadata."""
     del model.metadata_props[:]
     for key, value in facts.items():
         model.metadata_props.add(key=PREFIX + key, value=json.dumps(value))
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a file written by :func:`to_onnx` or :func:`chain` says about itself.
+    """Reads the metadata of a file written by :func:`to_onnx` or :func:`chain`.
 
     Args:
         path: The file.
 
     Returns:
-        ``version``, ``inputs`` and ``output`` (name to shape, type and unit), ``camera`` (its focus and f-number are
-        those of the module; the graph takes them as inputs), ``table`` (name, family, unit and SHA-256 of its JSON),
-        ``options``, ``depth_edges``, ``width`` (that a table was pinned to, or None), ``layers`` and ``opset``.
+        ``version``, ``inputs`` and ``output`` (name to shape, type and unit), ``camera`` (the module's; its focus and
+        f-number are inputs of the graph), ``table`` (name, family, unit and SHA-256 of its JSON), ``options``,
+        ``depth_edges``, ``width`` (of a table with lengths, or None), ``layers`` and ``opset``.
 
     Raises:
-        ValueError: If it is not such a file.
-        FileNotFoundError: If there is no file.
+        ValueError: If the file was not written by them.
+        FileNotFoundError: If the file is missing.
     """
     return facts_of(load(path, whole=False), str(path))
 
 
 def load(path: str | os.PathLike[str], whole: bool = True) -> onnx.ModelProto:
-    """Read an ONNX file.
+    """Reads an ONNX file.
 
     Args:
         path: The file.
-        whole: Whether tensors that lie in other files are read as well; a stranger's file may name any.
+        whole: Whether to read tensors stored in other files; in untrusted files these may be any files.
 
     Raises:
-        ValueError: If it is not one, or larger than there is memory for.
-        FileNotFoundError: If there is none.
+        ValueError: If it is not an ONNX file, or larger than the memory.
+        FileNotFoundError: If the file is missing.
     """
     if not os.path.isfile(path):
         raise FileNotFoundError(f"there is no file {path}")
@@ -96,7 +96,7 @@ def load(path: str | os.PathLike[str], whole: bool = True) -> onnx.ModelProto:
         raise ValueError(f"{path} takes {size / 2**30:.3g} GiB, more than there is memory for")
     try:
         model = onnx.load(path, load_external_data=whole)
-    except Exception as error:  # protobuf has several ways to fail on bytes that are none
+    except Exception as error:  # protobuf raises several types for invalid bytes
         raise ValueError(f"{path} is not an ONNX file: {shown(str(error))}") from error
     if not model.graph.output:
         raise ValueError(f"{path} is not an ONNX file: it has no outputs")
@@ -104,16 +104,16 @@ def load(path: str | os.PathLike[str], whole: bool = True) -> onnx.ModelProto:
 
 
 def facts_of(model: onnx.ModelProto, name: str) -> dict[str, Any]:
-    """The metadata of a model that has been read, of a file of that name.
+    """The metadata of a loaded model; ``name`` is used in messages.
 
     Raises:
-        ValueError: If they are not those that an export writes.
+        ValueError: If they were not written by an export.
     """
     written: dict[str, str] = {}
     for entry in model.metadata_props:
         key, value = entry.key, entry.value
-        if not isinstance(key, str) or not isinstance(value, str):  # bytes that are no text come as bytes
-            raise ValueError(f"{name}: its metadata hold bytes that are no text")
+        if not isinstance(key, str) or not isinstance(value, str):  # other bytes are not decoded
+            raise ValueError(f"{name}: its metadata have bytes that are not text")
         if not key.startswith(PREFIX):
             continue
         if len(value) > _LONGEST or len(written) == _MOST:
@@ -131,7 +131,7 @@ def facts_of(model: onnx.ModelProto, name: str) -> dict[str, Any]:
 
 
 def shown(text: str) -> str:
-    """A stranger's text for people: one line, what would steer a terminal escaped, its beginning if it is long."""
+    """Untrusted text on one line: control characters escaped, and cut if it is long."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text[:_SHOWN])
     return line if len(text) <= _SHOWN else f"{line}... ({len(text)} characters)"
 

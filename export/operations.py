@@ -19,15 +19,15 @@ __all__ = ["GraphOps"]
 
 
 class GraphOps(Ops):
-    """What only a part of a frame needs becomes a branch, and what parts of it need one by one a loop.
+    """Operations that use a branch for work that only some frames need, and a loop for work on parts of a frame.
 
-    Kernels of layers and of highlights are made before the graph is traced, which holds them as constants.
+    The kernels of layers and highlights are made before tracing and become constants of the graph.
 
     Args:
         plan: The layers of the graph.
-        table: Its kernels.
-        layered: Layers are blurred at coarser resolutions where that will do.
-        lens_width: Width in pixels of the image whose kernels these are, for a table with lengths.
+        table: Table of the kernels.
+        layered: Whether layers are blurred at coarser resolutions where that is accurate enough.
+        lens_width: Image width in pixels for the kernels of a table with lengths.
     """
 
     def __init__(self, plan: Plan, table: BlurTable, layered: bool, lens_width: int | None) -> None:
@@ -56,9 +56,9 @@ class GraphOps(Ops):
         coc_px: Tensor,
         obstacles: Sequence[tuple[Tensor, Tensor]],
     ) -> Tensor:
-        """A loop over parts of the highlights, where there are any."""
+        """A loop over parts of the highlights, if there are any."""
         splats = splat(rays, coc_px, obstacles, self.rays)
-        # wherever it is added, and it takes no memory
+        # broadcasts over the frame without taking its memory
         nothing = rays.coc_px.new_zeros(coc_px.shape[0], len(rays.light), 1, 1)
         return self.choose(lambda: torch.ones_like(rays.pixels).sum() > 0, splats, nothing)
 

@@ -1,7 +1,7 @@
-"""Operators of our own that stand for structure in what is traced; :mod:`.structure` makes loops and branches of them.
+"""Placeholder operators for structure in a traced graph, from which :mod:`.structure` makes loops and branches.
 
-A traced graph is flat: one operator cuts a window of each tile, another collects the tiles, a third chooses between two
-results.
+A traced graph is flat. One operator cuts a window for each tile, another collects the tiles, and a third chooses
+between two results.
 """
 
 from collections.abc import Sequence
@@ -13,32 +13,32 @@ from torch import Tensor
 __all__ = ["CHOICE", "COLLECT", "DOMAIN", "WINDOW", "choose", "collect", "operator", "window"]
 
 DOMAIN = "torchdof"
-"""Of the operators; none is left in a file."""
+"""Domain of these operators; a finished file contains none."""
 
 CHOICE, WINDOW, COLLECT = "Choice", "Window", "Collect"
-"""``Choice(needed, result, given)``; ``Window(map)``, one for each tile; ``Collect(tile)``, all of them.
+"""``Choice(needed, result, given)``; ``Window(map)``, cut for each tile; ``Collect(tile)``, all tiles.
 
-Windows of several maps, before one ``Collect``, are those of the same tile."""
+All windows before one ``Collect`` belong to the same tile."""
 
 
 def choose(needed: Tensor, result: Tensor, given: Tensor) -> Tensor:
-    """A result if it is needed, a bool ``[]``, else what is given: a branch of the graph."""
+    """A branch in the graph: ``result`` if ``needed`` (bool ``[]``) is true, else ``given``."""
     return operator(CHOICE, [needed, result, given], result.shape)
 
 
 def window(values: Tensor, length: int, margin: int) -> Tensor:
-    """What a tile of so many pixels of a map sees of it, with a margin."""
+    """The window of a map for one tile of ``length`` pixels, with a margin."""
     across = length + 2 * margin
     return operator(WINDOW, [values], (1, int(values.shape[1]), across, across), side=length, margin=margin)
 
 
 def collect(tile: Tensor, count: int | torch.SymInt) -> Tensor:
-    """All of so many tiles, from what is computed of one: ``[count, C, side, side]``."""
+    """Collects the results of ``count`` tiles, given the computation of one: ``[count, C, side, side]``."""
     return operator(COLLECT, [tile], (count, *tile.shape[1:]))
 
 
 def operator(name: str, inputs: Sequence[Tensor], shape: Sequence[int | torch.SymInt], **attributes: int) -> Tensor:
-    """An operator of :data:`DOMAIN` in a graph; what it gives has the type of its last input."""
+    """An operator of :data:`DOMAIN` in a graph; its result has the dtype of its last input."""
     stated: dict[str, Any] = {**attributes}
     return torch.onnx.ops.symbolic(
         f"{DOMAIN}::{name}", inputs, stated, dtype=inputs[-1].dtype, shape=list(shape), version=1

@@ -1,6 +1,6 @@
-"""The loop of :mod:`.rays`, as functions of ONNX that :mod:`onnxscript` makes of what is written here.
+"""The loop of :mod:`.rays`, as ONNX functions that :mod:`onnxscript` makes from the code below.
 
-Lists are those of sources ``[n]``; kernels are those of a part of them, ``[m, k, k]``, as wide as its widest needs.
+Sources are in lists ``[n]``. Kernels ``[m, k, k]`` of a part of the sources are as wide as its widest kernel.
 """
 
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from torchdof.render.highlights import COARSE_CELL, NEARER_PX
 
 from .operators import DOMAIN
 
-if TYPE_CHECKING:  # what stands below is read, and not by Python's rules
+if TYPE_CHECKING:  # onnxscript compiles these functions, and types differ
     from typing import Any
     from typing import Any as Flag
     from typing import Any as Floats
@@ -26,14 +26,14 @@ else:
 __all__ = ["FUNCTIONS"]
 
 _TAPS = 2**16
-"""Rays that are splatted together."""
+"""Largest number of rays splatted together."""
 
 _script = onnxscript.script(onnxscript.values.Opset(DOMAIN, 1), default_opset=op)
 
 
 @_script
 def stop_of(half: Ints, start: Ints) -> Ints:
-    """Where a part of the sources, narrowest first, ends that begins here: their taps are bounded."""
+    """End of the part of the sources that begins at ``start``; sources are sorted by width; the taps are limited."""
     side = 2 * op.Gather(half, start) + 1
     stop = op.Min(start + op.Max(_TAPS / (side * side), 1), op.Size(half))
     side = 2 * op.Gather(half, stop - 1) + 1
@@ -42,7 +42,7 @@ def stop_of(half: Ints, start: Ints) -> Ints:
 
 @_script
 def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: Ints, step: Ints) -> Floats:
-    """Kernels ``[1 or C, m, k, k]`` at nodes ``[m]``; 0 beyond their ends."""
+    """Kernels ``[1 or C, m, k, k]`` at nodes ``[m]``; 0 outside."""
     axes = op.Constant(value_ints=[1, 2])
     down = op.Unsqueeze(step, op.Constant(value_ints=[1]))
     most = op.Max(op.Abs(step), op.Abs(down))
@@ -56,7 +56,7 @@ def values_at(values: Floats, origins: Ints, halves: Ints, round: Flag, node: In
 def kernels_at(
     values: Floats, origins: Ints, halves: Ints, round: Flag, node: Ints, part: Floats, step: Ints
 ) -> Floats:
-    """Kernels ``[1 or C, m, k, k]`` between nodes ``[m]`` and the next ones."""
+    """Kernels ``[1 or C, m, k, k]`` interpolated between nodes ``[m]`` and the next ones."""
     near = values_at(values, origins, halves, round, node, step)
     far = values_at(values, origins, halves, round, node + 1, step)
     return near + (far - near) * op.Unsqueeze(part, op.Constant(value_ints=[1, 2]))
@@ -64,14 +64,14 @@ def kernels_at(
 
 @_script
 def covered_at(places: Floats, covers: Floats, pixel: Ints, bin: Floats) -> Floats:
-    """Part of pixels ``[p, k, k]`` that surfaces in bins ``[p, 1, 1, 1]`` cover."""
+    """Share of pixels ``[p, k, k]`` covered by surfaces in bins ``[p, 1, 1, 1]``."""
     near = op.Relu(1.0 - op.Abs(op.Gather(places, pixel) - bin))
     return op.ReduceSum(op.Gather(covers, pixel) * near, op.Constant(value_ints=[3]), keepdims=0)
 
 
 @_script
 def count_in(cells: Floats, bin: Ints, item: Ints, row: Ints, column: Ints) -> Floats:
-    """Cells above and left of places ``[m, bins]`` that may show something in bins ``[bins]``."""
+    """Number of cells above and left of ``[m, bins]`` that may contain surfaces in bins ``[bins]``."""
     items = op.Squeeze(op.Shape(cells, start=1, end=2))
     rows = op.Squeeze(op.Shape(cells, start=2, end=3))
     columns = op.Squeeze(op.Shape(cells, start=3, end=4))
@@ -93,7 +93,12 @@ def hidden_of(
     cells: Floats,
     nearest: Floats,
 ) -> Floats:
-    """Share of each ray that nearer surfaces take, ``[m, k, k]``; as ``_Occluders`` of the plain engine."""
+    """Share of each ray that nearer surfaces block, ``[m, k, k]``.
+
+    1. Find the pairs of source and bin for which the bin may contain a surface within the reach of the rays.
+    2. Interpolate the cover of that bin where each ray crosses it.
+    3. Add up the covers of all bins of a source, at most 1.
+    """
     axis_1 = op.Constant(value_ints=[1])
     axis_2 = op.Constant(value_ints=[2])
     axes = op.Constant(value_ints=[1, 2])
@@ -105,7 +110,7 @@ def hidden_of(
     last_column = op.Cast(width - 1, to=1)
     step = op.Cast(step, to=1)
 
-    # which of the bins may show something within reach of a source: pairs of both
+    # pairs of a source and a bin that may contain a surface within reach of its rays
     zero = op.Constant(value_int=0)
     one = op.Constant(value_int=1)
     bin = op.Range(zero, op.Squeeze(op.Shape(cells, start=0, end=1)), one)
@@ -124,7 +129,7 @@ def hidden_of(
     source = op.Gather(pairs, zero)
     pair_bin = op.Unsqueeze(op.Cast(op.Gather(pairs, one), to=1), op.Constant(value_ints=[1, 2, 3]))
 
-    # each pair's rays pass that surface at places between four pixels
+    # each ray of a pair crosses the bin's surface between four pixels
     way = op.Unsqueeze(op.GatherND(scale, pair), axis_1) * step
     rows = op.Clip(op.Gather(row, source) + way, 0.0, last_row)
     columns = op.Clip(op.Gather(column, source) + way, 0.0, last_column)
@@ -144,14 +149,14 @@ def hidden_of(
     taken = covered * op.Unsqueeze(op.GatherND(fade, pair), axes)
     side = op.Shape(step)
     none = op.ConstantOfShape(op.Concat(op.Shape(item, start=0, end=1), side, side, axis=0))
-    # not by ScatterND: runtimes add in parallel there, and a source has several bins
+    # ScatterND would not do: runtimes add in parallel in it, and a source has several bins
     into = op.Expand(op.Unsqueeze(source, axes), op.Shape(taken))
     return op.Min(op.ScatterElements(none, into, taken, axis=0, reduction="add"), 1.0)
 
 
 @_script
 def landed(splats: Floats, light: Floats, first: Ints, kernels: Floats, step: Ints, across: Ints) -> Floats:
-    """Splats ``[C, n]`` with the light ``[m, C]`` of sources at places ``[m]`` of them added."""
+    """Adds the light ``[m, C]`` of sources, centred at ``first`` ``[m]``, to splats ``[C, n]``."""
     axes = op.Constant(value_ints=[1, 2])
     all_of_it = op.Constant(value_ints=[-1])
     landing = kernels * op.Unsqueeze(op.Transpose(light, perm=[1, 0]), op.Constant(value_ints=[2, 3]))
@@ -185,7 +190,7 @@ def splat(
     cells: Floats,
     nearest: Floats,
 ) -> Floats:
-    """Light ``[C, B, H, W]`` of all sources on a blank frame with room around it, but for what nearer surfaces take."""
+    """Light ``[C, B, H, W]`` of all sources on a blank frame with a margin, except light blocked by nearer surfaces."""
     splats = op.Reshape(blank, op.Constant(value_ints=[0, -1]))
     start = op.Constant(value_int=0)
     going = op.Size(half) > 0
@@ -216,4 +221,4 @@ def splat(
 
 
 FUNCTIONS = (stop_of, values_at, kernels_at, covered_at, count_in, hidden_of, landed, splat)
-"""All of them, by their names in the graph."""
+"""The functions called in the graph."""

@@ -1,7 +1,7 @@
-"""Highlights of a graph: their light splatted ray by ray (:mod:`torchdof.render.highlights`), in a loop over parts.
+"""Highlights in a graph: their light is splatted ray by ray (:mod:`torchdof.render.highlights`), in a loop over parts.
 
-What a source needs by itself is traced. The loop over sources, whose number only a frame tells, is a function in ONNX
-(:mod:`.ray_splats`), which one operator calls in what is traced.
+Values for single sources are traced. The loop over sources, whose number is known only at run time, is a function in
+ONNX (:mod:`.ray_splats`), called through one operator in the traced graph.
 """
 
 from collections.abc import Sequence
@@ -20,21 +20,21 @@ from .operators import operator
 
 __all__ = ["Kernels", "kernels_of", "splat"]
 
-_NEVER = 1e6  # pixels of coc that none has
+_NEVER = 1e6  # pixels; larger than any coc
 
 
 class Kernels(NamedTuple):
-    """Kernels of all radii of a plan, near to far, in rows of numbers.
+    """Kernels of all radii of a plan, from the most negative to the most positive one, packed into rows of numbers.
 
     Args:
-        values: ``[1 or C, n]``: of each kernel the eighth right of its centre and below, row by row to the diagonal, or
-            all of it. The first is 0.
-        origins: Where the value of each kernel's centre lies, ``[m]``.
-        halves: Pixels on each side of its centre.
-        round: Whether there are eighths, a bool ``[]``.
-        per_px: Kernels a pixel of radius.
-        bins: Pixels of coc from the nearest to the farthest.
-        margin: Pixels on each side of the widest one's centre.
+        values: ``[1 or C, n]``. Of each round kernel, the eighth right of and below its centre, row by row to the
+            diagonal; of other kernels, all values. The first value is 0.
+        origins: Index of the centre's value for each kernel, ``[m]``.
+        halves: Half width of each kernel in pixels, ``[m]``.
+        round: Whether only eighths are stored, a bool ``[]``.
+        per_px: Kernels for each pixel of radius.
+        bins: Range of coc in pixels, from the nearest to the farthest.
+        margin: Half width of the widest kernel in pixels.
     """
 
     values: Tensor
@@ -47,7 +47,7 @@ class Kernels(NamedTuple):
 
 
 def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
-    """Kernels of the highlights of a plan, in an image of a width in pixels."""
+    """Kernels for the highlights of a plan, for an image of ``lens_width`` pixels."""
     farthest = max(abs(c) for c in plan.coc_px)
     count = int(farthest * plan.kernels_per_px) + 2
     values, size, places = [torch.zeros(table.channels, 1)], 1, []
@@ -61,7 +61,7 @@ def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
         else:
             numbers, centre = kernel.flatten(1), 2 * half * (half + 1)
         key = numbers.contiguous().numpy().tobytes()
-        if key not in seen:  # most are alike in front of the focus plane and behind it
+        if key not in seen:  # most are equal on both sides of the focus plane
             seen[key] = (size + centre, half)
             values.append(numbers)
             size += numbers.shape[1]
@@ -74,13 +74,13 @@ def kernels_of(table: BlurTable, plan: Plan, lens_width: int) -> Kernels:
 
 
 def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Tensor]], kernels: Kernels) -> Tensor:
-    """What :func:`torchdof.render.highlights.splat` does, of one list of highlights, in a graph: ``[B, C, H, W]``.
+    """:func:`torchdof.render.highlights.splat` for one list of highlights, in a graph: ``[B, C, H, W]``.
 
     Args:
         rays: The highlights of all surfaces.
-        coc_px: Of the frame, ``[B, 1, H, W]``.
-        obstacles: Coc and cover of what may stand in the way, each ``[B, 1, H, W]``.
-        kernels: Of the file.
+        coc_px: Coc of the frame, ``[B, 1, H, W]``.
+        obstacles: Coc and cover of surfaces that may block rays, each ``[B, 1, H, W]``.
+        kernels: The graph's kernels.
     """
     batch, _, height, width = coc_px.shape
     *lens, per_px, bins, margin = kernels
@@ -89,7 +89,7 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
     low = step.floor()
     node, part = low.long(), step - low
     half = torch.maximum(halves.index_select(0, node), halves.index_select(0, node + 1))
-    half, order = half.sort()  # a part of the sources has the taps of its widest
+    half, order = half.sort()  # each part of the sources is processed with its widest kernel
     node, part, coc, source = (t.index_select(0, order) for t in (node, part, rays.coc_px, rays.pixels))
     light = rays.light.index_select(1, order).t()
     item, row, column = pixels.places(source, height, width)
@@ -104,7 +104,7 @@ def splat(rays: Highlights, coc_px: Tensor, obstacles: Sequence[tuple[Tensor, Te
         places = [(coc - nearest, cover) for coc, cover in obstacles]
         maps = [torch.stack([t.flatten() for t in part], 1) for part in zip(*places, strict=True)]
         maps.append(covered_cells(places, bins))
-    else:  # in no bin is there anything
+    else:  # no bins with surfaces
         maps = [coc_px.new_zeros(1, 1), coc_px.new_zeros(1, 1), coc_px.new_zeros(0, 1, 1, 1)]
     inputs = [blank, *lists, *lens, *sizes, *maps, nearest]
     splats = operator("splat", inputs, blank.shape)

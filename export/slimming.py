@@ -1,4 +1,4 @@
-"""A translated graph made flat, small and plain: what other runtimes read as well as the one it is verified with."""
+"""Simplifies a translated graph: one flat, small graph of plain operators that many runtimes can read."""
 
 import itertools
 import string
@@ -15,12 +15,18 @@ from .structure import structure
 
 __all__ = ["slim"]
 
-_OF_WINDOWS = {"pads": 0, "dilations": 1, "strides": 1}  # what these are where they are not stated, along each axis
-_LARGEST_EQUAL = 64  # numbers of a constant that are written one by one though they are the same
+_OF_WINDOWS = {"pads": 0, "dilations": 1, "strides": 1}  # defaults of these attributes, for each axis
+_LARGEST_EQUAL = 64  # constants with more equal numbers than this are stored as a shape and a value
 
 
 def slim(model: onnx_ir.Model) -> onnx_ir.Model:
-    """One flat graph without repeated constants, stack traces and names of source files; with loops and branches."""
+    """Makes one graph without repeated constants, stack traces and names of source files, but with loops and branches.
+
+    1. Inline functions, fold constants, and replace operators and chains of operators by faster or more common ones.
+    2. Make loops and branches.
+    3. Put each convolution's weights into its own graph, and turn initializers into nodes.
+    4. Remove default attributes and shorten names.
+    """
     flat: tuple[onnx_ir.passes.PassBase, ...] = (
         passes.InlinePass(),
         passes.RemoveUnusedFunctionsPass(),
@@ -67,7 +73,7 @@ def slim(model: onnx_ir.Model) -> onnx_ir.Model:
 
 
 def _place_weights(model: onnx_ir.Model) -> None:
-    """Weights of convolutions in the graph that convolves: only then runtimes arrange them for their fast kernels."""
+    """Puts weights of convolutions into the graph that uses them; only then runtimes arrange them for speed."""
     for graph in (model.graph, *model.graph.subgraphs()):
         for node in [node for node in graph if node.op_type == "Conv"]:
             weight = node.inputs[1]
@@ -87,7 +93,7 @@ def _place_weights(model: onnx_ir.Model) -> None:
 
 
 def _as_nodes(graph: onnx_ir.Graph) -> None:
-    """Initializers as ``Constant`` nodes: ``onnx.compose`` renames these where a branch takes them from outside."""
+    """Turns initializers into ``Constant`` nodes, which ``onnx.compose`` renames in branches too."""
     first = next(iter(graph), None)
     values: list[Any] = list(graph.initializers.values())
     for value in values:
@@ -119,7 +125,7 @@ def _initializer(graph: onnx_ir.Graph, array: np.ndarray, name: str) -> onnx_ir.
 
 
 class _Casts(onnx_ir.passes.InPlacePass):
-    """``CastLike`` as ``Cast``, or as nothing where the type is right already: not every runtime folds it."""
+    """``CastLike`` becomes ``Cast``, or nothing if the type is right already; not every runtime simplifies it."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
         """Replace in all graphs."""
@@ -147,10 +153,10 @@ class _Casts(onnx_ir.passes.InPlacePass):
 
 
 class _Parts(onnx_ir.passes.InPlacePass):
-    """Slices of what was put together, as the parts themselves; onnxruntime warns where it does so itself."""
+    """A slice that is exactly one input of a ``Concat`` becomes that input; onnxruntime would warn of it."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
-        """Replace in the graph; a flat one, as it is before it gets its branches."""
+        """Replace in the graph, which is still flat."""
         for node in list(model.graph):
             if node.op_type == "Slice" and not node.outputs[0].is_graph_output():
                 part = _part(node)
@@ -161,7 +167,7 @@ class _Parts(onnx_ir.passes.InPlacePass):
 
 
 class _Cuts(onnx_ir.passes.InPlacePass):
-    """A slice of a slice along another axis, as one: each would copy."""
+    """Two slices in sequence along different axes become one, because each copies."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
         """Replace in the graph."""
@@ -189,7 +195,7 @@ class _Cuts(onnx_ir.passes.InPlacePass):
 
 
 class _Averages(onnx_ir.passes.InPlacePass):
-    """The mean of blocks before a convolution as a convolution, on which runtimes are several times as fast."""
+    """Block means before a convolution become a convolution, which is several times as fast in runtimes."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
         """Replace in the graph."""
@@ -216,9 +222,9 @@ class _Averages(onnx_ir.passes.InPlacePass):
 
 
 class _Fills(onnx_ir.passes.InPlacePass):
-    """Channels that only fill up a convolution, as a part of what is put together before it.
+    """Padding channels of a convolution become inputs of the ``Concat`` before it.
 
-    What they hold does not matter, for nothing takes them: they are some of the others once more.
+    Their values do not matter, because they are not used: they repeat some of the other channels.
     """
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
@@ -247,7 +253,7 @@ class _Fills(onnx_ir.passes.InPlacePass):
 
 
 class _Splits(onnx_ir.passes.InPlacePass):
-    """A split of all channels but the last ones, as one of all, of which nothing takes the last part."""
+    """A slice of the first channels and a split become one split, whose last part is not used."""
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
         """Replace in the graph."""
@@ -274,10 +280,10 @@ class _Splits(onnx_ir.passes.InPlacePass):
 
 
 class _Ramps(onnx_ir.passes.InPlacePass):
-    """Straight lines that are clipped to 0 and 1, as one operator instead of three.
+    """Linear functions clipped to [0, 1] become one operator instead of three.
 
-    They are ``1 - clip(x / width)``, and of an eased ramp ``1 - slope (1 - w)`` of a clipped ``w``, which is below 0
-    only where its foot, which never is, is taken instead.
+    They occur as ``1 - clip(x / width)``, and in an eased ramp as ``1 - slope (1 - w)`` of a clipped ``w``. Where the
+    latter is negative the ramp's foot is used instead, so it may be clipped as well.
     """
 
     def call(self, model: onnx_ir.Model) -> onnx_ir.passes.PassResult:
@@ -303,7 +309,7 @@ class _Ramps(onnx_ir.passes.InPlacePass):
             clipped: Any = None if rest is None else rest.producer()
             if rest is None or straight is None or slope is None or clipped.op_type != "Clip":
                 continue
-            # exactly 1 at 1: the offset is a multiple of what a number as large as the slope can tell apart
+            # exactly 1 at 1: the offset is a multiple of the float32 resolution near the slope
             offset = round((1.0 - slope) * 2**23) / 2**23
             line = onnx_ir.node("HardSigmoid", [clipped.inputs[0]], {"alpha": 1.0 - offset, "beta": offset})
             line.outputs[0].type, line.outputs[0].shape = straight.type, straight.shape
@@ -317,27 +323,27 @@ class _Ramps(onnx_ir.passes.InPlacePass):
 
 
 def _operand(value: onnx_ir.Value | None, operator: str, number: float) -> onnx_ir.Value | None:
-    """What a number's difference, product or the like is taken with, if that is what a value is."""
+    """The second operand of ``value``, if it is this operator with this number as the first operand; else None."""
     node = None if value is None else value.producer()
     is_it = node is not None and node.op_type == operator and _number(node.inputs[0]) == number
     return node.inputs[1] if node is not None and is_it else None
 
 
 def _number(value: onnx_ir.Value | None) -> float | None:
-    """A constant of one number."""
+    """The number in a constant with one element, else None."""
     tensor = None if value is None else onnx_ir.convenience.get_const_tensor(value)
     return float(tensor.numpy().item()) if tensor is not None and tensor.size == 1 else None
 
 
 def _spare_channels(node: onnx_ir.Node) -> int:
-    """How many channels a ``Pad`` adds behind those there are, if that is all that it does."""
+    """Number of channels that a ``Pad`` appends, if it does nothing else; otherwise 0."""
     pads = node.inputs[1] if node.op_type == "Pad" and len(node.inputs) > 1 else None
     ends = [] if pads is None or pads.const_value is None else pads.const_value.numpy().tolist()
     return ends[5] if len(ends) == 8 and not any(ends[:5] + ends[6:]) else 0
 
 
 def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
-    """The part that a slice cuts out, if it is exactly one of those that its input is made of."""
+    """The input of a ``Concat`` that a slice cuts out exactly, else None."""
     whole, *bounds = node.inputs
     numbers = [v.const_value.numpy().tolist() for v in bounds if v is not None and v.const_value is not None]
     source = None if whole is None else whole.producer()
@@ -360,14 +366,14 @@ def _part(node: onnx_ir.Node) -> onnx_ir.Value | None:
 
 
 def _cast_constant(graph: onnx_ir.Graph, value: onnx_ir.Value, kind: onnx_ir.DataType, number: int) -> onnx_ir.Value:
-    """A constant in another type, as an initializer of the graph."""
+    """A constant cast to another type, as an initializer of the graph."""
     if value.const_value is None:
-        raise ValueError(f"{value.name} is no constant")
+        raise ValueError(f"{value.name} is not a constant")
     return _initializer(graph, value.const_value.numpy().astype(kind.numpy()), f"cast_{number}")
 
 
 def _drop_defaults(model: onnx_ir.Model) -> None:
-    """Attributes that state what holds without them."""
+    """Removes attributes with default values."""
     for node in model.graph.all_nodes():
         known = onnx.defs.get_schema(node.op_type, model.opset_imports[""]).attributes
         for name, attribute in list(node.attributes.items()):
@@ -379,15 +385,16 @@ def _drop_defaults(model: onnx_ir.Model) -> None:
 
 
 def _plain(attribute: onnx_ir.Attr) -> Any:
-    """What an attribute holds, as :mod:`onnx` tells it; None of graphs and tensors."""
+    """Value of an attribute in :mod:`onnx`'s types; None for graphs and tensors."""
     value = attribute.value
     return value.encode() if isinstance(value, str) else value if isinstance(value, int | float) else None
 
 
 def _shorten(model: onnx_ir.Model) -> None:
-    """No names of nodes, and short ones of values, the shortest of those that are named most often.
+    """Removes names of nodes, and shortens names of values; the most frequent names become the shortest.
 
-    Types and shapes of what lies between would be most of the file as well; inference finds them.
+    Types and shapes of intermediate values are also removed, because they would be most of the file; inference finds
+    them.
     """
     kept = {value.name for value in (*model.graph.inputs, *model.graph.outputs)}
     values: list[onnx_ir.Value] = []

@@ -1,7 +1,7 @@
-"""The structure of a graph, made of the operators that stand for it in what was traced (:mod:`.operators`).
+"""Makes loops and branches of the placeholder operators in a traced graph (:mod:`.operators`).
 
-What depends on a window becomes the body of a ``Loop`` over tiles. What only one side of a choice needs becomes that
-side's branch of an ``If``, so it is computed only when it is taken.
+Nodes that depend on a window become the body of a ``Loop`` over tiles. Nodes that only one side of a choice uses become
+that side's branch of an ``If``, and are computed only if it is taken.
 """
 
 from typing import Any
@@ -13,11 +13,11 @@ from .operators import CHOICE, COLLECT, DOMAIN, WINDOW
 
 __all__ = ["structure"]
 
-_Owners = dict[Any, onnx_ir.Node]  # the node that a subgraph belongs to
+_Owners = dict[Any, onnx_ir.Node]  # node that owns a subgraph
 
 
 def structure(model: onnx_ir.Model) -> None:
-    """Make loops and branches of a flat graph, in place."""
+    """Makes loops and branches of a flat graph, in place."""
     owners: _Owners = {a.as_graph(): n for n in model.graph for a in n.attributes.values() if _is_graph(a)}
     for node in _ours(model.graph, COLLECT):
         _loop(model.graph, node, owners)
@@ -29,7 +29,12 @@ def _ours(graph: onnx_ir.Graph, name: str) -> list[onnx_ir.Node]:
 
 
 def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
-    """What lies between windows and their tiles, as the body of a loop that slices its windows from the frame."""
+    """Moves the nodes between windows and ``collect`` into the body of a loop that slices its windows from the frame.
+
+    1. Before the loop: number of tiles, from the frame's size.
+    2. In the body: slice each window at the tile's position, then compute the tile.
+    3. Replace ``collect`` by the loop's output.
+    """
     windows, dependent, body_nodes = [], set(), []
     for node in graph:
         if node is collect:
@@ -66,19 +71,19 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
         start = inside.op("Mul", [tile_place, _ints(inside, 1, side, side)])
         stop = inside.op("Add", [start, _ints(inside, 1, side + 2 * margin, side + 2 * margin)])
         sliced = inside.op("Slice", [window.inputs[0], start, stop, _ints(inside, 0, 2, 3)])
-        # runtimes cannot tell the size of a slice, and take their fast convolutions only for sizes that they know
+        # runtimes do not know the size of a slice, and use fast convolutions only for known sizes
         size = window.outputs[0].shape
         cut = inside.op("Reshape", [sliced, _ints(inside, *(size.numpy() if size else ()))])
         window.outputs[0].replace_all_uses_with(cut)
     for node in body_nodes:
         graph.remove(node)
-    goes_on = inside.op("Identity", [going])
+    condition = inside.op("Identity", [going])
     after = Tape()
     squeezed = after.op("Squeeze", [tile, _ints(after, 0)])
     nodes = [*inside.nodes, *body_nodes, *after.nodes]
-    _type(goes_on, onnx_ir.DataType.BOOL, [])
+    _type(condition, onnx_ir.DataType.BOOL, [])
     _type(squeezed, tile.dtype, tile.shape[1:])
-    body = onnx_ir.Graph([step, going], [goes_on, squeezed], nodes=nodes, name="tile")
+    body = onnx_ir.Graph([step, going], [condition, squeezed], nodes=nodes, name="tile")
     loop = onnx_ir.node("Loop", [total, always], {"body": body})
     graph.insert_before(collect, [*before.nodes, loop])
     owners[body] = loop
@@ -88,7 +93,7 @@ def _loop(graph: onnx_ir.Graph, collect: onnx_ir.Node, owners: _Owners) -> None:
 
 
 def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
-    """Choices of a graph, outermost first, and of what they enclose."""
+    """Makes an ``If`` of each choice in a graph, outermost first, then of those in its branches and loops."""
     inside: list[onnx_ir.Graph] = []
     while choices := _ours(graph, CHOICE):
         choice = choices[-1]
@@ -105,9 +110,9 @@ def _branches(graph: onnx_ir.Graph, owners: _Owners) -> None:
 
 
 def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Owners) -> onnx_ir.Graph:
-    """The branch that gives an input of a choice; it takes over all nodes that nothing else needs."""
+    """The branch that computes one input of a choice, with all nodes that nothing else uses."""
     result: Any = choice.inputs[index]
-    last = onnx_ir.node("Identity", [result])  # a branch gives what it makes itself
+    last = onnx_ir.node("Identity", [result])  # a branch can only return its own values
     graph.insert_before(choice, [last])
     choice.replace_input_with(index, last.outputs[0])
     moved, open_nodes = {last}, [last]
@@ -130,7 +135,7 @@ def _branch(graph: onnx_ir.Graph, choice: onnx_ir.Node, index: int, owners: _Own
 
 
 def _taken(node: onnx_ir.Node) -> list[onnx_ir.Value]:
-    """What a node and its subgraphs take."""
+    """The inputs of a node and of its subgraphs."""
     values = [value for value in node.inputs if value is not None]
     for attribute in node.attributes.values():
         if _is_graph(attribute):
@@ -143,7 +148,7 @@ def _is_graph(attribute: onnx_ir.Attr) -> bool:
 
 
 def _in(graph: onnx_ir.Graph, node: onnx_ir.Node, owners: _Owners) -> onnx_ir.Node:
-    """The node of a graph that is, or holds, another node."""
+    """The node of ``graph`` that is, or contains, ``node``."""
     while node.graph is not graph:
         node = owners[node.graph]
     return node

@@ -1,7 +1,7 @@
-"""The frame tile by tile, in a loop: how an exported graph does only the work that a scene needs.
+"""Renders the frame tile by tile in a loop, so that an exported graph does only the work that a scene needs.
 
-A graph cannot choose its work before it runs. In a loop over tiles each step sees a small window, and the branches
-inside skip every layer that the window does not hold, and everything where it is in focus.
+A graph cannot choose its work before it runs. In a loop over tiles each step reads a small window; branches skip layers
+without pixels in the window, and the whole tile if it is in focus.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,25 +19,25 @@ from .shifting import samples
 
 __all__ = ["seen", "side", "tile_by_tile"]
 
-_SIDE = 96  # the maps of one tile fit the processor's caches
+_SIDE = 96  # pixels of a tile; its maps fit into the processor's caches
 
 
 def side(margin: int) -> int:
-    """Pixels of a tile along each axis, given those that the widest kernel reaches beyond it."""
+    """Side of a tile in pixels, given the reach of the widest kernel."""
     return next((n for n in (_SIDE, 128) if margin <= n // 2), 256)
 
 
 def tile_by_tile(frame: Frame, render: Callable[[Frame], Tensor], ops: Ops) -> Tensor:
-    """Render each tile of a frame as a frame of its own.
+    """Renders each tile of a frame as a frame of its own.
 
     Args:
         frame: Surfaces and their border; its area is a multiple of :func:`side`.
-        render: Renders one tile: ``[1, C, side, side]``, or with weights of its light, 1 where it is sharp, in further
-            channels.
-        ops: How a sharp tile is skipped.
+        render: Renders one tile: ``[1, C, side, side]``, or with weights of its light in further channels, which are 1
+            where it is sharp.
+        ops: Operations; they skip sharp tiles.
 
     Returns:
-        The same of the frame, ``[B, C, H, W]``.
+        The rendered frame, ``[B, C, H, W]``.
     """
     length, margin = side(frame.margin), frame.margin
     surfaces = [Placed(*(window(t, length, margin) for t in s if t is not None)) for s in frame.surfaces]
@@ -93,7 +93,7 @@ def seen(levels: Sequence[Level], coc_px: Tensor, mask: Tensor, ops: Ops) -> See
 
 
 def _joined(tiles: Tensor, counts: tuple[int, int, int]) -> Tensor:
-    """Tiles ``[n, C, side, side]`` of so many items, rows and columns as maps."""
+    """Joins tiles ``[n, C, side, side]`` to maps; counts: items, rows and columns."""
     channels, side = tiles.shape[1:3]
     batch, rows, columns = counts
     maps = tiles.reshape(batch, rows, columns, channels, side, side).permute(0, 3, 1, 4, 2, 5)

@@ -1,4 +1,4 @@
-"""A file against the module it came from: names, types, shapes, values and time."""
+"""Compares a file with its module: names, types, shapes, values and time."""
 
 import dataclasses
 import os
@@ -29,15 +29,15 @@ TOLERANCE = 1e-5
 
 @dataclasses.dataclass(frozen=True)
 class CaseComparison:
-    """One case.
+    """Result of one case.
 
     Args:
-        name: What is special about it.
-        shape: Of the image, ``[B, C, H, W]``.
-        max_error: Largest difference, relative to the local range.
+        name: Short description.
+        shape: Shape of the image, ``[B, C, H, W]``.
+        max_error: Largest difference, relative to the local range of light.
         mean_error: Mean difference.
-        called_db: PSNR in dB of the file against the module as users call it, with layers for the scene, highlights ray
-            by ray and edges mended; display-encoded, infinite where both are the same.
+        called_db: PSNR in dB of the file against a normal call of the module, with layers chosen for the scene, its own
+            highlights and edge repair; display-encoded, infinite if both are equal.
         torch_s: Seconds in eager PyTorch.
         onnxruntime_s: Seconds in onnxruntime.
     """
@@ -53,11 +53,11 @@ class CaseComparison:
 
 @dataclasses.dataclass(frozen=True)
 class Verification:
-    """How a file compares with the module; ``str`` is a table.
+    """Result of comparing a file with its module; ``str`` is a table.
 
     Args:
-        title: What was compared.
-        cases: One row a call.
+        title: Description of the file.
+        cases: One row for each call.
         bytes: Size of the file.
     """
 
@@ -67,7 +67,7 @@ class Verification:
 
     @property
     def max_error(self) -> float:
-        """Largest difference of all cases, relative to the local range."""
+        """Largest difference over all cases, relative to the local range."""
         return max(row.max_error for row in self.cases)
 
     @property
@@ -98,27 +98,27 @@ def verify(
     large: bool = False,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Verification:
-    """Compare a file with the module it came from.
+    """Compares a file with the module from which it was made.
 
-    The file passes ``onnx.checker`` in full and strict shape inference, uses standard operators only and holds its
-    weights; its inputs and output have the names, types and free sizes that :func:`to_onnx` promises; and onnxruntime
-    renders what the module renders with eager PyTorch (with the same layers and ``check=False``), to 1e-5 of the
-    largest light within the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced
-    ones. How far it is from the module as users call it is told beside that.
+    Checks that the file passes ``onnx.checker`` in full and strict shape inference, uses standard operators only and
+    contains its weights; that its inputs and output have the names, types and free sizes described at :func:`to_onnx`;
+    and that onnxruntime gives the result of eager PyTorch (with the same layers and ``check=False``) within 1e-5 of the
+    largest light in the reach of a kernel, for sizes, batches, focus distances and scenes other than the traced ones.
+    The report also has the difference from a normal call of the module.
 
     Args:
         path: The file.
         dof: The module.
-        large: Also compare, and time, a frame of 960 x 540.
-        progress: Is called with the name of each case as it begins.
+        large: Also compares and times a frame of 960 x 540.
+        progress: Called with the name of each case.
 
     Returns:
         The comparison, case by case.
 
     Raises:
-        ValueError: If the file is not valid, was made from another module, or renders something else; the message holds
-            the table.
-        FileNotFoundError: If there is no file.
+        ValueError: If the file is invalid, was made from another module, or gives another result; the message contains
+        the table.
+        FileNotFoundError: If the file is missing.
     """
     model = load(path)
     facts = facts_of(model, str(path))
@@ -142,7 +142,7 @@ def verify(
 
 
 def session(path: str | os.PathLike[str]) -> onnxruntime.InferenceSession:
-    """An onnxruntime session on the CPU with as many threads as PyTorch uses here."""
+    """An onnxruntime session on the CPU with as many threads as PyTorch uses."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
@@ -157,7 +157,7 @@ def local_range(image: Tensor, reach: int) -> Tensor:
 
 
 def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Case) -> CaseComparison:
-    """One case in eager PyTorch and in onnxruntime: errors and times."""
+    """Runs one case in eager PyTorch and in onnxruntime; returns errors and times."""
     start = time.perf_counter()
     with torch.no_grad():
         expected = portable(*case.tensors)
@@ -167,7 +167,7 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
     end = time.perf_counter()
     if got.dtype != np.float32 or got.shape != tuple(expected.shape):
         raise ValueError(f"{case.name}: expected float32 {list(expected.shape)}, got {got.dtype} {list(got.shape)}")
-    # coarser layers average light over their pixels before they blur it
+    # coarse layers average light over their pixels before blurring it
     blurs = portable.blurs((int(expected.shape[2]), int(expected.shape[3])))
     reach = max(blur.halo + blur.scale - 1 for blur in blurs)
     unit = local_range(case.tensors[0], min(reach, max(expected.shape[-2:])))
@@ -181,12 +181,12 @@ def _compare(runner: onnxruntime.InferenceSession, portable: Portable, case: Cas
 
 
 def check_format(model: onnx.ModelProto, path: str) -> None:
-    """Refuse a file that is not valid, needs other than standard operators, or is not whole.
+    """Raises an error if a file is invalid, needs non-standard operators, or keeps weights elsewhere.
 
     Raises:
-        ValueError: Saying which.
+        ValueError: With the reason.
     """
-    whole = onnx.load(path, load_external_data=False)  # a loaded model no longer says where its weights were
+    whole = onnx.load(path, load_external_data=False)  # a loaded model no longer contains where its weights were stored
     if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in _tensors(whole.graph)):
         raise ValueError(f"{path} keeps weights in another file")
     try:
@@ -200,7 +200,7 @@ def check_format(model: onnx.ModelProto, path: str) -> None:
 
 
 def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
-    """All that a graph and its branches hold."""
+    """All tensors of a graph and its subgraphs."""
     yield from graph.initializer
     for attribute in (attribute for node in graph.node for attribute in node.attribute):
         if attribute.HasField("t"):
@@ -210,7 +210,7 @@ def _tensors(graph: onnx.GraphProto) -> Iterator[onnx.TensorProto]:
 
 
 def _check_origin(facts: dict, dof: DepthOfField) -> None:
-    """Refuse a file that was made from another table, other options or another camera than the module's."""
+    """Raises an error if a file was made from another table, options or camera than the module's."""
     if facts["table"]["sha256"] != table_hash(dof.options.table):
         raise ValueError(f"the file was made with the table {facts['table']}, the module has {dof.options.table!r}")
     options: dict[str, Any] = {**dof.options.arguments()}
@@ -223,7 +223,7 @@ def _check_origin(facts: dict, dof: DepthOfField) -> None:
 
 
 def _check_interface(model: onnx.ModelProto, inputs: str) -> int:
-    """Names, types and free sizes; returns the channels."""
+    """Checks names, types and free sizes; returns the number of channels."""
     channels = model.graph.output[0].type.tensor_type.shape.dim[1].dim_value
     single, colours = (ITEMS, 1, "H", "W"), ("B", channels, "H", "W")
     lens = ((ITEMS,), (ITEMS,)) if inputs == "depth" else ()

@@ -1,4 +1,4 @@
-"""Capture to radial profile to fitted kernel to blur table: lengths in, lengths out, in the caller's unit."""
+"""Fits kernels to photographs of a dot or traced lenses, and makes blur tables; lengths in the caller's unit."""
 
 from .lens.trace import trace_table
 from .photo.across import table_of_dots

@@ -24,13 +24,13 @@ DATA, MODEL = "#7a7a7a", "#c2410c"
 
 
 def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
-    """Samples with the fitted curve: the paper's Fig. 2, its lengths in a unit.
+    """Samples with the fitted curve (the paper's Fig. 2); lengths are labelled with `unit`.
 
-    For a forward fit the samples are the blurred dot's pixels and the curve is the model of them, with the kernel's own
-    profile beside it; for a profile fit they are the samples of blur strength.
+    For a forward fit, the samples are the blurred dot's pixels and the curve is their model, together with the kernel's
+    own profile; for a profile fit, the samples are blur strengths.
 
     Raises:
-        FitError: the fit carries no samples.
+        FitError: the fit has no samples.
     """
     if not fit.samples.shape[1]:
         raise FitError("this fit carries no samples to draw")
@@ -40,7 +40,7 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
     if forward:
         r, level = model_line(fit)
         axes.plot(r, level, color=MODEL, label="forward model", zorder=3)
-        if fit.aperture is None:  # what is not round has no profile
+        if fit.aperture is None:  # kernels that are not round have no profile
             line = np.linspace(0, fit.samples[0].max(), 400)
             shape = evaluate(fit.family, line, fit.kernel_params())
             scaled = shape / shape.max() * level.max()
@@ -55,7 +55,7 @@ def picture_of_fit(fit: BlurFit, unit: str = "px", title: str = "") -> Figure:
 
 
 def model_line(fit: BlurFit) -> tuple[Array, Array]:
-    """Radii, and the mean level of a forward fit's model around them, in steps of half a unit."""
+    """Radii, and the mean level of a forward fit's model at these radii, in steps of half a unit."""
     bins = np.floor(fit.curve[0] * 2 + 0.5).astype(int)
     count = np.bincount(bins)
     r, level = (np.bincount(bins, row)[count > 0] / count[count > 0] for row in fit.curve)
@@ -63,7 +63,7 @@ def model_line(fit: BlurFit) -> tuple[Array, Array]:
 
 
 def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str = "") -> Figure:
-    """The blur texture at a signed circle of confusion of an image of a width in pixels: the paper's Fig. 3."""
+    """The blur texture at a signed circle of confusion, for an image `width` px wide (the paper's Fig. 3)."""
     texture = table.blur_texture(coc_px, width).detach().numpy()
     figure, axes = new_figure(4.2, 3.6)
     half = texture.shape[-1] / 2
@@ -77,7 +77,7 @@ def picture_of_texture(table: BlurTable, coc_px: float, width: int, title: str =
 
 
 def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
-    """A quad in focus and out of focus `[H, W]`, linear light, and the row through the middle: the paper's Fig. 4."""
+    """A quad in focus and out of focus `[H, W]`, linear light, and their middle rows (the paper's Fig. 4)."""
     figure, (left, right, below) = new_figure(9.6, 3.4, 3)
     white = float(sharp.max())
     show(left, sharp, "in focus", white=white)
@@ -92,7 +92,7 @@ def picture_of_quad(sharp: Array, blurred: Array, title: str = "") -> Figure:
 
 
 def picture_of_table(table: BlurTable, title: str = "") -> Figure:
-    """A table over depth: every parameter at its nodes, and the lines the table draws between them."""
+    """A table over depth: every parameter at its nodes, and the table's interpolation between them."""
     names = list(table.node_params)
     figure, axes = new_figure(3.2 * len(names), 3.2, len(names))
     reach = float(table.coc.abs().max())
@@ -125,7 +125,7 @@ def picture_of_table(table: BlurTable, title: str = "") -> Figure:
 def show(
     axes: Axes, picture: Array, title: str, *, white: float | None = None, box: Sequence[tuple[float, float]] = ()
 ) -> None:
-    """Draws a picture `[H, W]` in linear light as a display shows it, and a line through the corners of a box."""
+    """Draws a picture `[H, W]` in linear light, encoded for display, and a line through the corners of a box."""
     white = max(float(picture.max()) if white is None else white, 1e-12)
     axes.imshow(np.clip(picture / white, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
     if box:
@@ -135,8 +135,8 @@ def show(
 
 
 def new_figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Figure, Any]:
-    """A figure of a size in inches, and its axes side by side, in rows where there are several."""
-    # no pyplot: it would choose a screen and keep every figure alive
+    """A figure with a size in inches, and its axes in columns and rows."""
+    # not pyplot, which would choose a display and keep every figure in memory
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""What can be wrong with a capture or a fit: an error where no honest number can be given, else a warning."""
+"""Problems of a capture or a fit: an error if no reliable number can be given, otherwise a warning."""
 
 import sys
 import warnings
@@ -8,39 +8,39 @@ from pathlib import Path
 from typing import Literal
 
 Kind = Literal[
-    "argument",  # an argument of a function is not what it must be
-    "asymmetry",  # the blur is not round; `number`: share of its contrast that depends on the angle
+    "argument",  # an argument of a function is invalid
+    "asymmetry",  # the blur is not round; `number`: share of it that depends on the angle
     "boundary",  # a parameter ended on its bound; the bound
-    "camera",  # the blur, or EXIF, contradicts the camera's numbers and distances; fitted over promised
-    "distance",  # distances do not increase, equal the focus, or leave nothing of the dot; the first bad one, the size
+    "camera",  # the blur or EXIF contradicts the camera's numbers and distances; fitted over expected
+    "distance",  # distances do not increase, equal the focus, or make the dot vanish; the first bad one, or the size
     "exposure",  # the fitted gain contradicts the stated exposures; fitted over stated
-    "flat profile",  # the samples do not fix a parameter, or no shape at all; its relative error, variation over noise
-    "magnification",  # the blurred dot has not the expected size; fitted over expected
-    "manifest",  # the folder's manifest is missing, unreadable, or has a wrong field
-    "no dot",  # nothing stands out from the background; the peak over the noise
+    "flat profile",  # the samples do not determine a shape; a parameter's relative error, or variation over noise
+    "magnification",  # the blurred dot does not have the expected size; fitted over expected
+    "manifest",  # the folder's manifest is missing, unreadable, or has an invalid field
+    "no dot",  # nothing exceeds the noise enough; the peak over the noise
     "not converged",  # no start converged; the number of starts
-    "not finite",  # NaN or infinity in the data; how many
+    "not finite",  # NaN or infinity in the data; the number of values
     "not in focus",  # the sharp picture is soft; sigma of the dot's edge in px
-    "not linear",  # the pictures are not in linear light, or nobody said whether they are
-    "outside measured",  # a table is used beyond what was measured; the factor
+    "not linear",  # the pictures are not in linear light, or their encoding is unknown
+    "outside measured",  # a table is used outside its measured range; the factor
     "residual",  # the residual is far above the noise; their ratio
-    "saturated",  # pixels are clipped, or blacks are cut off; how many, or their share
-    "several dots",  # more than one dot where one was expected; how many
-    "single distance",  # one distance was measured, and is scaled to all others; that distance in m
-    "window",  # the window cuts the blur; the share of the light that falls outside
+    "saturated",  # pixels are clipped, or blacks are cut off; their number, or share
+    "several dots",  # more than one dot where one was expected; their number
+    "single distance",  # only one distance was measured and is scaled to all others; that distance in m
+    "window",  # the window cuts the blur; the share of light outside
 ]
-"""What a problem is about, and what its `number` then is."""
+"""The subject of a problem, and the meaning of its `number`."""
 
 _PACKAGE = str(Path(__file__).parent)
 
 
 class _Problem(Exception):
-    """A message that begins with the file it is about.
+    """A message that begins with the file concerned.
 
     Attributes:
-        kind: what it is about.
-        file: the picture or manifest, or None when only arrays were given.
-        number: the measured quantity that led to it, or None.
+        kind: the subject.
+        file: the picture or manifest, or None if only arrays were given.
+        number: the measured quantity, or None.
     """
 
     def __init__(
@@ -51,15 +51,15 @@ class _Problem(Exception):
 
 
 class FitError(_Problem, ValueError):
-    """A capture or a fit that cannot give an honest number; has a `kind`, a `file` and a `number`."""
+    """A capture or a fit that cannot give a reliable number; has a `kind`, a `file` and a `number`."""
 
 
 class FitWarning(_Problem, UserWarning):
-    """A number is given, but here is why to doubt it; has a `kind`, a `file` and a `number`."""
+    """A reason to doubt a result; has a `kind`, a `file` and a `number`."""
 
 
 def warn(message: str, kind: Kind, *, file: str | None = None, number: float | None = None) -> None:
-    """Warn, pointing at the line outside of this package that led here."""
+    """Warns, pointing at the caller's line outside of this package."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
         level, frame = level + 1, frame.f_back
@@ -67,8 +67,8 @@ def warn(message: str, kind: Kind, *, file: str | None = None, number: float | N
 
 
 @contextmanager
-def unheard() -> Iterator[None]:
-    """In which fits do not warn: another fit of the same pictures does."""
+def without_warnings() -> Iterator[None]:
+    """Suppresses warnings of fits, for pictures whose final fit will give them."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)
         yield

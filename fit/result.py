@@ -1,4 +1,4 @@
-"""What a fit returns: parameters with calibrated errors, and how well they explain the data."""
+"""The result of a fit: parameters with calibrated errors, and residuals."""
 
 import math
 from dataclasses import dataclass, field
@@ -21,31 +21,31 @@ class BlurFit:
         family: "gaussian", "ring", "disc", "softm" or "radial"; or, where the blur is not round, "polygon" or "image":
             a disc of `params["radius"]` seen through the `aperture`, as in `BlurTable.polygon` and `from_aperture`.
         params: the family's parameters (see `torchdof.optics.psf.FAMILIES`), lengths in the caller's unit (pixels for
-            `fit_pair`). Floats, and for `radial` the array "values" [P]. A profile fit (`fit_profile`, model "ratio")
+            `fit_pair`). Floats, except the array "values" [P] of `radial`. A profile fit (`fit_profile`, model "ratio")
+            also has the strength "N".
             has the strength "N" too.
         stderr: one standard error for each parameter, calibrated against repeated simulated captures.
-        radius: of the uniform disc with the PSF's second moment (forward model), px; NaN for a profile.
-        radius_stderr: its standard error. Unlike single parameters, which may trade with each other, it is well fixed.
-        residual: norm of (data - model) over norm of (data above background): 0 is perfect, 1 explains nothing.
-        noise: the noise that was expected in the data, as a share of the same norm. NaN where it is not known.
+        radius: of the uniform disc with the same second moment as the PSF (forward model), px; NaN for a profile.
+        radius_stderr: its standard error. The radius is well determined even if single parameters are correlated.
+        residual: norm of (data - model) over norm of (data above background): 0 is a perfect fit.
+        noise: the expected noise in the data, relative to the same norm. NaN if unknown.
         covariance: covariance of the parameters in `names` [n, n].
-        names: the order of `covariance`; also holds what was fitted beside the kernel ("dx", "dy", "magnification").
-        bic: Bayesian information criterion; lower is better, comparable between families on the same data.
+        names: the order of `covariance`; also includes other fitted parameters ("dx", "dy", "magnification").
+        bic: Bayesian information criterion; lower is better, comparable between families for the same data.
         count: the number of samples or pixels used.
         model: "forward", "ratio" or "profile".
         gain: the fitted exposure ratio between the pictures (forward model), else 1.
         background: the fitted level under the blurred dot (forward model), else 0.
         shift: the fitted displacement (x, y) of the blurred dot against the sharp one, px.
-        centre: (x, y) of the blurred dot in its picture, px from the middle of pixel (0, 0).
-        magnification: the fitted size of the blurred picture's dot over the sharp one's.
-        aperture: the lens's opening as it shows in the defocused picture (turned by half where that was nearer than the
-            focus), None where the kernel is round.
-        asymmetry: the share of the blur's light that depends on the angle in a way that the kernel does not have, NaN
-            where unknown.
-        why: one sentence: how the family was chosen.
-        psnr: for family="auto", dB on a natural image that each family reached against "radial".
-        samples: the radii and strengths [2, n] that a picture of the fit shows.
-        curve: the fitted curve at those radii, [2, m].
+        centre: (x, y) of the blurred dot in its picture, px from the centre of pixel (0, 0).
+        magnification: the fitted size of the dot in the blurred picture over its size in the sharp one.
+        aperture: the lens's opening as seen in the defocused picture (rotated by half a turn in front of the focus);
+            None for a round kernel.
+        asymmetry: share of the blur's light that depends on the angle but is not in the kernel; NaN if unknown.
+        why: one sentence on the choice of the family.
+        psnr: for family="auto", the PSNR of each family on a natural image against "radial", dB.
+        samples: radii and strengths [2, n] for plotting.
+        curve: the fitted curve for plotting, [2, m].
     """
 
     family: str
@@ -74,15 +74,15 @@ class BlurFit:
 
     @property
     def residual_over_noise(self) -> float:
-        """How far the residual lies above the noise: about 1 for a model that explains everything."""
+        """Residual over noise: about 1 if the model explains everything."""
         return self.residual / self.noise if self.noise > 0 else math.nan
 
     def kernel_params(self) -> dict[str, float | Array]:
-        """The parameters that `torchdof.optics.psf` takes (without the strength N and those of the aperture)."""
+        """Parameters for `torchdof.optics.psf`, that is, without the strength N and the aperture's parameters."""
         return {name: value for name, value in self.params.items() if name not in ("N", "rotation_deg", "curvature")}
 
     def summary(self) -> str:
-        """A few readable lines: each parameter with its error, the residual against the noise, the reason."""
+        """A few lines of text: each parameter with its error, the residual against the noise, why the family."""
         lines = [f"{self.family} ({self.model})"]
         for name, value in self.params.items():
             error = self.stderr[name]

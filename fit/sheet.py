@@ -1,4 +1,4 @@
-"""One sheet that shows a calibration from photographs: what was found, data, model, and a picture made with it."""
+"""One figure that documents a calibration from photographs: targets, data, model, and a rendered example."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 def sheet_of_photographs(
     photographs: Photographs, result: TableFit, render: Callable[[torch.Tensor, torch.Tensor, BlurTable], torch.Tensor]
 ) -> Figure:
-    """Draw the sheet.
+    """Draws the figure.
 
-    A row a distance: the target that was found, the window around its dot, its pixels over the distance from the centre
-    with the model's line, the residual, and the kernel. Below, rendered with the table: lights from near to far, and
-    the photograph in focus, around its dot, as far out of focus as was measured.
+    One row for each distance: the target found, the window around its dot, the window's pixels over the distance from
+    the centre with the model, the residual, and the kernel. Below, rendered with the table: lights from near to far,
+    and the window of the photograph in focus, blurred as at the most blurred distance.
 
     Args:
         photographs: from `read_photographs`.
-        result: from `fit_captures` of their captures.
-        render: `render(image, coc_px, table)`, all as `torchdof.blur_by_coc` takes them.
+        result: from `fit_captures` of the photographs' captures.
+        render: `render(image, coc_px, table)`, with the arguments of `torchdof.blur_by_coc`.
     """
     captures = photographs.captures
     rows = len(captures)
@@ -65,7 +65,7 @@ def sheet_of_photographs(
     window = sharp.light[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
     most, blurrest = max(zip(result.coc_px, captures, strict=True), key=lambda node: abs(node[0]))
     ends = min(0.0, *result.coc_px), max(0.0, *result.coc_px)
-    scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights over stripes
+    scene = 0.15 + 0.1 * (np.arange(720) // 12 % 2) * np.ones((90, 1))  # small lights on stripes
     scene[44:46, 18::36] = 25.0
     lights = _rendered(render, scene, result.table, captures.width_px, *ends)
     photograph = _rendered(render, window, result.table, captures.width_px, most, most)
@@ -84,9 +84,9 @@ def _rendered(
     left: float,
     right: float,
 ) -> Array:
-    """A part `[H, W]` of a frame of `width_px`, its circle of confusion going from `left` to `right` px."""
+    """Renders a part `[H, W]` of a frame `width_px` wide, with a circle of confusion from `left` to `right` px."""
     coc = torch.linspace(left, right, scene.shape[1], dtype=torch.float32).expand(1, 1, *scene.shape)
-    if table.unit == "mm" and table.sensor_width_mm is not None:  # seen through a part of the frame as wide as this
+    if table.unit == "mm" and table.sensor_width_mm is not None:  # the part has its own share of the sensor
         table = table.replace(sensor_width_mm=table.sensor_width_mm * scene.shape[1] / width_px)
     shown = render(torch.from_numpy(scene).float()[None, None], coc, table)
     return np.clip(shown[0, 0].numpy().astype(np.float64), 0, 1)

@@ -1,4 +1,4 @@
-"""Least squares by SciPy from several starts, and what is told of a solution; silent failures become named errors."""
+"""Least squares by SciPy from several starts, and statistics of a solution; failures raise errors."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -12,12 +12,12 @@ from .result import Array
 
 _ROUGH = 1e-3
 _LAST = 1e-5
-_TIGHT = 1e-13  # well-posed noise-free data should come back to ten digits
+_TIGHT = 1e-13  # well-posed data without noise give ten digits
 _ATTEMPTS = 400
 
 
 def one_thread() -> AbstractContextManager[object]:
-    """In which numpy, SciPy and PyTorch compute in one thread: a fit's steps are small, and threads cost more."""
+    """Limits numpy, SciPy and PyTorch to one thread: the steps of a fit are too small for more."""
     return threadpool_limits(limits=1)
 
 
@@ -31,22 +31,22 @@ def best_of(
     tolerance: float = _TIGHT,
     loyalty: float = 0.0,
 ) -> Array:
-    """Fit roughly from every start, finish from the best, and return the parameters.
+    """Fits roughly from every start, finishes from the best, and returns the parameters.
 
     Args:
-        model: from parameters `[p]` to what is held against the data `[n]`.
+        model: maps parameters `[p]` to a prediction of the data `[n]`.
         data: `[n]`, more samples than parameters, of order 1.
-        starts: parameter vectors, of order 1; moved into the bounds.
+        starts: parameter vectors, of order 1; moved inside the bounds.
         bounds: lower and upper bounds.
-        jacobian: the model's derivatives `[n, p]`; three-point differences when None.
-        tolerance: relative change of cost, parameters and gradient at which to stop.
-        loyalty: the first start is finished unless another one's sum of squares is smaller by more than this share.
+        jacobian: the model's derivatives `[n, p]`; None uses three-point differences.
+        tolerance: relative change of cost, parameters and gradient that ends the iteration.
+        loyalty: the first start is used unless another one reduces the sum of squares by more than this share.
 
     Raises:
-        FitError: of kind "not converged" when no start did.
+        FitError: of kind "not converged" if no start converged.
     """
     low, high = (np.asarray(side, dtype=np.float64) for side in bounds)
-    # keep starts off the bounds, where the trust region cannot move
+    # starts on a bound would be stuck: the trust region vanishes there
     margin = np.where(np.isfinite(high - low), 1e-6 * (high - low), 1e-9)
 
     def descend(start: Sequence[float] | Array, tolerance: float) -> tuple[float, Array] | None:
@@ -71,13 +71,13 @@ def best_of(
     best = min(reached, key=lambda r: r[0])
     if rough[0] is not None and rough[0][0] <= best[0] * (1 + loyalty):
         best = rough[0]
-    # a long narrow valley may take too many steps for the last digits; its floor is a solution all the same
+    # in a long narrow valley the last digits may take too many steps; a less exact solution is then accepted
     finished = descend(best[1], tolerance) or descend(best[1], max(tolerance, _LAST)) or best
     return np.asarray(min(finished, best, key=lambda r: r[0])[1])
 
 
 def inverse(information: Array) -> Array:
-    """Inverse of an information matrix; a direction without information gets an infinite variance, not an error."""
+    """Inverse of an information matrix; directions without information get infinite variance instead of an error."""
     scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     lost = values <= 1e-13 * max(values.max(), 1e-300)
@@ -89,5 +89,5 @@ def inverse(information: Array) -> Array:
 
 
 def information_criterion(squares: float, count: int, parameters: int) -> float:
-    """Bayesian information criterion of a least-squares fit, up to a constant of the data."""
+    """Bayesian information criterion of a least-squares fit, up to a constant that depends on the data only."""
     return count * float(np.log(max(squares, np.finfo(float).tiny) / count)) + parameters * float(np.log(count))

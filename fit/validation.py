@@ -1,4 +1,4 @@
-"""Arguments as the fits need them, or a refusal that says what was expected and what came."""
+"""Validation of arguments; errors contain the expected and the given value."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from torchdof.validation import number, show, whole
 from .problems import FitError
 from .result import Array
 
-_BRIGHTEST, _DARKEST = 1e30, 1e-30  # squares of levels, and their squares, are summed
+_BRIGHTEST, _DARKEST = 1e30, 1e-30  # the fourth powers of levels are summed
 
 
 def a_number(name: str, value: Any, low: float, high: float = np.inf, unit: str = "") -> float:
@@ -31,13 +31,13 @@ def a_count(name: str, value: Any, low: int, high: int) -> int:
 
 
 def a_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Refuse what is none of some texts with a `FitError`."""
+    """Raises a `FitError` if the value is not one of the choices."""
     if not isinstance(value, str) or value not in choices:
         raise FitError(f"{name} must be one of {', '.join(choices)}, got {show(value)}")
 
 
 def a_picture(name: str, picture: ArrayLike, smallest: int, file: str | None = None) -> Array:
-    """A picture `[H, W]` of finite numbers with a least number of pixels on a side.
+    """A picture `[H, W]` of finite numbers with at least `smallest` pixels on each side.
 
     Raises:
         FitError: it is not an array of real numbers, too small, or so bright or dark that squares overflow; of kind

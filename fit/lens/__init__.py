@@ -1,4 +1,4 @@
-"""From a lens prescription, by tracing rays, to a blur table."""
+"""Makes blur tables of lens prescriptions by tracing rays."""
 
 from .lens import Lens
 from .trace import trace_table

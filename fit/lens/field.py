@@ -1,4 +1,4 @@
-"""A lens's spots across the field: traced at distances from the axis and in depth, gathered in boxes."""
+"""Traces a lens's spots over the field: at several distances from the axis and in depth, as sampled boxes."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,11 +12,11 @@ from ..result import Array
 from .lens import Lens
 from .spot import Reference, point_spread
 
-_CELLS = (128, 64)  # of half a spot, along and across
-_GROWING = 1.5  # power of the number of a node that its coc grows with
-_CHIEF = 0.1  # of the stop's diameter, through which a place in the sharp image is seen
+_CELLS = (128, 64)  # of half a spot, along and across the radial direction
+_GROWING = 1.5  # coc grows with this power of the node's index
+_CHIEF = 0.1  # diameter, relative to the stop's, of the small stop that defines a position in the sharp image
 _CHIEF_RAYS = 900
-_TRIES = 3  # to hit a place in the frame, past the lens's distortion
+_TRIES = 3  # iterations that correct the lens's distortion
 
 
 def trace_field(
@@ -29,10 +29,10 @@ def trace_field(
     rays: int,
     reference: Reference,
 ) -> Field:
-    """Spots at signed coc, whose object distances a function tells, and at distances from the middle of the frame.
+    """Traces spots at signed coc, whose object distances are given by `distance_m`, and at distances from the centre.
 
     Raises:
-        ValueError: If no ray reaches a place.
+        ValueError: If no ray reaches a position.
     """
     rows, columns = _CELLS
     heights = [field_height_mm(lens, distance_m(0.0), sensor_mm, radius, reference) for radius in radius_mm]
@@ -44,7 +44,7 @@ def trace_field(
                 for wavelength in (wavelengths_um or (None,))
             ]
             low, high = min(u.min() for u, _, _ in spots), max(u.max() for u, _, _ in spots)
-            # a ray's light goes to the cells around it, so it lies half a cell inside the box
+            # a ray's light is split among the cells around it, so rays lie half a cell inside the box
             middle, length = (low + high) / 2, max(high - low, 1e-9) / 2 * rows / (rows - 1)
             wide = max(1e-9, *(np.abs(v).max() for _, v, _ in spots)) * 2 * columns / (2 * columns - 1)
             boxes.append((middle, length, wide))
@@ -59,14 +59,14 @@ def trace_field(
 
 
 def _gathered(u: Array, v: Array, weight: Array) -> Array:
-    """Light of rays at places from -1 to 1 along and 0 to 1 across, divided among the four cells around each."""
+    """Splits the light of rays, at -1 to 1 along and 0 to 1 across, among the four cells around each."""
     rows, columns = _CELLS
     along, across = (u + 1.0) * (rows / 2) - 0.5, v * columns - 0.5
     row, column = np.floor(along).astype(int), np.floor(across).astype(int)
     cells = np.zeros(rows * columns)
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
         share = (1.0 - np.abs(along - row - down)) * (1.0 - np.abs(across - column - right))
-        # half a spot: what lies beside its axis, in column -1, is mirrored
+        # half a spot: cells beyond its axis (column -1) are mirrored
         mirrored = np.clip(np.abs(column + right + 0.5) - 0.5, 0, columns - 1).astype(int)
         cells += np.bincount(np.clip(row + down, 0, rows - 1) * columns + mirrored, weight * share, cells.size)
     return cells.reshape(rows, columns)
@@ -81,9 +81,9 @@ def spot_of_place(
     wavelength_um: float | None = None,
     reference: Reference = "principal",
 ) -> tuple[Array, Array, Array]:
-    """Where the light of a point falls, from where its sharp image is: away from the axis, across, and its weight.
+    """Positions of a point's light relative to its sharp image: away from the axis, across, and weight.
 
-    The sharp image is the one that the lens makes of it in the d line through a small stop. Arguments are those of
+    The sharp image is that of the d line through a small stop. Arguments are those of
     :func:`torchdof.fit.lens.spot.point_spread`; lengths in mm ``[R]``.
     """
     spot = point_spread(
@@ -94,7 +94,7 @@ def spot_of_place(
 
 
 def chief_ray_mm(lens: Lens, z_m: float, sensor_mm: float, field_mm: float, reference: Reference) -> float:
-    """Distance from the axis at which a small stop shows a point, in the d line."""
+    """Distance from the axis, in mm, of a point's image through a small stop, in the d line."""
     if field_mm == 0.0:
         return 0.0
     stopped = lens.with_stop(lens.surfaces[lens.stop].diameter * _CHIEF)
@@ -102,7 +102,7 @@ def chief_ray_mm(lens: Lens, z_m: float, sensor_mm: float, field_mm: float, refe
 
 
 def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, reference: Reference) -> float:
-    """The ``field_mm`` of a point that is seen at a distance from the middle of the frame, past the distortion."""
+    """The ``field_mm`` of a point whose image is at `radius_mm` from the centre; corrects the distortion."""
     height = radius_mm
     for _ in range(_TRIES if radius_mm else 0):
         height *= radius_mm / chief_ray_mm(lens, z_m, sensor_mm, height, reference)
@@ -110,9 +110,9 @@ def field_height_mm(lens: Lens, z_m: float, sensor_mm: float, radius_mm: float, 
 
 
 def coc_nodes(near_mm: float, far_mm: float, count: int) -> list[float]:
-    """Signed coc from the nearest to the farthest, closer to each other near focus; so many on either side on average.
+    """Signed coc from the nearest to the farthest, denser near focus, on average `count` on each side.
 
-    The side that reaches farther has more of them, by the square root of how far.
+    The number on each side is proportional to the square root of its reach.
 
     Example:
         >>> [round(coc, 3) for coc in coc_nodes(-0.8, 0.2, 3)]

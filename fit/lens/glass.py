@@ -1,11 +1,11 @@
-"""Glasses: refractive index in air at any wavelength.
+"""Glasses: the refractive index in air at any wavelength.
 
-A catalogue's glass has the coefficients of Sellmeier's formula, with the wavelength l in micrometres:
+Glasses of a catalogue have the coefficients of Sellmeier's formula, with the wavelength l in micrometres:
 
     ``n^2 - 1 = B1 l^2 / (l^2 - C1) + B2 l^2 / (l^2 - C2) + B3 l^2 / (l^2 - C3)``
 
-It holds the catalogue's indices to their last digit. A glass of which only numbers are known has Cauchy's three terms,
-``n = a + b / l^2 + c / l^4``. What ships is ``glasses/schott.txt``; its source is stated there.
+It reproduces the catalogue's indices to the last digit. Glasses described by a few indices have Cauchy's formula, ``n =
+a + b / l^2 + c / l^4``. ``glasses/schott.txt`` is included; its source is stated there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from torchdof.validation import number, show
 
 D_UM, F_UM, C_UM, G_UM = 0.58756, 0.48613, 0.65627, 0.43584
-_LARGEST = 1e100  # coefficient, whose products are numbers too
+_LARGEST = 1e100  # of a coefficient; products stay finite
 _CATALOGUE = Path(__file__).parent / "glasses" / "schott.txt"
 
 
@@ -29,12 +29,12 @@ class Glass:
     """A glass, or another medium.
 
     Args:
-        name: As a prescription has it.
-        coefficients: ``B1, B2, B3, C1, C2, C3`` of Sellmeier's formula, the C in square micrometres; or ``a, b, c`` of
+        name: As in a prescription.
+        coefficients: ``B1, B2, B3, C1, C2, C3`` of Sellmeier's formula, with C in square micrometres; or ``a, b, c`` of
             Cauchy's.
 
     Raises:
-        ValueError: If these are not so many finite numbers that make an index from 1 to 5 between 0.4 and 0.7 um.
+        ValueError: If these are not 3 or 6 finite numbers that give an index from 1 to 5 between 0.4 and 0.7 um.
 
     Example:
         >>> round(Glass.named("N-BK7").index(0.58756), 5)
@@ -45,7 +45,7 @@ class Glass:
     coefficients: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        """Check that it is a glass."""
+        """Validates the coefficients."""
         given = self.coefficients
         plain = isinstance(given, tuple) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
         if not plain or len(given) not in (3, 6) or not all(abs(value) <= _LARGEST for value in given):
@@ -60,7 +60,7 @@ class Glass:
         """A glass of the catalogue.
 
         Raises:
-            ValueError: If there is none of that name; the message tells how to state it.
+            ValueError: If the name is unknown; the message contains the alternatives.
         """
         if not isinstance(name, str) or name.upper() not in catalogue():
             raise ValueError(
@@ -71,10 +71,10 @@ class Glass:
 
     @classmethod
     def of_numbers(cls, index: float, *dispersion: float) -> Glass:
-        """A glass by its index n_d at the d line, Abbe number and partial dispersion, as catalogues list them.
+        """A glass from its index n_d at the d line, Abbe number and partial dispersion, as listed in catalogues.
 
-        The Abbe number is ``V = (n_d - 1) / (n_F - n_C)``; without it the index is the same at any wavelength. The
-        partial dispersion is ``P_gF = (n_g - n_F) / (n_F - n_C)``; without it that of a normal glass is taken.
+        The Abbe number is ``V = (n_d - 1) / (n_F - n_C)``; without it the index is the same at all wavelengths. The
+        partial dispersion is ``P_gF = (n_g - n_F) / (n_F - n_C)``; without it that of a normal glass is assumed.
 
         Reference:
             SCHOTT, "TIE-29: Refractive index and dispersion", 2016 (the line of normal glasses).
@@ -94,7 +94,7 @@ class Glass:
         """Refractive index in air, from 0.3 to 1.2 micrometres.
 
         Raises:
-            ValueError: If the formula gives none from 1 to 5 there: the wavelength is beyond what the glass lets pass.
+            ValueError: If the index is not from 1 to 5: the wavelength is outside the glass's transmission range.
         """
         square = number("wavelength_um", wavelength_um, low=0.299, high=1.201, unit="micrometres") ** 2
         given = self.coefficients
@@ -110,7 +110,7 @@ class Glass:
 
 @functools.cache
 def catalogue() -> dict[str, Glass]:
-    """The glasses that ship, by name in capitals."""
+    """The glasses of the catalogue, by upper-case name."""
     lines = (line.partition("#")[0].split() for line in _CATALOGUE.read_text(encoding="utf-8").splitlines())
     return {name: Glass(name, tuple(map(float, given))) for name, *given in filter(None, lines)}
 

@@ -1,7 +1,7 @@
-"""Lenses: the list of surfaces a lens is made of, and what first-order optics tells of it.
+"""Lenses: a list of surfaces, and their first-order optics.
 
-Light travels to the right, along +z; z = 0 at the first surface's vertex. A positive radius is convex to the object.
-Lengths are in millimetres. :mod:`torchdof.fit.lens.prescription` describes the file format.
+Light travels to the right, along +z; z = 0 at the first surface's vertex. A positive radius is convex towards the
+object. Lengths are in millimetres. :mod:`torchdof.fit.lens.prescription` describes the file format.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from .glass import AIR, C_UM, D_UM, F_UM
 from .surface import Surface
 
 RGB_UM = (C_UM, 0.54607, F_UM)
-"""Wavelengths that stand for red, green and blue, in micrometres: the lines C, e and F."""
+"""Wavelengths for red, green and blue, in micrometres: the lines C, e and F."""
 
 _SHIPPED = Path(__file__).parent / "lenses"
-_LARGEST = 1e12  # mm, of focal lengths and what else first-order optics tells of a lens
-_MARKED = 1.03  # a lens is sold by a rounded f-number: f/2.03 is marked f/2
+_LARGEST = 1e12  # mm; limit of focal lengths and other first-order properties
+_MARKED = 1.03  # the f-number of a lens is rounded: f/2.03 is marked f/2
 
 
 class Paraxial(NamedTuple):
     """First-order properties of a lens in air, object at infinity. Millimetres; positions along +z.
 
-    The front focal point and the exit pupil are the rear focal point and the entrance pupil of :meth:`Lens.turned`.
+    For the front focal point and the exit pupil, take the rear focal point and the entrance pupil of
+    :meth:`Lens.turned`.
 
     Attributes:
         focal_length: f.
@@ -58,12 +59,12 @@ class Lens:
 
     Args:
         surfaces: Front to rear; the medium behind the last one has index 1.
-        stop: Number of the surface that is the aperture stop.
+        stop: Index of the surface that is the aperture stop.
         name: Short name.
-        source: Where the numbers are from.
+        source: Origin of the numbers.
 
     Raises:
-        ValueError: If an argument is not as described.
+        ValueError: If an argument is invalid.
 
     Reference:
         Kolb, Mitchell, Hanrahan, "A realistic camera model for computer graphics", SIGGRAPH 1995, section 3.1.
@@ -80,7 +81,7 @@ class Lens:
     source: str = ""
 
     def __post_init__(self) -> None:
-        """Check that it is a lens."""
+        """Validates the surfaces and the stop."""
         if not isinstance(self.surfaces, tuple) or not all(isinstance(one, Surface) for one in self.surfaces):
             raise ValueError(f"surfaces must be a tuple of Surface, got {show(self.surfaces)}")
         whole("stop", self.stop, 0, len(self.surfaces) - 1)
@@ -89,14 +90,14 @@ class Lens:
 
     @classmethod
     def read(cls, source: str | os.PathLike[str]) -> Lens:
-        """Read a prescription or a Zemax file (.zmx), or a shipped prescription by its name.
+        """Reads a prescription or a Zemax file (.zmx), or an included prescription by name.
 
         Args:
             source: Path of a file, or a name: ``"double_gauss_50mm"``, ``"wide_22mm"``, ``"telephoto_250mm"``.
 
         Raises:
-            ValueError: If the content is not a prescription; the message names file, line and column.
-            FileNotFoundError: If there is neither such a file nor such a shipped lens.
+            ValueError: If the content is not a prescription; the message contains file, line and column.
+            FileNotFoundError: If there is no such file and no included lens of this name.
         """
         if not isinstance(source, str | os.PathLike):
             raise ValueError(f"source must be the name or the path of a prescription, got {show(source)}")
@@ -120,16 +121,16 @@ class Lens:
 
     @property
     def dispersive(self) -> bool:
-        """Whether any glass has another index in another colour."""
+        """Whether any glass has different indices for different colours."""
         return bool((self.indices(F_UM) != self.indices(C_UM)).any())
 
     def indices(self, wavelength_um: float | None = None) -> Array:
-        """Refractive indices before the first surface (air) and behind each ``[S + 1]``; None is the d line."""
+        """Refractive indices before the first surface (air) and behind each surface ``[S + 1]``; None is the d line."""
         wavelength_um = D_UM if wavelength_um is None else wavelength_um
         return np.array([1.0, *(surface.glass.index(wavelength_um) for surface in self.surfaces)])
 
     def paraxial(self, wavelength_um: float | None = None) -> Paraxial:
-        """First-order properties, by matrices on height and angle.
+        """First-order properties, by ray transfer matrices.
 
         Raises:
             ValueError: If the lens does not converge light.
@@ -162,7 +163,7 @@ class Lens:
     def with_f_number(self, f_number: float) -> Lens:
         """The lens stopped down so that its paraxial f-number is ``f_number``.
 
-        A lens is sold by a rounded f-number. An ``f_number`` up to 3 % below that of the open stop means fully open.
+        The f-number of a lens is rounded. An ``f_number`` up to 3 % below that of the open stop means fully open.
 
         Raises:
             ValueError: If the lens cannot be opened that far.
@@ -174,7 +175,7 @@ class Lens:
         return self.with_stop(self.surfaces[self.stop].diameter * min(1.0, open_at / f_number))
 
     def scaled(self, focal_length_mm: float) -> Lens:
-        """The lens enlarged or shrunk as a whole to another focal length; its f-number stays."""
+        """The lens scaled to another focal length; its f-number is unchanged."""
         factor = number("focal_length_mm", focal_length_mm, 0, 1e9) / self.paraxial().focal_length
         scaled = [
             replace(one, thickness=one.thickness * factor, diameter=one.diameter * factor).bent(factor)
@@ -183,7 +184,7 @@ class Lens:
         return replace(self, surfaces=tuple(scaled))
 
     def turned(self) -> Lens:
-        """The lens with its rear in front.
+        """The lens with front and rear exchanged.
 
         Example:
             >>> lens = Lens.read("double_gauss_50mm")

@@ -1,12 +1,13 @@
-"""Nodes of a traced table: where they are, and kernels fitted to the spots of all of them, smooth over depth.
+"""Nodes of a traced table: their positions, and kernels fitted to their spots, smooth over depth.
 
-Everything is compared in the frequency domain: the transfer function of a spot (its Hankel transform, a sum of Bessel
-functions over the rays) against that of a profile, weighted by the spectrum of natural images (amplitude 1/frequency)
-and the area of a pixel. The squared difference is the squared error in a photograph, up to a constant.
+Spots and profiles are compared in the frequency domain. The transfer function of a spot (its Hankel transform, a sum of
+Bessel functions over the rays) and that of a profile are weighted by the spectrum of natural images (amplitude
+1/frequency) and the area of a pixel. The squared difference is then the squared error in a photograph, up to a
+constant.
 
-The default family ``"radial"`` is linear in its values once the radius is set, and the radius is geometry: that of the
-outermost ray. So the fit is a convex problem without branches to jump between, and it is solved for all nodes at once
-against spots at the nodes *and between them*, where the table will interpolate.
+The default family ``"radial"`` is linear in its values for a given radius, and the radius is that of the outermost ray.
+So the fit is a convex problem with a single solution. It is solved for all nodes at once, against spots at the nodes
+*and between them*, where the table interpolates.
 """
 
 import functools
@@ -27,21 +28,21 @@ from ..result import Array
 from ..solve import best_of
 from .spot import Spot
 
-_FINEST = 3.0  # cycles a pixel; kernels are sampled on the pixel grid, so frequencies beyond it fold back
-_BETWEEN = (0.25, 0.5, 0.75)  # where between two nodes spots are traced for the joint fit
+_FINEST = 3.0  # cycles for each pixel; kernels are sampled on the pixel grid, so higher frequencies are aliased
+_BETWEEN = (0.25, 0.5, 0.75)  # fractions of the interval between two nodes, at which spots are traced for the joint fit
 _SWEEPS = 6
-_PULL = 1e-4  # weight of a ray histogram where spots tell nothing (details far below a pixel)
-_NARROW = 0.01  # pixels of coc; an interval that narrow is not divided
-_WANTED_DB = 62.0  # PSNR of a natural image in the middle of an interval; beside it it may be some dB less
+_PULL = 1e-4  # weight of a ray histogram where spots do not determine a profile (details far below a pixel)
+_NARROW = 0.01  # pixels of coc; narrower intervals are not divided
+_WANTED_DB = 62.0  # PSNR of a natural image in the middle of an interval; elsewhere it may be a few dB less
 _CONTRAST = 0.22  # standard deviation of natural images over their peak
-# of named shapes: where parameters may lie, lengths relative to the outermost ray; the profile's samples, up to so many
-# times that ray; the weight of staying like the neighbour, so that parameters that hardly matter do not jump
+# for named shapes: ranges of parameters, lengths relative to the outermost ray; number of the profile's samples, and
+# their reach relative to that ray; weight of the neighbour's parameters, which avoids jumps of irrelevant ones
 _RANGES = {"radius": (0.02, 1.3), "sigma": (0.01, 1.0), "r_c": (0.0, 1.3), "b": (-1.0, 20.0), "m": (0.5, 12.0)}
 _STEPS, _REACH, _KEEP = 400, 2.0, 1e-3
 
 
 class NodeEquations(NamedTuple):
-    """A traced spot as a quadratic form: values v miss it, squared, by ``v @ gram @ v - 2 pull @ v + constant``."""
+    """A traced spot as a quadratic form: the squared error of values v is ``v @ gram @ v - 2 pull @ v + constant``."""
 
     radius: float
     gram: Array
@@ -50,23 +51,24 @@ class NodeEquations(NamedTuple):
     histogram: Array
 
     def error(self, values: Array) -> float:
-        """Weighted squared error of profile values."""
+        """Weighted squared error of a profile's values."""
         return max(float(values @ self.gram @ values - 2.0 * self.pull @ values + self.constant), 0.0)
 
 
 class Tracer:
-    """Traces spots by coc and keeps them; their equations are for profiles piecewise linear at ``points`` radii."""
+    """Traces spots by coc, with a cache; equations are for profiles that are piecewise linear at ``points`` radii."""
 
     def __init__(self, spot: Callable[[float], Spot], points: int, pixel: float) -> None:
         self.spot, self.points, self.pixel = spot, points, pixel
         self.frequency = np.linspace(1 / 256, _FINEST, 400)
-        # amplitude of natural images times the area of a ring of frequencies; flat beyond Nyquist, where it folds back
+        # amplitude of natural images times the area of a ring of frequencies; constant beyond Nyquist, because of
+        # aliasing
         spectrum = np.minimum(self.frequency, 0.5) ** -0.5
         self.weight = spectrum / np.sqrt(1.0 + (np.pi * self.frequency) ** 2)
         fine = 12 * (points - 1)
-        self._r = (np.arange(fine) + 0.5) / fine  # within a profile, relative to its radius
+        self._r = (np.arange(fine) + 0.5) / fine  # radii relative to the profile's
         self._light = _hats(self._r, points) * (2.0 * np.pi * self._r / fine)[:, None]
-        self.area = self._light.sum(0)  # of each hat, which is the light in it
+        self.area = self._light.sum(0)  # integral of each hat
         self.traced, self.alone = functools.cache(self._traced), functools.cache(self._alone)
 
     def _traced(self, coc: float) -> tuple[Array, Array, Array]:
@@ -77,29 +79,29 @@ class Tracer:
         return r, light, np.sum([j0(2.0 * np.pi * np.outer(self.frequency, r[i])) @ light[i] for i in pieces], axis=0)
 
     def _alone(self, coc: float) -> tuple[NodeEquations, Array]:
-        """The equations of the spot at a node, whose radius is that of the outermost ray, and values that fit it."""
+        """Equations of the spot at a node, with the radius of the outermost ray, and values that fit it."""
         node = self.equations(coc, float(self.traced(coc)[0].max()))
         return node, self.fitted(node.gram, node.pull, node.histogram)
 
     def equations(self, coc: float, radius: float) -> NodeEquations:
-        """The equations of the spot at a coc, for profiles that end at ``radius`` pixels."""
+        """Equations of the spot at a coc, for profiles that end at ``radius`` pixels."""
         r, light, transfer = self.traced(coc)
         basis = j0(2.0 * np.pi * np.outer(self.frequency, self._r * radius)) @ self._light * self.weight[:, None]
-        heavy = 1e4 * self.weight.max() ** 2  # all light, whatever the frequencies tell
+        heavy = 1e4 * self.weight.max() ** 2  # fixes the total light, whatever the frequencies
         gram = basis.T @ basis + heavy * np.outer(self.area, self.area)
         pull = basis.T @ (transfer * self.weight) + heavy * self.area
         histogram = light @ _hats(np.minimum(r / radius, 1.0), self.points) / self.area
         return NodeEquations(radius, gram, pull, float(((transfer * self.weight) ** 2).sum() + heavy), histogram)
 
     def fitted(self, gram: Array, pull: Array, prior: Array) -> Array:
-        """Non-negative least squares of a quadratic form, towards a prior where it is flat; light sums to 1."""
+        """Non-negative least squares of a quadratic form, with a prior where it is flat; the light sums to 1."""
         scale = _PULL**2 * np.trace(gram) / np.sum(self.area) * self.area
         factor = cholesky(gram + np.diag(scale), lower=True)
         values, _ = nnls(factor.T, solve_triangular(factor, pull + scale * prior, lower=True), maxiter=50 * len(pull))
         return values / (self.area @ values)
 
     def relative(self, error: float) -> float:
-        """Root of a squared error over that of a kernel that passes no light."""
+        """Root of a squared error, relative to that of an empty kernel."""
         return math.sqrt(error / float((self.weight**2).sum()))
 
 
@@ -109,12 +111,12 @@ def _hats(r: Array, points: int) -> Array:
 
 
 def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> list[float]:
-    """Signed coc of the nodes: intervals are halved where the table's interpolation is worst in the middle.
+    """Signed coc of the nodes: repeatedly halves the interval with the worst interpolation in its middle.
 
-    None halves as many as it takes for 50 dB between the nodes.
+    If ``nodes`` is None, until the interpolation reaches 50 dB everywhere.
 
     Raises:
-        ValueError: If there are no more intervals to halve.
+        ValueError: If no interval is left to halve.
     """
 
     def gap(left: float, right: float) -> float:
@@ -142,9 +144,9 @@ def place_nodes(tracer: Tracer, near: float, far: float, nodes: int | None) -> l
 
 
 def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array], Array]:
-    """Values of all nodes at once, by sweeps from both ends to the focus and back."""
+    """Values of all nodes together, in sweeps from both ends to the focus and back."""
     nodes, values = map(list, zip(*(tracer.alone(coc) for coc in places), strict=True))
-    # of each node: equations that its values enter, with what weight, and the node that has the rest of it
+    # for each node: equations that contain its values, their weight in them, and the node with the remaining weight
     spots: list[list[tuple[NodeEquations, float, int]]] = [[(node, 1.0, i)] for i, node in enumerate(nodes)]
     for i, (left, right) in enumerate(pairwise(zip(places, nodes, strict=True))):
         for share in _BETWEEN:
@@ -162,13 +164,13 @@ def fit_radial(tracer: Tracer, places: Sequence[float]) -> tuple[dict[str, Array
 
 
 def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[dict[str, Array], Array]:
-    """A named shape at each node, each started from its neighbour, from both ends to the focus."""
+    """A named shape at each node, starting from its neighbour's, from both ends to the focus."""
     names = FAMILIES[family]
     params, residual, before = np.zeros((len(names), len(places))), np.zeros(len(places)), None
     for i in _to_focus(places):
         r, light, transfer = tracer.traced(places[i])
         outermost, rms = float(r.max()), math.sqrt(float(light @ (r * r)))
-        before = None if i == len(places) - 1 else before  # there the other side begins
+        before = None if i == len(places) - 1 else before  # the other side begins here
         before, error = _fit_shape(family, tracer, outermost, transfer, rms / outermost, before)
         params[:, i] = before * [outermost * tracer.pixel if name in LENGTHS else 1.0 for name in names]
         residual[i] = tracer.relative(error)
@@ -176,7 +178,7 @@ def fit_shapes(tracer: Tracer, places: Sequence[float], family: str) -> tuple[di
 
 
 def _to_focus(places: Sequence[float]) -> list[int]:
-    """Numbers of the nodes from both ends to the focus."""
+    """Indices of the nodes from both ends to the focus."""
     focus = int(np.argmin(np.abs(places)))
     return [*range(focus), *range(len(places) - 1, focus - 1, -1)]
 
@@ -184,13 +186,13 @@ def _to_focus(places: Sequence[float]) -> list[int]:
 def _fit_shape(
     family: str, tracer: Tracer, outermost: float, spot_transfer: Array, rms: float, before: Array | None
 ) -> tuple[Array, float]:
-    """Parameters of a shape whose transfer function is nearest to a spot's, and the weighted squared error.
+    """Parameters of the shape whose transfer function is nearest to a spot's, and the weighted squared error.
 
-    Lengths are relative to the spot's outermost ray. A neighbour's parameters are a start and a weak pull.
+    Lengths are relative to the spot's outermost ray. The neighbour's parameters are a start and a weak prior.
     """
     names, weight, frequency = FAMILIES[family], tracer.weight, tracer.frequency * outermost
     low, high = np.array([_RANGES[name] for name in names]).T
-    if family == "softm":  # a small radius with a wide edge and a large tilt would be a second branch
+    if family == "softm":  # a second branch has a small radius, a wide edge and a large tilt
         low[0] = 0.5
     sigma = {"gaussian": 0.5**0.5, "ring": 0.5}.get(family, 0.05) * rms
     geometry = {"radius": 2.0**0.5 * rms, "sigma": sigma, "r_c": 0.7 * rms, "b": 0.0, "m": 2.0}

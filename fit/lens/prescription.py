@@ -1,4 +1,4 @@
-"""The text of a lens prescription: a table of surfaces, front to rear, one a line.
+"""The text format of lens prescriptions: a table of surfaces, front to rear, one on each line.
 
 ::
 
@@ -7,14 +7,14 @@
     29.475    3.76       1.67   25.2
     0         4.5        0      17.1
 
-Millimetres. ``thickness`` is the distance to the next surface, ``index`` the refractive index behind the surface and
-``diameter`` the clear diameter. Radius 0 is a flat aperture stop in the medium before it (its index 0), ``inf`` a flat
-surface. Behind the columns ``stop`` says that any other surface is the stop, and an even asphere has its conic constant
-and polynomial, ``k=-0.6 A4=1.2e-6 A6=-3e-9`` (:mod:`torchdof.fit.lens.surface`).
-``1.67/47.1`` is an index at 587.56 nm (the d line) with its Abbe number V, and ``1.67/47.1/0.557`` has its partial
-dispersion P_gF too, as glass catalogues list them; without any the glass has the same index at any wavelength. Instead
-of an index there may be the name of a glass: one of SCHOTT's (``N-BK7``), or one that a line before it defines by its
-coefficients of Sellmeier's formula, ``glass NAME B1 B2 B3 C1 C2 C3``. ``#`` starts a comment; ``# source:`` is kept.
+Lengths are in millimetres. ``thickness`` is the distance to the next surface, ``index`` the refractive index behind the
+surface and ``diameter`` the clear diameter. Radius 0 is a flat aperture stop in the medium before it (its index is 0),
+``inf`` a flat surface. After the columns, ``stop`` makes any other surface the stop, and an even asphere has its conic
+constant and polynomial, ``k=-0.6 A4=1.2e-6 A6=-3e-9`` (:mod:`torchdof.fit.lens.surface`).
+``1.67/47.1`` is an index at 587.56 nm (the d line) with its Abbe number V, and ``1.67/47.1/0.557`` also has its partial
+dispersion P_gF, as listed in glass catalogues; an index alone is the same at any wavelength. Instead of an index there
+may be the name of a glass: one of SCHOTT's (``N-BK7``), or one defined on an earlier line by its coefficients of
+Sellmeier's formula, ``glass NAME B1 B2 B3 C1 C2 C3``. ``#`` starts a comment; ``# source:`` is kept.
 """
 
 import math
@@ -29,10 +29,10 @@ _SHAPE = ("k", *(f"A{power}" for power in range(2, 18, 2)))
 
 
 def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
-    r"""Read the text of a prescription: the surfaces, the number of the stop, and the source.
+    r"""Reads the text of a prescription: the surfaces, the index of the stop, and the source.
 
     Raises:
-        ValueError: If it is not a prescription; the message names line and column.
+        ValueError: If it is not a prescription; the message contains line and column.
 
     Example:
         >>> surfaces, stop, _ = parse(b"50 5 1.5/64 20 \n 0 1 0 18 \n -50 0 1 20")
@@ -71,7 +71,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
 
 
 def _surface(words: list[str], before: Glass, defined: dict[str, Glass]) -> tuple[Surface, bool]:
-    """The surface of a line behind a medium, and whether it is the stop."""
+    """The surface on a line, behind a medium, and whether it is the stop."""
     if len(words) < 4:
         raise ValueError(f"expected the columns {_COLUMNS}, got {len(words)}: {' '.join(words)!r}")
     radius, thickness, diameter = (_number(_COLUMNS.split()[i], words[i]) for i in (0, 1, 3))
@@ -110,7 +110,7 @@ def _number(name: str, text: str) -> float:
 
 
 def lines(surfaces: Sequence[Surface], stop: int) -> list[str]:
-    """Surfaces as lines of a prescription, the inverse of :func:`parse`."""
+    """Surfaces as lines of a prescription; the inverse of :func:`parse`."""
     media = [AIR, *(surface.glass for surface in surfaces)]
     own = {glass.name: glass for glass in media if len(glass.coefficients) == 6 and glass not in catalogue().values()}
     written = [" ".join(["glass", name, *map(repr, glass.coefficients)]) for name, glass in own.items()]

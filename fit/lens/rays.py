@@ -1,4 +1,4 @@
-"""Real rays through a lens: where they cross each surface, and Snell's law there."""
+"""Traces real rays through a lens: intersection with each surface, and Snell's law."""
 
 from typing import NamedTuple
 
@@ -7,8 +7,8 @@ import numpy as np
 from ..result import Array, Mask
 from .lens import Lens
 
-_CHUNK = 1 << 14  # rays that stay in the processor's cache on their way through the lens
-_SLACK_MM = 1e-9  # by which rounding may put a surface behind the one before it
+_CHUNK = 1 << 14  # rays that fit into the processor's cache together
+_SLACK_MM = 1e-9  # rounding may put a surface this far behind the previous one
 
 
 class Rays(NamedTuple):
@@ -17,9 +17,9 @@ class Rays(NamedTuple):
     Attributes:
         position: ``[3, R]`` in mm: x, y, z with z = 0 at the first vertex.
         direction: Unit vectors ``[3, R]``.
-        alive: ``[R]``; False where a ray missed a surface, hit beyond a clear diameter, was totally reflected, or met
-            a surface before the one in front of it (two that cross at their rims). The position and direction of such
-            a ray mean nothing.
+        alive: ``[R]``; False if a ray missed a surface, hit outside a clear diameter, was totally reflected, or met a
+            surface before the one in front of it (two surfaces that intersect at their rims). Position and direction of
+            such a ray have no meaning.
     """
 
     position: Array
@@ -27,7 +27,7 @@ class Rays(NamedTuple):
     alive: Mask
 
     def at(self, z: float) -> Array:
-        """Where the rays, or their backward extensions, cross the plane at z: x and y ``[2, R]`` in mm."""
+        """Intersection of the rays, or their backward extensions, with the plane at z: x and y ``[2, R]`` in mm."""
         run = (z - self.position[2]) / self.direction[2]
         return self.position[:2] + run * self.direction[:2]
 
@@ -35,14 +35,14 @@ class Rays(NamedTuple):
 def trace_rays(
     lens: Lens, position: Array, direction: Array, wavelength_um: float | None = None, clip: bool = True
 ) -> Rays:
-    """Rays on the last surface, with the direction they leave it.
+    """Traces rays to the last surface; they have the direction behind it.
 
     Args:
         lens: The prescription.
-        position: A point of each ray ``[3, R]`` in mm, z = 0 at the first vertex; before the lens.
+        position: A point on each ray ``[3, R]`` in mm, z = 0 at the first vertex; in front of the lens.
         direction: Unit vectors ``[3, R]`` with a positive z.
         wavelength_um: Wavelength in micrometres; None is the d line.
-        clip: Whether the clear diameters, the stop's among them, end rays.
+        clip: Whether clear diameters, including the stop's, block rays.
 
     Reference:
         Kolb, Mitchell, Hanrahan 1995, section 3.1 (the loop over surfaces), Snell's law in vector form.
@@ -69,7 +69,7 @@ def trace_rays(
         run, normal, met = surface.meet(position - vertex * along, direction)
         position = position + run * direction
         alive &= met
-        if i > 0:  # a surface that lies behind the one before it there is no lens's
+        if i > 0:  # where two surfaces intersect there is no lens
             alive &= run >= -_SLACK_MM
         if clip:
             alive &= position[0] ** 2 + position[1] ** 2 <= (surface.diameter / 2) ** 2
@@ -78,6 +78,6 @@ def trace_rays(
         inside = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
         alive &= inside >= 0  # else totally reflected
         direction = ratio * direction + (np.sqrt(np.maximum(inside, 0.0)) - ratio * cosine) * normal
-        if not alive.all():  # let the dead go on along the axis, where their numbers stay small
+        if not alive.all():  # continue blocked rays along the axis, where their numbers stay small
             position, direction = np.where(alive, position, vertex * along), np.where(alive, direction, along)
     return Rays(position, direction, alive)

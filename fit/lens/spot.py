@@ -1,15 +1,15 @@
-"""The spot that a point of light makes on the sensor, and where the sensor is when the lens is focused.
+"""The spot of a point of light on the sensor, and the position of the sensor for a focus distance.
 
-Object distances ``z`` are metres along the axis from a stated reference of the lens:
+Object distances ``z`` are in metres along the axis, from a reference point of the lens:
 
-* ``"principal"`` (the default): the front principal plane. This is the thin lens's distance: the one that
-  :class:`torchdof.Camera` computes circles of confusion from.
-* ``"pupil"``: the entrance pupil, the point a picture's perspective is seen from. Depth in computer vision.
-* ``"vertex"``: the first surface. A tape measure.
-* ``"sensor"``: the sensor (the film plane). The scale engraved on a lens.
+* ``"principal"`` (the default): the front principal plane. This is the distance in the thin lens formula, used by
+  :class:`torchdof.Camera` for circles of confusion.
+* ``"pupil"``: the entrance pupil, the centre of perspective of a picture; depth in computer vision.
+* ``"vertex"``: the first surface, as with a tape measure.
+* ``"sensor"``: the sensor (the film plane), as with the scale on a lens.
 
-The focus distance and the object distances of one call always share the reference. For the 50 mm double Gauss at 2 m
-the four are up to 7 cm apart, and the blur of an object at 1 m differs by 10 % between them.
+The focus distance and the object distances of one call have the same reference. For the 50 mm double Gauss at 2 m the
+four differ by up to 7 cm, and the blur of an object at 1 m by 10 %.
 """
 
 import math
@@ -28,22 +28,23 @@ from .rays import Rays, trace_rays
 Reference = Literal["principal", "pupil", "vertex", "sensor"]
 Focus = Literal["best", "paraxial"]
 
-_PROBES = 64  # along each side of a box in the pupil
+_PROBES = 64  # grid intervals along each side of a box in the pupil
 _FAN = 4096
 _FARTHEST_M, _WIDEST_MM = 1e12, 1e9
 
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """Where the light of one object point lands on the sensor. A geometric spot: no diffraction.
+    """Positions of the light of one object point on the sensor. A geometric spot, without diffraction.
 
     Attributes:
-        x: Hits relative to the centroid ``[R]``, in mm; the object's field direction is +y (its image is at -y).
+        x: Hits relative to the centroid ``[R]``, in mm; the object lies in the direction +y of the field (its image at
+            -y).
         y: See x.
-        weight: Share of the light that each hit carries ``[R]``; sums to 1.
+        weight: Share of the light of each hit ``[R]``; sums to 1.
         centre: The centroid's distance from the axis in mm, along the image's field direction.
-        pupil_mm2: Area of the entrance pupil that lets light through, to about 1 %. Off axis over on axis: vignetting.
-        meridional: True for a spot on the axis that was traced as one fan along y and stands for its full turn.
+        pupil_mm2: Unvignetted area of the entrance pupil, to about 1 %. Off axis over on axis: vignetting.
+        meridional: True for a spot on the axis traced as one fan along y, which represents its rotation about the axis.
     """
 
     x: Array
@@ -70,10 +71,10 @@ class Spot:
 
     @property
     def asymmetry(self) -> float:
-        """How far the spot is from round: 0 for a round one.
+        """Deviation of the spot from a round one: 0 if it is round.
 
         The light of each of 16 rings of equal light is expanded in the angle; this is the root mean square of the
-        harmonics 1 to 4 relative to the mean, so 0.5 means that the light of a ring varies by about half of itself.
+        harmonics 1 to 4 relative to the mean. 0.5 means that the light of a ring varies by about half.
         """
         if self.meridional:
             return 0.0
@@ -86,17 +87,17 @@ class Spot:
 
 
 def focus_sensor(lens: Lens, focus_m: float, kind: Focus = "best", reference: Reference = "principal") -> float:
-    """Distance of the sensor behind the last vertex, in mm, that focuses on an object at ``focus_m``.
+    """Distance of the sensor behind the last vertex, in mm, for an object at ``focus_m`` in focus.
 
     Args:
-        lens: The prescription; its stop counts for the best focus.
+        lens: The prescription; the best focus depends on its stop.
         focus_m: Object distance in metres; ``inf`` allowed.
-        kind: ``"paraxial"`` is where rays close to the axis meet; ``"best"`` where the spot on the axis has the least
-            root mean square radius, which is where a photographer (or an autofocus) puts the sensor.
-        reference: What the distance is measured from, see the module.
+        kind: ``"paraxial"``: where rays close to the axis meet; ``"best"``: where the spot on the axis has the smallest
+            root mean square radius, like the focus of a photographer or an autofocus.
+        reference: Reference point of the distance, see the module.
 
     Raises:
-        ValueError: If the object is too near to be focused, or an argument is not as described.
+        ValueError: If the object is too near for focusing, or an argument is invalid.
 
     Example:
         >>> lens = Lens.read("double_gauss_50mm")
@@ -125,24 +126,24 @@ def point_spread(
     reference: Reference = "principal",
     meridional: bool = False,
 ) -> Spot:
-    """Trace the spot of an object point.
+    """Traces the spot of an object point.
 
-    Rays fill the part of the entrance pupil that lets them through, on a square grid, each weighted by its solid angle:
-    the object point shines alike in all directions.
+    Rays fill the unvignetted part of the entrance pupil on a square grid. Each is weighted by its solid angle, because
+    the object point emits equally in all directions.
 
     Args:
-        lens: The prescription, stopped down as wanted.
+        lens: The prescription, stopped down as needed.
         z_m: Object distance in metres from the reference; ``inf`` allowed.
-        sensor_mm: Sensor behind the last vertex, from :func:`focus_sensor`.
-        field_mm: Image height in mm at which a pinhole camera with its hole in the front principal plane, as far from
-            its sensor as H' is, would see the object point; the real image lies there up to distortion.
-        rays: Number of rays aimed at the lens; the share that passes depends on the vignetting.
+        sensor_mm: Distance of the sensor behind the last vertex, from :func:`focus_sensor`.
+        field_mm: Image height in mm in a pinhole camera with its hole in the front principal plane and its sensor at
+            the distance from H'; the real image is there too, up to distortion.
+        rays: Number of rays aimed at the lens; vignetting blocks some.
         wavelength_um: Wavelength in micrometres; None is the d line.
-        reference: What ``z_m`` is measured from, see the module.
-        meridional: On the axis only: trace a fan that stands for its full turn. As good with 2,000 rays.
+        reference: Reference point of ``z_m``, see the module.
+        meridional: On the axis only: trace a fan that represents its rotation; as accurate with 2,000 rays.
 
     Raises:
-        ValueError: If an argument is not as described, or no ray reaches the sensor.
+        ValueError: If an argument is invalid, or no ray reaches the sensor.
 
     Example:
         >>> lens = Lens.read("double_gauss_50mm")
@@ -203,7 +204,7 @@ def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
     weight = weight * traced.alive
     height = traced.at(lens.vertices[-1] + paraxial)[1]
     slope = traced.direction[1] / traced.direction[2]
-    # the squared radius is a parabola over the sensor's position
+    # the mean squared radius is a parabola over the sensor's position
     steepness = float(weight @ (slope * slope))
     if steepness == 0.0:
         raise ValueError(f"no ray of a fan through lens {lens.name!r} comes to a focus; are its openings too narrow?")
@@ -211,39 +212,39 @@ def _image_mm(lens: Lens, object_mm: float, kind: Focus) -> float:
 
 
 def _fan(reach: float, rays: int) -> Array:
-    """Points ``[2, N]`` of the pupil along y, each of which stands for a ring of the same area."""
+    """Points ``[2, N]`` of the pupil along y, each representing a ring of equal area."""
     return np.stack([np.zeros(rays), reach * np.sqrt((np.arange(rays) + 0.5) / rays)])
 
 
 def _grid(low: Array, high: Array, steps: Array) -> Array:
-    """Points ``[2, N^2]`` of a box at shares ``[N]`` of its sides."""
+    """Points ``[2, N^2]`` of a box, at fractions ``[N]`` of its sides."""
     return np.stack(np.meshgrid(*(low + (high - low) * steps[:, None]).T)).reshape(2, -1)
 
 
 class _Source:
-    """An object point that sends rays of one wavelength through a lens."""
+    """An object point that emits rays of one wavelength."""
 
     def __init__(
         self, lens: Lens, object_mm: float, sensor_mm: float, field_mm: float = 0.0, wavelength_um: float | None = None
     ) -> None:
         self.lens, self.wavelength_um, first = lens, wavelength_um, lens.paraxial()
         self.pupil = first.entrance_pupil
-        self.distance = object_mm + self.pupil  # before the entrance pupil
-        self.tangent = field_mm / (sensor_mm - first.rear_principal)  # of its direction, seen from H
+        self.distance = object_mm + self.pupil  # from the entrance pupil
+        self.tangent = field_mm / (sensor_mm - first.rear_principal)  # of the point's direction, seen from H
         self.slope = self.tangent * (1.0 + (first.front_principal - self.pupil) / self.distance)  # from the pupil
 
     def aim(self, points: Array) -> tuple[Rays, Array]:
-        """Rays through points ``[2, R]`` of the entrance pupil's plane, and the solid angle that each stands for."""
+        """Rays through points ``[2, R]`` of the entrance pupil's plane, and the solid angle of each."""
         slopes = points / self.distance - np.array([[0.0], [self.slope]])
         run = np.concatenate([slopes, np.ones_like(slopes[:1])])
         length = np.sqrt((run * run).sum(0))
-        # start at the first vertex's plane: the pupil's plane may lie inside the lens
+        # start in the plane of the first vertex: the pupil's plane may lie inside the lens
         start = np.concatenate([points - self.pupil * slopes, np.zeros_like(slopes[:1])])
         return trace_rays(self.lens, start, run / length, self.wavelength_um), length**-3
 
     def pupil_box(self) -> tuple[Array, Array]:
-        """Box ``(low, high)`` in the entrance pupil's plane that just holds the rays that pass."""
-        # every ray that passes goes through the first surface's clear diameter
+        """Bounding box ``(low, high)`` of the rays that pass, in the entrance pupil's plane."""
+        # every passing ray crosses the first surface's clear diameter
         front = self.lens.surfaces[0].diameter
         reach = front / 2 + abs(self.pupil) * (abs(self.tangent) + front / self.distance)
         low, high = np.array([-reach, -reach]), np.array([reach, reach])

@@ -1,10 +1,10 @@
-"""One surface of a lens: its shape, and where rays meet it.
+"""One surface of a lens: its shape, and its intersection with rays.
 
-The shape is the even asphere of lens design: a conic, and a polynomial in even powers of the distance from the axis,
+The shape is the even asphere of lens design: a conic plus a polynomial in even powers of the distance r from the axis,
 
     ``z(r) = c r^2 / (1 + sqrt(1 - (1 + k) c^2 r^2)) + A_2 r^2 + A_4 r^4 + ...``
 
-with the curvature c = 1 / radius and the conic constant k: 0 is a sphere, -1 a paraboloid, below that a hyperboloid.
+with the curvature c = 1 / radius and the conic constant k: 0 is a sphere, -1 a paraboloid, below -1 a hyperboloid.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchdof.validation import show
 from ..result import Array, Mask
 from .glass import Glass
 
-_SMALLEST_MM, _LARGEST_MM, _MOST_CONIC, _DEEPEST_MM = 1e-3, 1e7, 1e6, 1e15  # beyond, sums of lengths overflow
+_SMALLEST_MM, _LARGEST_MM, _MOST_CONIC, _DEEPEST_MM = 1e-3, 1e7, 1e6, 1e15  # beyond these, sums overflow
 _STEPS = 50  # of Newton's method; four do for most aspheres
 _CLOSE_MM = 1e-10
 
@@ -30,12 +30,13 @@ class Surface:
     """A sphere or even asphere, and the medium behind it.
 
     Args:
-        radius: Radius of curvature at the vertex in mm, ``inf`` for a flat surface; positive is convex to the object.
-        thickness: Distance to the next surface in mm, >= 0; that of the last one is not used.
+        radius: Radius of curvature at the vertex in mm, ``inf`` for a flat surface; positive if convex towards the
+            object.
+        thickness: Distance to the next surface in mm, >= 0; unused for the last one.
         glass: The medium behind it.
         diameter: Clear diameter in mm.
         conic: Conic constant k.
-        polynomial: ``A_2, A_4, ...`` in powers of millimetres.
+        polynomial: ``A_2, A_4, ...``, with lengths in millimetres.
 
     Raises:
         ValueError: If a number is outside its range; the message begins with its name.
@@ -49,7 +50,7 @@ class Surface:
     polynomial: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse shapes that no lens has."""
+        """Validates the shape."""
         if not isinstance(self.glass, Glass) or not isinstance(self.polynomial, tuple):
             raise ValueError(f"glass must be a Glass and polynomial a tuple of numbers, got {show(self)}")
         _check("diameter", self.diameter, _SMALLEST_MM, _LARGEST_MM)
@@ -59,16 +60,16 @@ class Surface:
             raise ValueError(f"radius must be inf, or {_SMALLEST_MM:g} to {_LARGEST_MM:g} mm long, got {self.radius}")
         _check("conic constant", self.conic, -_MOST_CONIC, _MOST_CONIC)
         for i, coefficient in enumerate(self.polynomial):
-            most = _DEEPEST_MM / (self.diameter / 2.0) ** (2 * i + 2)  # it bends the surface's rim no farther than that
+            most = _DEEPEST_MM / (self.diameter / 2.0) ** (2 * i + 2)  # limits the depth of the surface's rim
             _check(f"A{2 * i + 2}", coefficient, -most, most)
 
     def bent(self, factor: float) -> Surface:
-        """The surface with all lengths of its shape multiplied by a factor; -1 turns it around."""
+        """The surface with all lengths of its shape multiplied by a factor; -1 exchanges its sides."""
         polynomial = tuple(a / factor ** (2 * i + 1) for i, a in enumerate(self.polynomial))
         return replace(self, radius=self.radius * factor, polynomial=polynomial)
 
     def sag(self, square: Array) -> tuple[Array, Array]:
-        """Height z over the vertex's plane at r^2, and its derivative by r^2; NaN beyond the conic's rim."""
+        """Height z above the vertex's plane at r^2, and its derivative by r^2; NaN beyond the conic's rim."""
         curvature = 1.0 / self.radius
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             root = np.sqrt(1.0 - (1.0 + self.conic) * curvature**2 * square)
@@ -80,13 +81,13 @@ class Surface:
         return np.where(exists, z, np.nan), np.where(exists, slope, np.nan)
 
     def meet(self, position: Array, direction: Array) -> tuple[Array, Array, Mask]:
-        """Where rays meet the surface; of several places it is the one nearest to the vertex's plane.
+        """Intersections of rays with the surface; of several the one nearest to the vertex's plane.
 
-        Rays go from points ``[3, R]``, in mm from the vertex, along unit vectors ``[3, R]`` with a positive z.
+        Rays start at points ``[3, R]``, in mm from the vertex, along unit vectors ``[3, R]`` with a positive z.
 
         Returns:
-            The way there in mm ``[R]``, negative where the surface lies behind; the surface's normal there ``[3, R]``,
-            unit vectors with a positive z; and whether a ray meets it at all ``[R]``: else the rest means nothing.
+            The distance in mm ``[R]``, negative if the surface lies behind; the unit normal there ``[3, R]``, with a
+            positive z; and whether a ray meets the surface ``[R]``; otherwise the other values have no meaning.
 
         Reference:
             Welford, "Aberrations of Optical Systems", 1986, section 4.5 (conics), 4.6 (aspheres, by iteration).
@@ -108,7 +109,7 @@ class Surface:
                 break
             fall = w - 2.0 * slope * (x * u + y * v)
             step = np.where(met & (fall > 0), -off / np.where(fall > 0, fall, 1.0), 0.0)
-        met &= np.abs(off) <= _CLOSE_MM  # NaN is not
+        met &= np.abs(off) <= _CLOSE_MM  # also False for NaN
         slope = np.where(met, slope, 0.0)
         normal = np.stack([-2.0 * slope * x, -2.0 * slope * y, np.ones_like(x)])
         return run, normal / np.sqrt((normal * normal).sum(0)), met

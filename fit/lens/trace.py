@@ -1,4 +1,4 @@
-"""A lens prescription to a blur table: spots traced at many distances, kernels fitted to them, smooth over depth."""
+"""Makes a blur table of a lens prescription: traces spots at many distances, and fits kernels smooth over depth."""
 
 import datetime
 import math
@@ -45,47 +45,46 @@ def trace_table(
 ) -> BlurTable:
     """Blur table of a lens, traced at many distances on both sides of focus.
 
-    Nodes are keyed by the signed coc that :class:`torchdof.Camera` computes with the lens's paraxial focal length,
-    ``f_number`` and ``focus_m``: use that camera to render with the table. Nodes are placed where interpolation between
-    them would be worst, as many as keep a natural image to 50 dB between them; intervals whose spots stay within one
-    pixel are not divided, nor those of a hundredth of one.
+    Nodes are keyed by the signed coc that :class:`torchdof.Camera` gives for the lens's paraxial focal length,
+    ``f_number`` and ``focus_m``: render with that camera. Nodes are placed where interpolation would be worst, as many
+    as are needed for 50 dB on a natural image between them. Intervals whose spots stay within one pixel, or that are
+    narrower than 1/100 pixel, are not divided.
 
-    The table is exact for its focus and f-number. At another focus of the same f-number it holds as far as the lens's
-    aberrations do not change with distance; at another f-number it does not.
+    The table is exact for its focus and f-number. For another focus at the same f-number it is accurate if the lens's
+    aberrations change little with distance; for another f-number it is not.
 
     Args:
         lens: The prescription.
         f_number: Marked f-number, see :meth:`Lens.with_f_number`.
         focus_m: Focus distance in metres from ``reference``; ``inf`` allowed.
-        nodes: Number of nodes, at least 5, or 3 for a focus at infinity; None is as many as it takes.
-        nearest_m: Nearest object distance in metres; None is a third of the focus distance (then the blur on the near
-            side reaches twice that of infinity), or 25 focal lengths for a focus at infinity. The farthest is infinity.
+        nodes: Number of nodes, at least 5, or 3 for a focus at infinity; None uses as many as needed.
+        nearest_m: Nearest object distance in metres; None is a third of the focus distance (the blur is then twice that
+            of infinity), or 25 focal lengths for a focus at infinity. The farthest distance is infinity.
         family: ``"radial"``, or a named shape fitted by least squares: ``"softm"``, ``"ring"``, ``"gaussian"``,
             ``"disc"``.
-        points: Values of a radial profile, at least 3.
+        points: Number of values of a radial profile, at least 3.
         focus: ``"best"`` or ``"paraxial"``, see :func:`torchdof.fit.lens.spot.focus_sensor`.
-        reference: What distances are measured from, see :mod:`torchdof.fit.lens.spot`. A render's depth map has
-            the same.
-        field_mm: Image height in mm; off the axis the table holds the rotational average of the spot about its
-            centroid, and ``provenance["asymmetry"]`` how far it was from round.
-        wavelengths_um: One wavelength a channel, such as :data:`torchdof.fit.lens.lens.RGB_UM`, for a lens whose
+        reference: Reference point of distances, see :mod:`torchdof.fit.lens.spot`. Depth maps must use the same.
+        field_mm: Image height in mm. Off the axis, the table has the rotational average of the spot about its centroid,
+            and ``provenance["asymmetry"]`` the spot's deviation from a round one.
+        wavelengths_um: One wavelength for each channel, such as :data:`torchdof.fit.lens.lens.RGB_UM`, for a lens whose
             prescription has Abbe numbers; None traces the d line for all channels.
         sensor_width_mm: Width of the sensor.
-        width_px: Width of the images the fit is made for: details far below their pixels do not count.
-        rays: Rays a spot; None is 2,000 on the axis, where a fan is enough, and 50,000 off it.
-        field: Distances in mm from the middle of the frame, increasing from 0, at which spots are traced as they are,
-            for a table whose kernels depend on the place (:class:`torchdof.optics.field.Field`): a full frame of
-            36 x 24 mm wants those to 21.6 mm. None traces the axis alone.
-        field_nodes: Blurs at which these are traced on either side of focus, on average: the farther a side reaches,
-            the more.
-        field_rays: Rays of each of these spots.
-        name: Name of the table; None is the lens's with the f-number.
+        width_px: Width of the images for which the fit is made: details far below a pixel do not count.
+        rays: Rays for each spot; None is 2,000 on the axis, traced as a fan, and 50,000 off it.
+        field: Distances in mm from the centre of the frame, increasing from 0, at which spots are traced unaveraged,
+            for a table whose kernels vary over the frame (:class:`torchdof.optics.field.Field`); to 21.6 mm for a full
+            frame of 36 x 24 mm. None traces only the axis.
+        field_nodes: Mean number of blurs on each side of focus at which these are traced; the side with the larger blur
+            gets more.
+        field_rays: Rays for each of these spots.
+        name: Name of the table; None uses the lens's name and the f-number.
 
     Returns:
         A table in millimetres of the sensor, with provenance and the relative residual of each node.
 
     Raises:
-        ValueError: If an argument is not as described, or there are more nodes than intervals to divide.
+        ValueError: If an argument is invalid, or there are more nodes than intervals to divide.
 
     Example:
         >>> lens = Lens.read("double_gauss_50mm")
@@ -156,7 +155,7 @@ def trace_table(
 
 
 def _check(given: dict[str, Any]) -> None:
-    """Refuse arguments of :func:`trace_table` that make no sense, by name."""
+    """Raises an error for invalid arguments of :func:`trace_table`."""
     lens, focus_m, wavelengths, field = (given[key] for key in ("lens", "focus_m", "wavelengths_um", "field"))
     if not isinstance(lens, Lens):
         raise ValueError(f"lens must be a Lens, got {show(lens)}; read one with Lens.read()")
@@ -191,7 +190,7 @@ def _check(given: dict[str, Any]) -> None:
 
 
 def signed_coc_mm(z_m: float, focal_length_mm: float, f_number: float, focus_m: float) -> float:
-    """Signed radius of the thin lens's circle of confusion in mm on the sensor, as :class:`torchdof.Camera` has it.
+    """Signed radius of the thin lens's circle of confusion in mm on the sensor, as :class:`torchdof.Camera` gives it.
 
     Example:
         >>> round(signed_coc_mm(1.0, 50.3582, 2.03015, 2.0), 4)

@@ -1,9 +1,9 @@
-"""Lenses from Zemax files (.zmx): the sequential subset that a camera lens is made of.
+"""Reads lenses from Zemax files (.zmx): the sequential subset used for camera lenses.
 
-What is read: the unit, and of each surface the curvature, thickness, clear semi-diameter, glass, conic constant, even
-asphere, and which is the stop. The first surface is the object and the last the sensor; flat surfaces between air and
-air other than the stop are left out. Glasses are SCHOTT's by name, or else have the index and Abbe number that the file
-gives them. Mirrors, tilts, other kinds of surfaces and apertures, and several configurations are refused by name.
+Reads the unit and, for each surface, curvature, thickness, clear semi-diameter, glass, conic constant, even asphere,
+and whether it is the stop. The first surface is the object and the last the sensor; flat surfaces in air, except the
+stop, are skipped. Glasses are SCHOTT's by name, otherwise they have the file's index and Abbe number. Mirrors, tilts,
+other kinds of surfaces and apertures, and several configurations raise errors.
 """
 
 import math
@@ -17,10 +17,10 @@ _APERTURES = {"SQAP", "ELAP", "OBSC", "SQOB", "ELOB", "SPID", "UDAD", "UDOB"}
 
 
 def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
-    r"""Read the content of a .zmx file, which is UTF-16 or plain: surfaces, the number of the stop, and the source.
+    r"""Reads the content of a .zmx file, UTF-16 or plain: surfaces, the index of the stop, and the source.
 
     Raises:
-        ValueError: If it is no sequential lens that this package can trace; the message names the surface.
+        ValueError: If it is not a sequential lens that can be traced; the message names the surface.
 
     Example:
         >>> surface = "SURF {}\n TYPE STANDARD\n CURV {}\n DISZ {}\n DIAM 9\n"
@@ -70,7 +70,7 @@ def parse(content: bytes) -> tuple[tuple[Surface, ...], int, str]:
 
 
 def _surface(given: dict[str, list[str]], unit: float, before: Glass) -> Surface | float:
-    """A surface behind a medium; of a flat one in air, which is no part of the lens, the thickness alone, in mm."""
+    """A surface behind a medium; for a flat one in air, which is not part of the lens, only its thickness in mm."""
 
     def number(word: str, place: int = 0) -> float:
         fields = given.get(word, [])
@@ -96,7 +96,7 @@ def _surface(given: dict[str, list[str]], unit: float, before: Glass) -> Surface
 
 
 def _glass(fields: list[str]) -> Glass:
-    """A glass of the catalogue, or of index and Abbe number; air without fields."""
+    """A glass of the catalogue, or from index and Abbe number; air without fields."""
     if not fields:
         return AIR
     if fields[0] == "MIRROR":

@@ -1,1 +1,1 @@
-"""From photographs of a dot to the point spread function that blurred it, and from several to a blur table."""
+"""Fits the point spread function of photographs of a dot, and makes a blur table of several."""

@@ -1,4 +1,4 @@
-"""The dots of a grid to one table whose blur depends on the place in the frame."""
+"""Makes one table whose blur varies over the frame, from the dots of a grid."""
 
 import math
 from collections.abc import Sequence
@@ -16,24 +16,24 @@ from ..result import Array
 from .captures import Captures
 from .table import TableFit
 
-_CELLS = (96, 48)  # of half a spot, along and across
-_FINE = 64  # pixels of the picture of a dot's kernel on each side of its middle
-_SAME = 0.05  # of the farthest dot's distance from the middle; dots as far from it as that are taken together
+_CELLS = (96, 48)  # of half a spot, along and across the radial direction
+_FINE = 64  # pixels on each side of the centre when a dot's kernel is drawn
+_SAME = 0.05  # share of the largest distance from the centre within which dots are averaged
 
 
 def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
-    """One table of all dots of a grid, whose blur depends on the distance from the middle of the frame.
+    """One table from all dots of a grid, with a blur that depends on the distance from the centre of the frame.
 
-    Each dot tells of its place how large the blur is there (field curvature), of what profile, and what it looks like
-    where pictures of it were fitted (cat's eyes). Lenses are round, so the blur turns with the azimuth, and dots as far
-    from the middle as others are averaged: what does not turn, such as blades, is averaged away as dots surround the
-    middle. Where the blur lies against the sharp picture (coma) photographs do not tell.
+    Each dot gives the size of the blur at its position (field curvature), its profile and, if pictures were fitted, its
+    shape (cat's eyes). Lenses are round, so the blur rotates with the azimuth, and dots at equal distances from the
+    centre are averaged. Details that do not rotate, such as blades, average out if the dots surround the centre. The
+    blur's offset from the sharp picture (coma) cannot be measured this way.
 
     Args:
-        dots: What was photographed and fitted of each, the most central first, all with the scale of its fit.
+        dots: captures and fit of each dot, the most central first, all with the same scale.
 
     Raises:
-        FitError: There are no two dots at different distances from the middle, or they were not fitted alike.
+        FitError: there are no two dots at different distances from the centre, or their fits differ in kind.
     """
     if len(dots) < 2:
         raise FitError(f"dots must be those of a grid, two at least, got {len(dots)}")
@@ -53,19 +53,19 @@ def table_of_dots(dots: Sequence[tuple[Captures, TableFit]]) -> BlurTable:
 
 
 def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], shrunk: Array) -> Field:
-    """Spots over blur and distance from the middle, of tables with the same nodes of single places (x, y).
+    """Spots over blur and distance from the centre, from tables with the same nodes at single positions (x, y).
 
-    Places are those in the sharp picture, from the middle of the frame, in the tables' unit; pictures shrink towards
-    the middle by the focus over the distance at each node.
+    Positions are those in the sharp picture, relative to the centre of the frame, in the tables' unit. At each node the
+    picture is smaller by the factor `shrunk`, the focus distance over the object distance.
     """
     away = np.hypot(*np.array(places, dtype=np.float64).T)
     order = np.argsort(away)
-    groups = np.split(order, np.flatnonzero(np.diff(away[order]) > _SAME * away.max()) + 1)  # at like distances
+    groups = np.split(order, np.flatnonzero(np.diff(away[order]) > _SAME * away.max()) + 1)  # dots at similar distances
     rings = groups if away[groups[0]].mean() > _SAME * away.max() else groups[1:]
     if not rings or away.max() == 0:
         raise FitError(f"dots must lie at two distances from the middle of the frame at least, got {len(groups)}")
     rising = np.array([0.0, *(away[ring].mean() for ring in rings)])
-    # where dots lie in the picture in which they lie nearest to the middle, and in that where they lie farthest
+    # distances that dots reach in any picture: from the smallest picture's to the largest picture's
     both = np.sort(np.concatenate([rising * min(shrunk), rising[1:] * max(shrunk)]))
     radius = both[np.concatenate([[True], np.diff(both) > 1e-3 * both[-1]])]
     boxes, light = [], []
@@ -86,9 +86,9 @@ def field_of_dots(tables: Sequence[BlurTable], places: Sequence[tuple[float, flo
 def _spot(
     tables: Sequence[BlurTable], places: Sequence[tuple[float, float]], group: np.ndarray, node: int, azimuths: int = 0
 ) -> tuple[float, Tensor]:
-    """Half the side of the box and the light ``[C, U, V]`` of dots as far from the middle as each other, at a node.
+    """Half side of the box, and the light ``[C, U, V]``, of dots at one distance from the centre, at a node.
 
-    As seen towards each dot, or, in the middle of the frame, as the mean over a number of azimuths.
+    Seen in the radial direction of each dot or, in the centre of the frame, averaged over `azimuths` directions.
     """
     unit = tables[0].px_per_unit(1.0)
     coc = float(tables[0].coc[node]) * unit
@@ -112,7 +112,7 @@ def _spot(
 
 
 def _both_sides(coc: Tensor, sizes: Tensor, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Nodes on both sides of focus and in it: a side without any shows the other's spots turned by half."""
+    """Adds the focus and, if one side of it has no nodes, the other side's spots rotated by half a turn."""
     if not bool((coc < 0).any() and (coc > 0).any()):
         coc, sizes, light = (
             torch.cat(pair) for pair in ((coc, -coc.flip(0)), (sizes, sizes.flip(0)), (light, light.flip(0, -2)))
@@ -120,7 +120,7 @@ def _both_sides(coc: Tensor, sizes: Tensor, light: Tensor) -> tuple[Tensor, Tens
         order = coc.argsort()
         coc, sizes, light = coc[order], sizes[order], light[order]
     upper = int((coc > 0).nonzero()[0])
-    # the signed size is a line: where it does not cross 0 in focus, the focus of that place lies elsewhere
+    # interpolate the signed size: if it is not 0 in focus, that position has its focus at another depth
     part = coc[upper - 1] / (coc[upper - 1] - coc[upper])
     size = torch.lerp(-sizes[upper - 1], sizes[upper], part).abs()
     between = torch.lerp(light[upper - 1], light[upper], part)

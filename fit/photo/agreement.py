@@ -1,8 +1,8 @@
-"""Whether the fitted blur is the one that the camera's numbers and the distances promise; where not, what is wrong.
+"""Compares the fitted blur with the camera's numbers and distances, and finds the likely cause of a difference.
 
-A circle of confusion computed from a focal length, an f-number, a sensor's width and a distance stands beside a radius
-that was measured. Any number that was misread makes the two differ, and how they differ over the distances tells which.
-And a table that was measured at one focus and f-number reaches only so far.
+The circle of confusion follows from focal length, f-number, sensor width and distance, and its radius is also measured.
+A wrong number makes the two differ, and the difference over the distances indicates which number it is. `check_reach`
+also checks whether a table is used outside its measured focus and f-number.
 """
 
 import math
@@ -21,23 +21,23 @@ from ..result import Array, Mask
 from ..validation import a_number
 from .captures import CAMERA, Captures
 
-_TELLING_PX = 2.0  # smaller blurs are the lens's aberrations as much as its defocus
-_WARNED, _REFUSED = math.log(1.15), math.log(1.35)  # a thick lens close by differs by a tenth; one stop is 1.41
-_EXPLAINED = math.log(1.12)
+_TELLING_PX = 2.0  # px; smaller blurs are dominated by aberrations
+_WARNED, _REFUSED = math.log(1.15), math.log(1.35)  # a thick lens differs by up to 1.1, a stop is 1.41
+_EXPLAINED = math.log(1.12)  # remaining log factor up to which a cause explains the difference
 _UNITS = {3.28: "feet", 39.4: "inches", 100.0: "centimetres", 1000.0: "millimetres"}
 
 
 def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> None:
-    """Compare the fitted blur's radius at each distance with the camera's, and name the likely cause of a difference.
+    """Compares the fitted radius at each distance with the camera's, and names the likely cause of a difference.
 
     Raises:
-        FitError: of kind "camera" where they differ by more than a factor of 1.35; it warns from 1.15 on.
+        FitError: of kind "camera" if they differ by a factor above 1.35; it warns above 1.15.
     """
     measured, promised = np.asarray(radius_px, dtype=np.float64), captures.promised_px
     defocus = np.abs(captures.defocus)
     expected = defocus * _common_factor(defocus, measured) if promised is None else np.abs(promised)
     telling = np.maximum(expected, measured) > _TELLING_PX
-    # without a camera the first distances set the scale
+    # without a camera the scale is fitted to the distances themselves
     if int(telling.sum()) < (3 if promised is None else 1):
         return
     off = _misfit(expected, measured, telling)
@@ -48,7 +48,7 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
     worst = int(np.argmax(np.where(telling, np.abs(np.log(measured / expected)), 0.0)))
     who = "the other distances" if promised is None else "the camera's numbers"
     text = (
-        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, and {who} promise "
+        f"at {captures.distances_m[worst]:g} m the blur has a radius of {measured[worst]:.3g} px, but {who} give "
         f"{expected[worst]:.3g} px; "
     )
     cause = "; or ".join(likely[:2])
@@ -62,7 +62,7 @@ def check_agreement(captures: Captures, radius_px: Sequence[float] | Array) -> N
 
 
 def _readings(captures: Captures, expected: Array, measured: Array, telling: Mask) -> Iterator[tuple[float, str]]:
-    """Mistakes that could each explain it, and how far the blur is then from what the numbers promise."""
+    """Possible single mistakes: the misfit that remains if each is corrected, and its description."""
     distance, defocus = captures.distances_m, captures.defocus
     per_dioptre = float(np.median(expected / np.abs(defocus)))
     if captures.promised_px is not None:
@@ -87,13 +87,13 @@ def _readings(captures: Captures, expected: Array, measured: Array, telling: Mas
 
 
 def _stands(captures: Captures, defocus: float) -> str:
-    """The distance of a defocus [1/m], empty where there is none."""
+    """The distance with this defocus [1/m], as text; empty if there is none."""
     vergence = 1 / captures.focus_m - defocus
     return f"{1 / vergence:.3g} m" if vergence > 0 else ""
 
 
 def _scale_causes(captures: Captures, factor: float) -> str:
-    """Every number that could be wrong by itself if all blurs are `factor` times what is promised."""
+    """Numbers that could be wrong if all blurs are `factor` times the expected ones."""
     focal, stops, sensor = (float(getattr(captures, name)) for name in CAMERA)
     units = [name for unit, name in _UNITS.items() if abs(math.log(factor / unit)) < _EXPLAINED]
     causes = [f"the distances are in {name}, not in metres" for name in units]
@@ -111,14 +111,14 @@ def _scale_causes(captures: Captures, factor: float) -> str:
 
 
 def _common_factor(expected: Array, measured: Array) -> float:
-    """Measured over expected, the median weighted by what is expected: a single wrong distance has no say."""
+    """Measured over expected: a median weighted by the expected values, so that one wrong distance has no effect."""
     order = np.argsort(measured / expected)
     weight = np.cumsum(expected[order])
     return float((measured / expected)[order][np.searchsorted(weight, 0.5 * weight[-1])])
 
 
 def _misfit(expected: Array, measured: Array, telling: Mask) -> float:
-    """Largest |log(measured / expected)|, without what a pixel of aberrations explains."""
+    """Largest |log(measured / expected)|, after subtracting half a pixel for aberrations."""
     apart = np.maximum(np.abs(measured - expected) - 0.5, 0.0)
     factor = np.log1p(apart / np.maximum(np.minimum(measured, expected), 1e-9))
     return float(np.max(np.where(telling, factor, 0.0)))
@@ -127,27 +127,28 @@ def _misfit(expected: Array, measured: Array, telling: Mask) -> float:
 def check_reach(
     table: BlurTable, camera: Camera, near_m: float, far_m: float, width_px: int = 1920
 ) -> dict[str, float]:
-    """Whether a table measured at one focus and f-number says anything about another use of it.
+    """Checks whether a scene and camera are inside the range in which a table was measured.
 
-    A kernel is looked up by its signed circle of confusion, so a thin lens's table serves any focus and f-number. A
-    real lens's aberrations change with both: the farther from what was measured, the less a table knows.
+    Kernels are looked up by the signed circle of confusion, so a table of a thin lens would hold for any focus and
+    f-number. A real lens's aberrations change with both, so a table becomes less accurate with the distance from its
+    own.
 
     Args:
-        table: with the provenance that `fit_table` and `trace_table` write.
-        camera: to render with.
+        table: with the provenance written by `fit_table` or `trace_table`.
+        camera: the camera for rendering.
         near_m: nearest depth of the scene, m.
         far_m: farthest depth of the scene, m; `inf` allowed.
-        width_px: of the image.
+        width_px: width of the image, px.
 
     Returns:
-        Each over what was measured: "coc" (the largest circle of confusion of the scene over the largest measured on
-        its side), "f_number" and "focus_m" (1 where the table does not know).
+        Ratios of used to measured: "coc" (the scene's largest circle of confusion over the largest measured one on the
+        same side), "f_number" and "focus_m" (1 if unknown).
 
     Raises:
         FitError: the depths are not 0 < near <= far.
 
     Warns:
-        FitWarning: of kind "outside measured", for each of the three that lies outside what was measured.
+        FitWarning: of kind "outside measured", for each of the three outside the measured range.
 
     Example:
         >>> table = BlurTable("disc", [-0.1, 0.1], {"radius": [0.1, 0.1]}, unit="mm", sensor_width_mm=36.0)

@@ -14,7 +14,7 @@ from ..problems import FitError
 from ..result import Array
 from ..validation import a_number
 
-RANGES = {  # beyond any camera's
+RANGES = {  # wider than any camera's
     "focus_m": (1e-5, 1e6),
     "distance_m": (1e-5, 1e6),
     "focal_length_mm": (1e-3, 1e6),
@@ -29,19 +29,19 @@ CAMERA = ("focal_length_mm", "f_number", "sensor_width_mm")
 
 @dataclass(frozen=True)
 class Capture:
-    """One pair of windows of the same dot: in focus, and at another distance.
+    """A pair of windows around the same dot: in focus, and at another distance.
 
     Attributes:
         sharp: `[H, W]`, linear light, in focus.
         blurred: `[H, W]`, linear light, the same size.
-        distance_m: of the dot in `blurred`, from the lens.
-        files: where the two came from.
-        white: level of clipping in both, or None where it is not known.
-        exposure: of `blurred` over `sharp`, as stated, or None.
-        position_px: the dot's place (x, y) in the sharp frame, from the frame's centre.
-        colours: red, green and blue of `sharp` and of `blurred`, `[3, H, W]` each; None fits their mean alone.
-        uncertain: `sharp` and `blurred` again, as they would be with what was guessed about them (a tone curve) one
-            standard error off, in independent directions. Standard errors count what that does to a fit.
+        distance_m: distance of the dot in `blurred` from the lens.
+        files: names of the two pictures.
+        white: level of clipping in both, or None if unknown.
+        exposure: stated exposure of `blurred` over that of `sharp`, or None.
+        position_px: position (x, y) of the dot in the sharp frame, relative to the frame's centre.
+        colours: red, green and blue of `sharp` and of `blurred`, `[3, H, W]` each; None fits only their mean.
+        uncertain: `sharp` and `blurred` for other values of a guess (a tone curve), each one standard error away, in
+            independent directions. The effect on the fit is included in the standard errors.
     """
 
     sharp: Array
@@ -61,13 +61,13 @@ class Captures:
 
     Attributes:
         pairs: by increasing distance.
-        focus_m: distance of the sharp picture: what the lens stays focused on.
-        width_px: width of the whole frame, which `sensor_width_mm` belongs to: the pictures may be crops of it.
+        focus_m: distance of the sharp picture, at which the lens stays focused.
+        width_px: width of the whole frame, of width `sensor_width_mm`; the pictures may be crops of it.
         focal_length_mm: of the lens, or None.
         f_number: of the lens, or None.
         sensor_width_mm: of the camera, or None.
-        name: of the table to be.
-        notes: more about the capture, for the table's provenance.
+        name: name of the table.
+        notes: further provenance.
     """
 
     pairs: tuple[Capture, ...]
@@ -80,11 +80,11 @@ class Captures:
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check what all later steps rely on.
+        """Validates the fields.
 
         Raises:
-            FitError: no pair, or a camera number that is not positive; of kind "distance" where distances are not
-                increasing, not positive, or one is that of the focus.
+            FitError: no pair, or a camera number that is not positive; of kind "distance" if distances are not positive
+            and increasing, or one equals the focus.
         """
         if not isinstance(self.pairs, Sequence) or not all(isinstance(p, Capture) for p in self.pairs):
             raise FitError(f"pairs must be a tuple of Capture(sharp, blurred, distance_m), got {show(self.pairs)}")
@@ -106,17 +106,17 @@ class Captures:
 
     @property
     def distances_m(self) -> Array:
-        """Of the pairs `[n]`."""
+        """Distances of the pairs `[n]`."""
         return np.array([pair.distance_m for pair in self.pairs])
 
     @property
     def defocus(self) -> Array:
-        """1/focus - 1/distance of the pairs `[n]`, 1/m: what a thin lens's circle of confusion is proportional to."""
+        """1/focus - 1/distance of the pairs `[n]`, 1/m; a thin lens's circle of confusion is proportional to it."""
         return 1 / self.focus_m - 1 / self.distances_m
 
     @property
     def promised_px(self) -> Array | None:
-        """Signed circle of confusion of the pairs `[n]`, px of the frame; None where the camera is not known."""
+        """Signed circle of confusion of the pairs from the camera's numbers `[n]`, px of the frame; None if unknown."""
         camera = {name: getattr(self, name) for name in CAMERA}
         if None in camera.values():
             return None
@@ -125,7 +125,7 @@ class Captures:
 
 
 def check_distances(distances: Sequence[float], focus: float, where: str | None) -> None:
-    """Refuse distances that are not positive and increasing, or that equal the focus."""
+    """Raises an error if distances are not positive and increasing, or one equals the focus."""
     a_number("focus_m", focus, 0, 1e100, "metres")
     for before, distance in zip([0.0, *distances], distances, strict=False):
         a_number("distance_m", distance, -1e100, 1e100, "metres")

@@ -1,4 +1,4 @@
-"""What makes a capture or its fit less than it looks: levels, focus, residual, roundness, window, bounds."""
+"""Checks of a capture and its fit: levels, focus, residual, roundness, window, bounds."""
 
 import numpy as np
 import torch
@@ -8,42 +8,45 @@ from torchdof.io.transfer import decode, encode
 
 from ..problems import FitError, warn
 from ..result import Array, BlurFit
-from .diagnostics import CHANCE, UNEVEN, asymmetry_of, left_open, size_of_blur, unexplained
+from .diagnostics import CHANCE, UNEVEN, asymmetry_of, size_of_blur, unexplained, unfitted_part
 from .dot import Dot, inner_pixels
 from .forward import Forward, Solution
 from .noise import fine_variance, independent_share, noise_of, rounding_of
 from .source import UNFOCUSED_PX, Edge, soft_edge
 
 EXPLAINED = 1.15
-"""Misfit of an ideal dot, over the noise, up to which it explains a sharp picture."""
+"""Largest misfit of an ideal dot, over the noise, with which it explains a sharp picture."""
 
 FAR_ABOVE = 1.6
-"""Residual over noise from which on it is said."""
+"""Residual over noise above which a warning is given."""
 
+# a sharp picture
 _SENSOR_BLUR_PX = 0.7  # sigma of the edge that demosaicing, a filter before the sensor or a good lens leave in focus
-_SOFTENED = 0.02  # share of the kernel's size that a soft sharp picture costs
-_ENCODED = 0.7
-_STEEP, _CERTAIN = 0.03, 4.0  # an S-curve's least share of the dot's level, and in standard errors
-_TOGETHER = 1.9  # neighbouring second differences share pixels: their mean square is as uncertain as of so many fewer
-_BENT, _BENT_CHI = 0.075, 30.0  # of a curve of 20 %, what the fit does not take up; chi squared of two parameters
-_STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same where the sharp dot's edge agrees
-_CURVED, _CURVED_CHI = 0.03, 11.0  # half of what a curve of 20 % leaves at the expected size; once in 2000 by chance
-_RESIZED = 0.015  # another magnification than that by so much is not a weak tone curve, which makes it 1.002 to 1.006
-_CLEARER = 4.0  # chi squared by which a curve explains more than another magnification of the dot
-_MATTERS, _SEEN = 0.005, 1e-3  # residuals, as shares of the light
-_SPOT, _SPOT_MATTERS = 8.0, 0.003
-_MAGNIFIED = 0.08
-_OUTSIDE_REFUSED, _OUTSIDE_WARNED = 0.05, 0.005
+_SOFTENED = 0.02  # relative error of the kernel's size, from a soft sharp picture, above which to warn
+_ENCODED = 0.7  # exponent of the edge's levels below which the picture counts as sRGB encoded
+_STEEP, _CERTAIN = 0.03, 4.0  # least steepness of an S-curve: share of the dot's level, and in standard errors
+_TOGETHER = 1.9  # second differences for each independent one: neighbours share pixels
+# a tone curve in the residual: its strength, and chi squared (two parameters), above which to warn
+_BENT, _BENT_CHI = 0.075, 30.0  # after the fit, which leaves 0.075 of a curve of 20 %
+_STEEP_TOO, _BENT_CHI_TOO = 0.008, 18.0  # the same if the sharp dot's edge is steeper than this
+_CURVED, _CURVED_CHI = 0.03, 11.0  # at the expected magnification: half of what a 20 % curve leaves
+_RESIZED = 0.015  # change of magnification that no weak tone curve causes, which changes it by 0.002 to 0.006
+_CLEARER = 4.0  # chi squared by which a curve must explain more than a change of magnification does
+# the fit
+_MATTERS, _SEEN = 0.005, 1e-3  # residuals as shares of the light: at FAR_ABOVE, and at twice the noise
+_SPOT, _SPOT_MATTERS = 8.0, 0.003  # of a spot beyond the blur: standard deviations, share of the dot's level
+_MAGNIFIED = 0.08  # log factor between fitted and expected magnification
+_OUTSIDE_REFUSED, _OUTSIDE_WARNED = 0.05, 0.005  # share of the blur's light outside the window
 
 
 def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> bool:
-    """Whether a sharp picture seems to be in linear light, by its noise and its dot's edge; warns where it does not."""
+    """Whether noise and edge of a sharp picture's dot are those of linear light; warns if not."""
     text, number = "", 0.0
     inside = inner_pixels(still, dot)
     if inside is not None:
         bright = fine_variance(still, inside)
         rounding = rounding_of(still[still > dot.background + 0.5 * dot.peak])
-        # light only makes noise grow with the level; 4 standard errors of the noise's own estimate are allowed
+        # noise in light can only grow with the level; allow 4 standard errors of its estimate
         most = (1 + 4 / np.sqrt(int(inside.sum() / _TOGETHER))) * np.sqrt(bright + rounding)
         if dot.noise > max(most, 1e-4 * dot.peak):
             number = dot.noise / max(float(np.sqrt(bright)), 1e-9 * dot.peak)
@@ -72,19 +75,21 @@ def check_linearity(still: Array, dot: Dot, edge: Edge, file: str | None) -> boo
 
 
 def check_levels(pair: Forward, solution: Solution, held: Solution, edge: Edge, file: str | None) -> None:
-    """Warn where a tone curve would explain what a fit leaves.
+    """Warns if a tone curve would explain the residual of a fit.
 
-    No kernel makes all places of one level brighter, and all of another darker. A tone curve does, also one so weak
-    that the residual hardly grows. What the fit's own parameters could have taken up is left out. In a JPEG less shows
-    it; there the sharp dot's edge, a little steeper than pixels can be, is a second witness. And a fitted
-    magnification takes up most of it: so what the dot leaves at its expected size is looked at, too. Where a curve
-    explains more of that than another size does, it is said.
+    No kernel makes all pixels of one level brighter and all of another darker; a tone curve does, even one so weak that
+    the residual hardly grows. There are three kinds of evidence:
 
-    `held` is the solution with the magnification that was expected, `edge` that of the sharp dot.
+    1. The part of a curve's effect that the fit's parameters cannot imitate, in the residual of `solution`.
+    2. In a JPEG this part is less certain; an edge of the sharp dot that is slightly too steep then supports it.
+    3. A fitted magnification imitates most of a curve. So the residual of `held`, the solution with the expected
+       magnification, is tested as well; there a curve must explain more than a change of magnification does.
+
+    `edge` is that of the sharp dot.
     """
     curves = _curves(pair, solution, edge.level)
     found, spread = unexplained(pair, solution, curves)
-    seen = left_open(pair, solution, curves)
+    seen = unfitted_part(pair, solution, curves)
     bend = np.linalg.lstsq(seen.T @ seen, found, rcond=None)[0]
     chi_squared = float(found @ np.linalg.pinv(spread) @ found)
     steep = edge.steepness / max(edge.steepness_error, np.finfo(float).tiny)
@@ -93,31 +98,31 @@ def check_levels(pair: Forward, solution: Solution, held: Solution, edge: Edge, 
     bent = float(np.linalg.norm(bend)) > _BENT and (chi_squared > _BENT_CHI or agrees)
     if bent or (not resized and _curved(pair, held, edge.level, steep)):
         text = (
-            "what the fit leaves goes with the level, "
-            + ("" if bent else "were the dot as large as expected, ")
-            + "as under a tone curve (an S-curve, a picture style): then the kernel is 5 % too small and more; develop "
-            "without it. Colours that are blurred unlike each other leave as much (colours = 'each'), and a blur that "
-            f"is not of family {solution.family!r}"
+            "the fit's residual depends on the level, "
+            + ("" if bent else "at the expected size of the dot, ")
+            + "as with a tone curve (an S-curve, a picture style): the kernel is then too small by 5 % or more; "
+            "develop without it. Colours with different blurs have a similar effect (colours = 'each'), and a "
+            f"blur that is not of family {solution.family!r}"
         )
         warn(text, "not linear", file=file, number=float(bend[1]))
 
 
 def _curved(pair: Forward, held: Solution, level: float, steep: float) -> bool:
-    """Whether an S-curve explains what the expected magnification leaves, and better than another one does.
+    """Whether an S-curve explains the residual at the expected magnification, and better than another magnification.
 
-    The sharp dot's edge, so many standard errors steeper than pixels can be, speaks for the curve, too.
+    `steep`, the excess of the sharp dot's edge in standard errors, counts in favour of the curve.
     """
     larger = held.gain * pair.move_columns(held.moves, ("magnification",), pair.kernel(held))[0]
     basis = np.stack([_curves(pair, held, level)[:, 1], larger], axis=1)
     found, spread = unexplained(pair, held, basis)
     contrast, size = np.sign(found) * found**2 / np.maximum(np.diag(spread), np.finfo(float).tiny)
-    strength = found[0] / np.sum(left_open(pair, held, basis)[:, 0] ** 2)
+    strength = found[0] / np.sum(unfitted_part(pair, held, basis)[:, 0] ** 2)
     clearer = contrast + steep * abs(steep) - abs(size) > _CLEARER
     return bool(strength > _CURVED and contrast > _CURVED_CHI and clearer)
 
 
 def _curves(pair: Forward, solution: Solution, level: float) -> Array:
-    """What a weak tone curve adds to a fit's pixels `[pixels used, 2]`: brighter all over, an S-curve's contrast."""
+    """Effects of weak tone curves on a fit's pixels `[pixels used, 2]`: brightening, and an S-curve's contrast."""
     light = (solution.model[pair.used] - solution.background) / (solution.gain * level)  # 0 is the paper
     encoded = encode(torch.from_numpy(np.clip(light, 0.0, 1.0))[None, None, None], "srgb", False, False)
     step = 1e-3  # of the encoded level
@@ -127,13 +132,13 @@ def _curves(pair: Forward, solution: Solution, level: float) -> Array:
 
 
 def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | None) -> None:
-    """Warn where the sharp picture is softer than a camera in focus leaves it, and the kernel's size feels it.
+    """Warns if the sharp picture is softer than a camera in focus makes it, and this changes the kernel's size.
 
-    `deconvolved` is whether the kernel, of this radius, was fitted to the dot as it would be in focus.
+    `deconvolved`: whether the kernel, of this radius, was fitted to the dot as it would be in focus.
     """
     if edge.softness <= _SENSOR_BLUR_PX or edge.radius <= 2 * edge.softness:
         return
-    # along an axis a disc of radius R has a variance of R^2 / 4
+    # the variance along an axis of a disc of radius R is R^2 / 4
     excess = edge.softness**2 - _SENSOR_BLUR_PX**2
     share = 1 - 1 / np.sqrt(1 + 4 * excess / max(radius_px, 1e-9) ** 2)
     if share < _SOFTENED:
@@ -152,13 +157,13 @@ def check_focus(edge: Edge, radius_px: float, deconvolved: bool, file: str | Non
 
 
 def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None, freest: BlurFit) -> None:
-    """Raise or warn about everything that makes a fit of the picture `file` less than it looks.
+    """Raises or warns about problems of a fit to the picture `file`.
 
-    The solution is judged as the `fit` that will be returned; its residual beside that of the `freest` fit.
+    `fit` describes the solution and will be returned; `freest` is the fit with the freest kernel.
     """
     if not fit.gain > 0:
         raise FitError("the blurred picture has nothing in common with the sharp one", file=file, number=fit.gain)
-    # of what the kernel, as wide as the window, holds of the light
+    # share of the light that the kernel spreads outside the window
     source = pair.moved_source(solution.moves)
     total = float(source[0, 0].real)
     held = float(pair.convolve(source, pair.kernel(solution)[None], whole=True)[0].sum())
@@ -182,7 +187,7 @@ def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None,
     if fit.asymmetry > UNEVEN and asymmetry_of(pair, solution)[1] < CHANCE:
         text = (
             f"the blur is not round: {100 * fit.asymmetry:.0f} % of it depends on the angle in a way that family "
-            f"{fit.family!r} has not; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
+            f"{fit.family!r} cannot; is the lens decentred, the dot off the axis, or the stop a polygon? Families "
             "'auto' and 'image' take any shape"
         )
         warn(text, "asymmetry", file=file, number=fit.asymmetry)
@@ -191,16 +196,16 @@ def check_fit(pair: Forward, solution: Solution, fit: BlurFit, file: str | None,
 
 
 def _check_residual(fit: BlurFit, freest: BlurFit, file: str | None) -> None:
-    """Warn about a residual far above the noise: that of the freest fit, and what a cheaper family adds to it."""
+    """Warns if the freest fit's residual is far above the noise, or if the chosen family adds much to it."""
     ratio = freest.residual_over_noise
     far_above = (freest.residual > _MATTERS and ratio > FAR_ABOVE) or (freest.residual > _SEEN and ratio > 2.0)
-    # of a residual that is said already, only what the family adds
+    # if that is reported already, only what the family adds
     most = max(2.0, 1.3 * ratio) if far_above else 2.0
     if fit is not freest and fit.residual > _SEEN and fit.residual_over_noise > most:
         text = (
             f"family {fit.family!r} leaves {fit.residual_over_noise:.1f} times the noise ({100 * fit.residual:.1f} % "
-            f"of the light), the free profile {ratio:.1f} times; it was chosen because what is "
-            "missing would not be seen at accuracy_db: ask for more, or for a richer family"
+            f"of the light), the free profile {ratio:.1f} times; it was chosen because the "
+            "difference would not be seen at accuracy_db: ask for more, or for a richer family"
         )
         warn(text, "residual", file=file, number=fit.residual_over_noise)
     if far_above:
@@ -213,7 +218,7 @@ def _check_residual(fit: BlurFit, freest: BlurFit, file: str | None) -> None:
 
 
 def _check_spots(pair: Forward, solution: Solution, file: str | None) -> None:
-    """Warn about light beyond the dot's blur, which no family has: too little of it shows in the residual."""
+    """Warns about light beyond the dot's blur; the residual is not sensitive to small amounts."""
     beyond = (pair.distance > pair.dot.reach + 4) & pair.used
     if not beyond.any():
         return
@@ -221,10 +226,10 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None) -> None:
     remaining = np.where(beyond, gaussian_filter(residual, 2.0, mode="constant"), -np.inf)
     y, x = np.unravel_index(int(np.argmax(remaining)), remaining.shape)
     height, peak = float(remaining[y, x]), pair.dot.peak
-    # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of noise that goes together in neighbours
+    # smoothing by sigma = 2 px leaves 0.14 of white noise, and more of correlated noise
     smooth = pair.fine_share * independent_share(pair.noise_correlation)
     around = remaining[beyond]
-    usual = 1.4826 * float(np.median(np.abs(around - np.median(around))))  # of a JPEG's blocks, too
+    usual = 1.4826 * float(np.median(np.abs(around - np.median(around))))  # also of a JPEG's blocks
     if height > max(_SPOT * max(0.14 * noise_of(pair.data) / np.sqrt(smooth), usual), _SPOT_MATTERS * peak):
         text = (
             f"a spot of {100 * height / peak:.1f} % of the dot's level is left at ({x}, {y}), "
@@ -235,7 +240,7 @@ def _check_spots(pair: Forward, solution: Solution, file: str | None) -> None:
 
 
 def _check_parameters(pair: Forward, solution: Solution, file: str | None) -> None:
-    """Warn about parameters that ended on a bound, and about a blur whose size the pictures do not determine."""
+    """Warns about parameters on their bounds, and about a blur whose size the pictures do not determine."""
     low, high = pair.bounds(solution.names)
     for name, least, most in zip(solution.names, low, high, strict=True):
         value = float({**solution.moves, **solution.params}[name])
@@ -244,8 +249,8 @@ def _check_parameters(pair: Forward, solution: Solution, file: str | None) -> No
         if at_most and length:
             text = f"the blur is wider than the window: {name} ran to {value:.3g} px"
             raise FitError(text, "flat profile", file=file, number=value)
-        # a blur below a pixel has no shape, and the exponent of a tilt that is not there, the curvature of blades that
-        # are straight, or leave a circle, end anywhere
+        # exempt: the shape of a blur below a pixel, the exponent of a missing tilt, the curvature of straight or
+        # circular blades
         if (at_least and not length and name != "b" or at_most) and name not in ("m", "curvature"):
             warn(f"{name} ended on its bound {value:.4g}; it is only a limit", "boundary", file=file, number=value)
     size, error = size_of_blur(pair, solution)

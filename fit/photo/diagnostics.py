@@ -1,4 +1,4 @@
-"""A solution of the forward model judged: what it leaves, how large its blur is, how likely it is; as a `BlurFit`."""
+"""Statistics of a solution of the forward model: residual, size of the blur, likelihood; as a `BlurFit`."""
 
 import numpy as np
 from scipy.special import chdtrc
@@ -10,58 +10,58 @@ from .noise import fine_variance, independent_share, noise_of
 from .radial import size_of_profile
 
 UNEVEN = 0.02
-"""Share of a blur's light that depends on the angle, from which on it is said not to be round."""
+"""Share of a blur's light that depends on the angle, above which it is not round."""
 
 CHANCE = 1e-6
-"""How seldom noise may do as much."""
+"""Probability of a deviation by noise alone, below which it is significant."""
 
 _HARMONICS, _RINGS = 8, 4
-_LIT = 0.01  # of its peak, from which on a pixel of a free kernel counts as one of its parameters
+_LIT = 0.01  # share of the peak above which a pixel of a free kernel counts as a parameter
 
 
 def rms_left(pair: Forward, solution: Solution) -> float:
-    """Root mean square of the residual where the light is."""
+    """Root mean square of the residual over the lit pixels."""
     return float(np.sqrt(np.mean((pair.data[pair.lit] - solution.model[pair.lit]) ** 2)))
 
 
 def noise_near(pair: Forward, solution: Solution) -> float:
-    """Deviation of a pixel's noise where the light is, from what varies from pixel to pixel in the residual."""
+    """Standard deviation of a pixel's noise where the light is, from the fine (pixel to pixel) part of the residual."""
     residual = np.where(pair.used, pair.data - np.nan_to_num(solution.model), 0.0)
     seen = np.nan_to_num(fine_variance(residual, pair.lit))
     lit = pair.data[pair.lit] - solution.background
     dark, light = noise_of(pair.data) ** 2, pair.shot_noise * float(np.mean(np.maximum(lit, 0.0)))
     known = dark / pair.fine_share + light / (pair.fine_share_of_light or pair.fine_share)
-    # what is more is not noise of the camera's kind, and need not go together in neighbours
+    # additional fine variance is not camera noise and may be uncorrelated
     return float(np.sqrt(known + max(seen - dark - light, 0.0)))
 
 
 def unexplained(pair: Forward, solution: Solution, basis: Array) -> tuple[Array, Array]:
     """Products of patterns `[pixels used, n]` with a fit's residual `[n]`, and their covariance under noise alone.
 
-    What the fit could have taken up is left out of the patterns.
+    The parts of the patterns that the fit's parameters can imitate are removed.
     """
-    basis = left_open(pair, solution, basis)
+    basis = unfitted_part(pair, solution, basis)
     residual = pair.values - solution.model[pair.used]
-    # a smooth deviation would take the shape itself for noise: its level beside the dot and within it is enough. And
-    # noise is at most what is left: a JPEG has less of it in the dark than goes with that in the light
+    # a smooth deviation must not count as noise: use the level beside the dot and inside it. Noise cannot exceed the
+    # residual: in a JPEG, dark areas have less noise than the level in the light suggests
     variance = min(noise_near(pair, solution), rms_left(pair, solution)) ** 2
-    return basis.T @ residual, variance * basis.T @ pair.together(basis, pair.noise_correlation)
+    return basis.T @ residual, variance * basis.T @ pair.correlated_noise(basis, pair.noise_correlation)
 
 
-def left_open(pair: Forward, solution: Solution, basis: Array) -> Array:
-    """Patterns without what the fit could have taken up, which is not seen in its residual."""
+def unfitted_part(pair: Forward, solution: Solution, basis: Array) -> Array:
+    """Patterns without the parts that the fit's parameters can imitate, which are not in its residual."""
     known, _ = np.linalg.qr(solution.slopes[:, np.abs(solution.slopes).max(axis=0) > 0])
     return without_level(basis - known @ (known.T @ basis), solution.model[pair.used])
 
 
 def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
-    """How much of the blur depends on the angle, and how likely noise alone would show as much.
+    """How much of the blur depends on the angle, and the probability of that by noise alone.
 
-    The residual is expanded in the first eight harmonics of the angle, on four rings each. Under noise of known
-    covariance the squared coefficients, whitened, follow a chi squared distribution.
+    The residual is expanded in the first eight harmonics of the angle on four rings. With noise of known covariance,
+    the whitened squared coefficients follow a chi squared distribution.
 
     Returns:
-        Norm of what depends on the angle, without noise's own share, over the norm of the light; and the chance.
+        Norm of the angle-dependent part, without noise's contribution, over the norm of the light; and the probability.
     """
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
     rows, columns = pair.pixels
@@ -73,7 +73,7 @@ def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
         hat = np.clip(1 - np.abs(place - ring + 0.5), 0, None) * near
         for order in range(1, _HARMONICS + 1):
             templates += [hat * np.cos(order * angle), hat * np.sin(order * angle)]
-    basis = left_open(pair, solution, np.stack([t[pair.used] for t in templates], axis=1))
+    basis = unfitted_part(pair, solution, np.stack([t[pair.used] for t in templates], axis=1))
     left, values, _ = np.linalg.svd(basis, full_matrices=False)
     left = left[:, values > 1e-6 * values.max()]
     found, spread = unexplained(pair, solution, left)
@@ -84,7 +84,7 @@ def asymmetry_of(pair: Forward, solution: Solution) -> tuple[float, float]:
 
 
 def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
-    """The PSF's rms radius and its standard error, px; single parameters may trade with each other."""
+    """The PSF's rms radius and its standard error, px; better determined than single, correlated parameters."""
     if solution.family == "radial":
         return size_of_profile(solution)
     shape = list(solution.params)
@@ -98,13 +98,13 @@ def size_of_blur(pair: Forward, solution: Solution) -> tuple[float, float]:
     covariance = solution.covariance[np.ix_(index, index)]
     if np.isfinite(np.diag(covariance)).all():
         variance, of_moment = max(float(slope @ covariance @ slope), 0.0), 0.0
-        if solution.family == "image":  # its shape is free: only the picture's second moment fixes its size
+        if solution.family == "image":  # its shape is free: only the picture's second moment determines its size
             squared, light = pair.distance[pair.lit] ** 2, pair.data[pair.lit] - solution.background
             away = squared - float(light @ squared / light.sum())
             noise = noise_near(pair, solution) / np.sqrt(independent_share(pair.noise_correlation))
             of_moment = float(noise * np.linalg.norm(away) / abs(light.sum()) / (2 * max(rms, 1e-9)))
         return rms, float(np.sqrt(variance + of_moment**2))
-    # parameters trade with each other without limit; their size may be known all the same
+    # single parameters are undetermined, but their combination may determine the size
     _, values, right = np.linalg.svd(solution.slopes[:, index], full_matrices=False)
     seen = values > 1e-6 * values.max()
     along = right @ slope
@@ -120,18 +120,18 @@ def bic_of(pair: Forward, solution: Solution) -> float:
     if solution.family == "radial":
         free = int(np.sum(np.asarray(solution.params["values"]) > 0))
     elif solution.family == "polygon":
-        free += 1  # its number of blades
+        free += 1  # the number of blades
     elif solution.family == "image":
         kernel = pair.kernel(solution)
         free = int(np.sum(kernel > _LIT * kernel.max()))
-    # neighbours whose noise goes together are no independent witnesses
+    # correlated neighbours are not independent samples
     count = pair.values.size * independent_share(pair.noise_correlation)
     squares = (solution.squares + floor) * count / pair.values.size
     return information_criterion(squares, max(round(count), 1), free + len(pair.fit_moves) + 2)
 
 
 def describe(pair: Forward, solution: Solution, why: str) -> BlurFit:
-    """The solution as a `BlurFit`: errors by name, residual and noise where the light is, samples for a picture."""
+    """The solution as a `BlurFit`: errors by name, residual and noise of the lit pixels, samples for plotting."""
     x, y = pair.dot.x + solution.moves["dx"], pair.dot.y + solution.moves["dy"]
     size = float(np.sqrt(np.mean((pair.data[pair.lit] - solution.background) ** 2)))
     through = (solution.gain * pair.source.noise) ** 2 / pair.fine_share

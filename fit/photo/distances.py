@@ -1,4 +1,4 @@
-"""The distances of one capture, fitted so that each informs its neighbours, and its colours one by one."""
+"""Fits all distances of a capture, smoothly over distance, and each colour."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from torchdof.optics.aperture import Aperture
 from torchdof.optics.psf import FAMILIES, LENGTHS
 
-from ..problems import unheard
+from ..problems import without_warnings
 from ..result import Array, BlurFit
 from .captures import Capture, Captures
 from .dot import find_dot
@@ -18,16 +18,16 @@ from .opening import common_opening, turned
 from .pair import fit_pair
 from .source import soft_edge
 
-_KNOTS = 33  # values of a free profile, the same at all distances
+_KNOTS = 33  # values of a free profile, equal for all distances
 _SWEEPS = 2
 _COLOURS = ("red", "green", "blue")
 _GREEN = 1
-_DEFOCUSED_PX = 1.5  # a smaller blur does not tell on which side of focus a colour is
-_KNOWN = 0.02  # share of a radius to which the thin lens is believed
+_DEFOCUSED_PX = 1.5  # px; for smaller blurs it is uncertain on which side of focus a colour is
+_KNOWN = 0.02  # relative error with which the thin lens gives the radius
 
 
 def fit_one(pair: Capture, focus_m: float, family: str, **known: Any) -> BlurFit:
-    """Fit one pair, its size expected from the distances; `known` as `fit_pair` takes it."""
+    """Fits one pair, with the magnification expected from its distance; `known` are arguments of `fit_pair`."""
     expected = {"magnification": focus_m / pair.distance_m, "knots": _KNOTS if family == "radial" else None}
     return fit_pair(pair.sharp, pair.blurred, family, white=pair.white, files=pair.files, **{**expected, **known})
 
@@ -35,9 +35,9 @@ def fit_one(pair: Capture, focus_m: float, family: str, **known: Any) -> BlurFit
 def fit_distances(
     captures: Captures, family: str, smooth: bool, done: Callable[[Capture, BlurFit], None]
 ) -> list[BlurFit]:
-    """Fit all pairs with one family; `smooth` lets neighbouring distances inform each other after the first fits."""
+    """Fits all pairs with one family; `smooth` then refits each with information from neighbouring distances."""
     place, fits = captures.defocus, dict[int, BlurFit]()
-    for sign in (-1, 1):  # from both ends towards focus, each from its neighbour's fit
+    for sign in (-1, 1):  # from both ends towards focus, each starting from its neighbour's fit
         start: BlurFit | None = None
         side = sorted(np.flatnonzero(place * sign > 0).tolist(), key=lambda k: -abs(place[k]))
         for before, i in zip([None, *side], side, strict=False):
@@ -47,16 +47,16 @@ def fit_distances(
             start = fits[i] = fit_one(captures.pairs[i], captures.focus_m, family, start=start)
             done(captures.pairs[i], start)
     if smooth:
-        with unheard():
+        with without_warnings():
             (_refine_aligned if family == "radial" else _refine_together)(captures, family, fits)
     return [fits[i] for i in range(len(place))]
 
 
 def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit]) -> None:
-    """Fit every pair once more, expecting what lies on the line between its neighbours on the same side of focus.
+    """Refits every pair with a prior: the line between its neighbours on the same side of focus.
 
-    Parameters that trade with each other (a rim's height and its steepness) are thus told alike at all distances,
-    while what the pictures determine stays as they say: the expectation is loose.
+    Correlated parameters (a rim's height and its steepness) thus become consistent over distance. The prior is loose,
+    so parameters that the pictures determine do not change.
     """
     place = captures.defocus
     for i in _SWEEPS * sorted(fits, key=lambda k: -abs(place[k])):
@@ -80,9 +80,9 @@ def _refine_together(captures: Captures, family: str, fits: dict[int, BlurFit]) 
 
 
 def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -> None:
-    """Fit free profiles once more, each up to a radius on one line over the circle of confusion.
+    """Refits free profiles, with radii that lie on a line over the circle of confusion.
 
-    Between nodes a table mixes values at equal shares of the radius: shapes are alike there only if the radii follow
+    Between nodes a table mixes values at equal fractions of the radius, so the shapes only match if the radii follow
     one rule.
     """
     place = captures.defocus
@@ -91,7 +91,7 @@ def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -
         if len(side) < 2:
             continue
         x, ends = np.abs(place[side]), np.array([_end(fits[i]) for i in side])
-        # near focus a profile may have any end: the outer nodes set the line, which is lifted to hold theirs
+        # near focus a profile may end anywhere: the outer nodes define the line, raised so that it contains theirs
         slope, start = np.polyfit(x, ends, 1, w=x)
         lift = max(float(np.max((ends - slope * x - start)[x > 0.25 * x.max()])), 0.0)
         for i, defocus, end in zip(side, x, ends, strict=True):
@@ -100,7 +100,7 @@ def _refine_aligned(captures: Captures, family: str, fits: dict[int, BlurFit]) -
 
 
 def _end(fit: BlurFit) -> float:
-    """Radius in px that holds all but a thousandth of a free profile's light."""
+    """Radius in px that contains all but a thousandth of a free profile's light."""
     values, radius = np.asarray(fit.params["values"]), float(fit.params["radius"])
     r = np.linspace(0, radius, 1001)
     light = np.cumsum(np.interp(r, np.linspace(0, radius, values.size), values) * r)
@@ -110,9 +110,9 @@ def _end(fit: BlurFit) -> float:
 def fit_openings(
     captures: Captures, family: str, firsts: list[BlurFit], done: Callable[[Capture, BlurFit], None]
 ) -> tuple[list[BlurFit], Aperture]:
-    """Fit all pairs with kernels that are not round, those of one opening in as many sizes.
+    """Fits all pairs with kernels that are not round: one opening for all, in different sizes.
 
-    The first fits of `family` ("polygon" or "image") tell the opening, which is given as it shows behind the focus.
+    The first fits of `family` ("polygon" or "image") determine the opening, returned as seen behind the focus.
     """
     nearer = [pair.distance_m < captures.focus_m for pair in captures]
     telling = [i for i, fit in enumerate(firsts) if fit.family == family]
@@ -127,17 +127,17 @@ def fit_openings(
 
 
 def _fit_like(fit: BlurFit, pair: Capture, focus_m: float, sharp: Array, blurred: Array, **known: Any) -> BlurFit:
-    """Fit other pictures of a pair as it was fitted: with its family and opening, a free profile up to its end."""
+    """Fits other pictures of a pair like its own: with the same family and opening, or free profile's end."""
     family, start = (fit.family, fit) if fit.aperture is None else ("image", None)
     known |= {"start": start, "aperture": fit.aperture, "reach": fit.params["radius"] if family == "radial" else None}
     return fit_one(replace(pair, sharp=sharp, blurred=blurred), focus_m, family, **known)
 
 
 def counted(pair: Capture, focus_m: float, fit: BlurFit) -> BlurFit:
-    """A fit whose standard errors also count what was guessed about its pictures."""
+    """Adds the uncertainty of what was guessed about its pictures to a fit's standard errors."""
     if not pair.uncertain:
         return fit
-    with unheard():
+    with without_warnings():
         plain, *others = (
             _fit_like(fit, pair, focus_m, *pictures) for pictures in ((pair.sharp, pair.blurred), *pair.uncertain)
         )
@@ -163,10 +163,10 @@ class Colour:
 
     Attributes:
         name: "red", "green" or "blue".
-        fits: one for each distance, as those of the mean of the colours.
-        focus_shift_dioptres: 1/distance of its focus less that of green's, 1/m: longitudinal colour. NaN where
-            fewer than two distances are blurred enough to tell.
-        lateral_px: (x, y) by which its dot lies beside green's, px: in focus, then at each distance: lateral colour.
+        fits: one for each distance, like those of the mean of the colours.
+        focus_shift_dioptres: 1/distance of its focus minus that of green's, 1/m (longitudinal colour). NaN if fewer
+            than two distances are blurred enough.
+        lateral_px: (x, y) offsets of its dot from green's, px: in focus, then at each distance (lateral colour).
     """
 
     name: str
@@ -176,10 +176,10 @@ class Colour:
 
 
 def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ...]:
-    """Fit red, green and blue of every pair as their mean was fitted.
+    """Fits red, green and blue of every pair like their mean.
 
-    In the sharp picture a colour that is not the one in focus is itself blurred a little. The sharpest colour's edge
-    stands for all, so that each kernel holds all of its colour's blur.
+    In the sharp picture the colours that are not in focus are slightly blurred themselves. The softness of the sharpest
+    colour is used for all, so that each kernel contains all of its colour's blur.
     """
     found: list[list[BlurFit]] = [[] for _ in _COLOURS]
     for pair, mean in zip(captures, fits, strict=True):
@@ -187,7 +187,7 @@ def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ..
             raise AssertionError("only captures with colours are fitted by colour")
         softness = min(soft_edge(still, find_dot(still, file=pair.files[0])).softness for still in pair.colours[0])
         known: dict[str, Any] = {"magnification": mean.magnification, "fit_magnification": False, "softness": softness}
-        with unheard():  # what is wrong with a capture its mean has said
+        with without_warnings():  # the mean's fit has already warned
             for colour, *pictures in zip(found, *pair.colours, strict=True):
                 colour.append(_fit_like(mean, pair, captures.focus_m, *pictures, **known))
     shifts = [_focus_shift(captures.defocus, colour) for colour in found]
@@ -198,19 +198,19 @@ def fit_colours(captures: Captures, fits: Sequence[BlurFit]) -> tuple[Colour, ..
 
 
 def _focus_shift(defocus: Array, fits: Sequence[BlurFit]) -> float:
-    """1/distance of a colour's focus less the capture's, 1/m: where the line through its signed radii crosses 0."""
+    """1/distance of a colour's focus minus the capture's, 1/m: where the line through its signed radii crosses 0."""
     radius: Array = np.array([f.radius for f in fits]) * np.sign(defocus)
     error = np.hypot([f.radius_stderr for f in fits], _KNOWN * radius)
     telling = np.abs(radius) > _DEFOCUSED_PX
     if telling.sum() < 2:
         return math.nan
     slope, start = np.polyfit(defocus[telling], radius[telling], 1, w=1 / error[telling])
-    # the blur is slope * (1/focus - shift' - 1/distance) with the colour's own 1/focus - shift'
+    # radius = slope * (1/focus - shift - 1/distance), with the colour's own focus 1/focus - shift
     return float(start / slope)
 
 
 def _beside(fits: Sequence[BlurFit], green: Sequence[BlurFit]) -> tuple[tuple[float, float], ...]:
-    """(x, y) by which dots lie beside green's: of the sharp picture, then of each distance."""
+    """(x, y) offsets of dots from green's: in the sharp picture, then at each distance."""
     moved = np.array([np.subtract(f.centre, g.centre) for f, g in zip(fits, green, strict=True)])
     shifted = np.array([np.subtract(f.shift, g.shift) for f, g in zip(fits, green, strict=True)])
     return tuple((float(x), float(y)) for x, y in [(moved - shifted).mean(axis=0), *moved])

@@ -1,4 +1,4 @@
-"""The dot in a picture: where it is, how large, on what background, in how much noise, and which pixels are clipped."""
+"""The dot in a picture: position, size, background, noise, and clipped pixels."""
 
 from dataclasses import dataclass
 
@@ -11,22 +11,22 @@ from ..result import Array, Mask
 from ..validation import a_picture
 from .noise import fine_variance, noise_of
 
-_THRESHOLD = 0.15  # of the peak: low enough to keep an uneven ring in one piece
+_THRESHOLD = 0.15  # of the peak; low enough to keep an uneven ring in one piece
 _SMALLEST_PX = 9
-_OTHER_DOT = 0.08  # light of a second dot, over the first's, that is not dirt
-_CLIPPED = 0.6  # share of the dot's pixels beyond which what is left does not fix a fit
-_CUT = 0.1  # share of the paper on the lowest level, from which on what is cut off lifts it by a twentieth of the noise
-_WIDER = 1.5  # noise over its mean to noise below; where a tenth of it is cut off, 1.9
+_OTHER_DOT = 0.08  # share of the brightest dot's light above which another spot is a dot and not dirt
+_CLIPPED = 0.6  # share of clipped pixels of the dot above which it cannot be fitted
+_CUT = 0.1  # share of the paper on its lowest level above which blacks are cut
+_WIDER = 1.5  # noise above the mean over noise below it; 1.9 if a tenth of it is cut off
 
 
 @dataclass(frozen=True)
 class Dot:
-    """A bright spot on a dark ground; lengths in px."""
+    """A bright spot on dark ground; lengths in px."""
 
-    x: float  # of its centre; pixel (0, 0) has its centre at 0
+    x: float  # of the centre; pixel (0, 0) has its centre at 0
     y: float  # the same, downwards
     radius: float  # of a uniform disc with the same second moment
-    reach: float  # radius beyond which its light is lost in the noise
+    reach: float  # radius beyond which its light vanishes in the noise
     background: float  # level around it
     peak: float  # highest level of the slightly smoothed picture above the background
     noise: float  # standard deviation of a pixel on the background
@@ -39,10 +39,10 @@ def distance_from(dot: Dot, shape: tuple[int, ...]) -> Array:
 
 
 def find_dot(picture: Array, *, file: str | None = None) -> Dot:
-    """The one dot in a picture `[H, W]` in linear light.
+    """Finds the only dot in a picture `[H, W]` in linear light.
 
     Raises:
-        FitError: as from :func:`find_dots`; of kind "several dots" where there is more than one.
+        FitError: as from :func:`find_dots`; of kind "several dots" if there is more than one.
     """
     dots = find_dots(picture, file=file)
     if len(dots) > 1:
@@ -56,24 +56,24 @@ def find_dot(picture: Array, *, file: str | None = None) -> Dot:
 
 
 def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTHER_DOT) -> list[Dot]:
-    """Every dot in a picture `[H, W]` in linear light, the brightest (by its light) first, down to a `smallest` share.
+    """Finds dots in a picture `[H, W]` in linear light, brightest first, down to a share `smallest` of its light.
 
     Raises:
-        FitError: of kind "no dot" where nothing stands out from the noise; of kind "window" where the brightest dot
-            touches the edge of the picture.
+        FitError: of kind "no dot" if nothing exceeds the noise enough; of kind "window" if the brightest dot touches
+        the edge of the picture.
     """
     height, width = a_picture("a picture of a dot", picture, _SMALLEST_PX, file).shape
     noise = noise_of(picture)
     frame = max(1, min(height, width) // 20)
     edge = np.ones(picture.shape, dtype=bool)
     edge[frame:-frame, frame:-frame] = False
-    # a mean without outliers: where blacks are cut off at 0, half the noise is gone and the median is not the mean
+    # a mean without outliers: the median is biased if blacks are cut off at 0, which removes half of the noise
     levels, background = picture[edge], float(np.median(picture[edge]))
     if noise > 0 and (kept := np.abs(levels - background) <= 5 * noise).any():
         background = float(levels[kept].mean())
     smooth = ndimage.gaussian_filter(picture - background, 1.0, mode="nearest")
     peak = float(smooth.max())
-    # smoothing by sigma = 1 px leaves 0.28 of white noise; its largest of many pixels is about 4.5 of that
+    # smoothing by sigma = 1 px leaves 0.28 of white noise; the maximum over many pixels is about 4.5 times that
     floor = 0.28 * noise
     if not peak > max(8 * floor, 1e-9 * max(float(np.abs(picture).max()), 1e-300)):
         ratio = peak / floor if floor > 0 else 0.0
@@ -99,7 +99,7 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
                 raise FitError(text, "window", file=file, number=1.0)
             continue
         y, x = ndimage.center_of_mass(smooth, labels, i + 1)
-        # a crop around the spot is enough, and much faster in a large frame
+        # measure in a crop, which is much faster in a large frame
         margin = 20 + 2 * max(rows.stop - rows.start, columns.stop - columns.start)
         top, left = max(rows.start - margin, 0), max(columns.start - margin, 0)
         crop = picture[top : rows.stop + margin, left : columns.stop + margin] - background
@@ -109,15 +109,15 @@ def find_dots(picture: Array, *, file: str | None = None, smallest: float = _OTH
 
 
 def _measured(above: Array, x: float, y: float, noise: float, peak: float) -> tuple[float, float, float, float]:
-    """Centre, radius and reach of a dot around (x, y), by moments; three rounds, each within the reach found.
+    """Centre, radius and reach of a dot near (x, y), by moments in three rounds, each within the last reach.
 
-    The reach is where the mean level over rings is no more above the noise, nor above what a moment would feel.
+    The reach is the radius at which the mean over a ring falls below the noise and is negligible for the moments.
     """
     rows, columns = np.indices(above.shape).astype(np.float64)
     for _ in range(3):
         distance = np.hypot(columns - x, rows - y)
         rings = np.floor(distance + 0.5).astype(np.int64).ravel()  # one px wide
-        count = np.bincount(rings)[: max(3, min(above.shape) // 2 + 1)]  # but for those that the crop cuts
+        count = np.bincount(rings)[: max(3, min(above.shape) // 2 + 1)]  # without rings that the crop cuts
         mean = np.bincount(rings, weights=above.ravel())[: count.size] / np.maximum(count, 1)
         dark = np.abs(mean) < np.maximum(2.5 * noise / np.sqrt(np.maximum(count, 1)), 5e-4 * peak)
         bright = int(np.argmax(mean))
@@ -131,15 +131,15 @@ def _measured(above: Array, x: float, y: float, noise: float, peak: float) -> tu
 
 
 def inner_pixels(picture: Array, dot: Dot) -> Mask | None:
-    """Pixels `[H, W]` that the edge of a sharp dot does not reach; None where they are too few."""
+    """Pixels `[H, W]` of a sharp dot that its edge does not affect; None if they are too few."""
     inside = distance_from(dot, picture.shape) < dot.radius - 4
     return inside if inside.sum() >= 25 else None
 
 
 def fine_share_inside(picture: Array, dot: Dot) -> float | None:
-    """Share of the noise's variance within a sharp dot that second differences see; None where the dot is too small.
+    """Share of the noise's variance in a sharp dot that second differences measure; None if the dot is too small.
 
-    A JPEG keeps fine noise in the light that it takes away in the dark. Uneven light, a parabola, is no noise.
+    In a JPEG fine noise is kept in the light but removed in the dark. Uneven light is removed by fitting a parabola.
     """
     inside = inner_pixels(picture, dot)
     if inside is None:
@@ -156,17 +156,17 @@ def fine_share_inside(picture: Array, dot: Dot) -> float | None:
 def used_pixels(
     picture: Array, dot: Dot, white: float | None, file: str | None, name: str, *, refuse: bool = True
 ) -> Mask:
-    """Pixels that are not clipped `[H, W]`, those that noise may have clipped left out with them.
+    """Pixels `[H, W]` that are not clipped, excluding those that noise may have clipped.
 
-    With `refuse` it warns of pixels that are left out, and raises a `FitError`, both of kind "saturated", where too
-    little of the dot is left. `white` None looks for a plateau.
+    With `refuse` it warns about excluded pixels, and raises a `FitError` if too little of the dot is left, both of kind
+    "saturated". If `white` is None, a plateau is searched.
     """
     level = white if white is not None else _plateau(picture, dot)
     clipped = picture >= (np.inf if level is None else level * (1 - 1e-6))
     count = int(clipped.sum())
     if level is None or not count:
         return ~clipped
-    # where the level is within the noise of white, only the dark half of the noise is left
+    # within the noise of the clipping level only the lower half of the noise is left
     clipped |= uniform_filter(picture, 3, mode="nearest") > level - 3 * dot.noise
     bright = picture > dot.background + 0.15 * dot.peak
     share = float(np.sum(clipped & bright)) / max(int(bright.sum()), 1)
@@ -182,8 +182,8 @@ def used_pixels(
 def _plateau(picture: Array, dot: Dot) -> float | None:
     """The level at which a picture is clipped, or None.
 
-    A clipped picture has many pixels at exactly its highest level, more than one level lower, although its noise is
-    larger than the distance between its levels. Without noise a flat top is only a flat top.
+    A clipped picture has many pixels at exactly its highest level, more than at the next lower one, although its noise
+    is larger than the distance of its levels. Without noise a flat top may be real.
     """
     top = float(picture.max())
     above = picture[picture > dot.background + 0.5 * dot.peak]
@@ -192,16 +192,16 @@ def _plateau(picture: Array, dot: Dot) -> float | None:
         return None
     levels, counts = np.unique(above, return_counts=True)
     if levels.size > 1 and counts[-1] <= counts[-2]:
-        return None  # the tail of the noise, in the few levels of a file
+        return None  # the tail of the noise in a file with few levels
     spacing = float(np.median(np.diff(levels))) if levels.size > 1 else 0.0
     return top if dot.noise > 0.6 * spacing and dot.noise > 1e-12 * abs(top) else None
 
 
 def check_blacks(picture: Array, dot: Dot, file: str | None, name: str) -> None:
-    """Warn where the dark paper's noise is cut off below: it is then brighter than it was, and faint light is not.
+    """Warns if the dark paper's noise is cut off below: its mean is then too high, and faint light is lost.
 
-    Paper without noise, and paper that keeps within a few levels of a file, lies on its lowest level by right: there
-    noise is no wider than a level, or as wide below as above.
+    Paper without noise, or within a few levels of a file, lies on its lowest level without being cut; its noise is then
+    below one level, or symmetric.
     """
     paper = picture[distance_from(dot, picture.shape) > dot.reach + 1]
     levels, counts = np.unique(paper, return_counts=True)

@@ -1,4 +1,4 @@
-"""Which family a blur needs: the cheapest whose picture a viewer could not tell from the exact one."""
+"""Chooses the kernel family: the cheapest whose picture a viewer cannot distinguish from the most likely one's."""
 
 from collections.abc import Mapping
 
@@ -12,19 +12,19 @@ from ..validation import a_picture
 COST = ("gaussian", "disc", "ring", "softm", "radial")
 """Families by growing number of parameters."""
 
-_CONTRAST = 0.22  # standard deviation of a photograph's levels over its peak
-_WIDTH = 256
-_EVIDENCE = 2.0  # difference of BIC below which one speaks of none
+_CONTRAST = 0.22  # standard deviation of a photograph's levels over their peak
+_WIDTH = 256  # px; smallest picture for the comparison
+_EVIDENCE = 2.0  # difference of BIC that is not significant
 _LOOK_BELOW = 20.0  # dB by which a highlight may differ more than a photograph
-_DARK, _DISPLAY = 0.02, 1 / 2.2
+_DARK, _DISPLAY = 0.02, 1 / 2.2  # level of a highlight that is compared, and exponent of the display
 
 
 def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     """PSNR between a natural image blurred with one kernel and with another, in dB.
 
-    Natural images have an amplitude spectrum of 1/f; with it, the mean squared difference is a sum over the kernels'
-    spectra and needs no image: a standard deviation of 0.22 of the peak, 256 px wide, is taken for all. The kernels are
-    `[k, k]`, k odd, and sum to 1; 200 dB is the most.
+    Natural images have an amplitude spectrum of 1/f. The mean squared difference is then a sum over the kernels'
+    spectra and needs no image; a standard deviation of 0.22 of the peak and a width of 256 px are assumed. The kernels
+    are `[k, k]`, k odd, and sum to 1. The result is at most 200 dB.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -52,11 +52,11 @@ def natural_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
 
 
 def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
-    """PSNR between what a highlight looks like through one kernel and through another, in dB.
+    """PSNR between the pictures of a highlight through two kernels, in dB.
 
-    A highlight shows the kernel itself, which a natural image hardly does. It is shown as a display shows it, encoded,
-    the other's peak at white, and compared where either is brighter than 2 % of that. Kernels are as for
-    :func:`natural_psnr`; the other one is that to be like.
+    A highlight shows the kernel itself, unlike a natural image. It is encoded for display with the peak of `other` at
+    white, and compared where either picture is brighter than 2 % of that. Kernels are as for :func:`natural_psnr`;
+    `other` is the reference.
 
     Raises:
         FitError: a kernel is not `[k, k]` with an odd k, or not of finite numbers.
@@ -64,7 +64,7 @@ def highlight_psnr(kernel: ArrayLike, other: ArrayLike) -> float:
     Example:
         >>> import torch
         >>> from torchdof.optics import psf
-        >>> round(highlight_psnr(psf.disc(6.0), psf.ring(2.0, 5.0)))  # nobody would mistake one for the other
+        >>> round(highlight_psnr(psf.disc(6.0), psf.ring(2.0, 5.0)))  # clearly different
         7
     """
     first, second = _square("kernel", kernel), _square("other", other)
@@ -87,7 +87,7 @@ def _square(name: str, kernel: ArrayLike) -> Array:
 
 
 def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
-    """Whether a photograph through a kernel is within `accuracy_db` of that through another, a highlight 20 dB less."""
+    """Whether two kernels agree within `accuracy_db` on a photograph, and within 20 dB less on a highlight."""
     look = highlight_psnr(kernel, other)
     return natural_psnr(kernel, other) >= accuracy_db and look >= accuracy_db - _LOOK_BELOW
 
@@ -95,13 +95,13 @@ def looks_alike(kernel: Array, other: Array, accuracy_db: float) -> bool:
 def choose(
     kernels: Mapping[str, Array], bic: Mapping[str, float], accuracy_db: float
 ) -> tuple[str, str, dict[str, float]]:
-    """The cheapest family that a viewer could not tell from the likeliest one.
+    """The cheapest family that a viewer cannot distinguish from the most likely one.
 
-    The simplest family within 2 of the lowest BIC stands for the truth. Another one will do if a photograph through it
-    is `accuracy_db` from the truth's, and a highlight, where shapes show, at most 20 dB less.
+    The most likely one is the simplest family within 2 of the lowest BIC. Another family is accurate enough if its
+    photograph reaches `accuracy_db` against that one's, and its highlight at most 20 dB less.
 
     Returns:
-        The family, one sentence saying why and what came second, and the PSNR of each family on a natural image
+        The family, one sentence with the reason and the alternatives, and the PSNR of each family on a natural image
         against the free profile "radial".
     """
     by_likelihood = sorted(kernels, key=lambda f: (bic[f], COST.index(f)))

@@ -1,4 +1,4 @@
-"""A whole picture as the camera took it, in linear light, and the windows around its dots."""
+"""A whole picture from the camera in linear light, and the windows around its dots."""
 
 import math
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from .dot import Dot, find_dot, find_dots
 Dots = Literal["one", "centre", "each", "field"]
 
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
-"""Colours of the upper left four pixels of a mosaic, by rows."""
+"""Colours of the upper left 2 x 2 pixels of a mosaic, in rows."""
 
 _MARGIN = 1.35  # window over the blur's reach
 _CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]]) / 4
@@ -30,16 +30,16 @@ _SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]]) / 4
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture in linear light, and what its file says."""
+    """A picture in linear light, and facts from its file."""
 
     file: Path
     light: Array  # [H, W], mean of its colours
     colours: Array  # [C, H, W]
-    white: float | None  # the level at which it is clipped
-    encoded: bool  # whether it was stored in integers, and decoded as sRGB
+    white: float | None  # the clipping level
+    encoded: bool  # whether it had integers, decoded as sRGB
     width_px: int  # of the whole picture
     middle: tuple[float, float]  # (x, y) of the whole picture's centre in px of `light`
-    facts: Mapping[str, float]  # what EXIF says about the camera
+    facts: Mapping[str, float]  # from EXIF, about the camera
 
 
 def read_frame(
@@ -49,12 +49,12 @@ def read_frame(
     crop: tuple[int, int, int, int] | None = None,
     bayer: str | None = None,
 ) -> Frame:
-    """Read a picture; `crop` is left, top, width and height in px, `dark` was taken with the lens cap on.
+    """Reads a picture; `crop` is left, top, width and height in px, `dark` was taken with the lens cap on.
 
     Raises:
-        FitError: of kind "manifest" where crop, mosaic or dark frame do not go with the picture, of kind "not finite"
-            for NaN in it.
-        OSError: it is missing or damaged.
+        FitError: of kind "manifest" if crop, mosaic or dark frame do not fit the picture, of kind "not finite" if it
+        has NaN.
+        OSError: the file is missing or damaged.
     """
     picture = read_image(path, transfer=transfer)
     pixels = picture.pixels[0].numpy().astype(np.float64)
@@ -70,7 +70,7 @@ def read_frame(
     height, width = pixels.shape[1:]
     left, top, columns, rows = crop or (0, 0, width, height)
     if left + columns > width or top + rows > height:
-        text = f"crop {[left, top, columns, rows]} leaves the picture of {width}x{height}"
+        text = f"crop {[left, top, columns, rows]} extends beyond the picture of {width}x{height}"
         raise FitError(text, "manifest", file=str(path))
     pixels = pixels[:, top : top + rows, left : left + columns]
     if bad := int(np.sum(~np.isfinite(pixels))):
@@ -102,7 +102,7 @@ def read_frame(
 def demosaiced(mosaic: Array, pattern: str) -> Array:
     """Red, green and blue `[3, H, W]` of a mosaic `[H, W]`, interpolated bilinearly.
 
-    It is linear, alike in the sharp and the blurred picture, and adds no colour that is not there: all that a fit asks.
+    Bilinear interpolation is linear, equal in the sharp and the blurred picture, and adds no false colour.
     """
     colours = []
     for colour, kernel in (("R", _SQUARE), ("G", _CROSS), ("B", _SQUARE)):
@@ -122,12 +122,12 @@ def size_of(picture: Array) -> str:
 def cut_pairs(
     still: Frame, moved: Frame, focus_m: float, distance_m: float, dots: Dots, exposure: float | None, colours: bool
 ) -> list[Capture]:
-    """Find the dot, or the dots of a grid, in two frames and cut the windows around each.
+    """Finds the dot, or the dots of a grid, in two frames and cuts the windows around each.
 
     `exposure` is the brightness of `moved` over that of `still`.
 
     Raises:
-        FitError: no dot, several, one too near to the frame's edge or to others.
+        FitError: no dot, several dots, or one too close to the frame's edge or to others.
     """
     frames = (still, moved)
     if dots == "one":
@@ -138,12 +138,12 @@ def cut_pairs(
     for first, second in matched:
         places = [(round(dot.x), round(dot.y)) for dot in (first, second)]
         height, width = still.light.shape
-        room = [min(x, y, width - 1 - x, height - 1 - y) for x, y in places]
+        border = [min(x, y, width - 1 - x, height - 1 - y) for x, y in places]
         needed = max(first.reach, second.reach) + 2
-        half = min(*room, math.ceil(_MARGIN * needed) + 8)
+        half = min(*border, math.ceil(_MARGIN * needed) + 8)
         if half < needed:
             text = f"the frame cuts the blur: it reaches {needed:.0f} px from the dot, the frame ends after {half} px"
-            worse = still if room[0] < first.reach + 2 else moved
+            worse = still if border[0] < first.reach + 2 else moved
             raise FitError(text, "window", file=str(worse.file), number=needed)
         cut = [(..., slice(y - half, y + half + 1), slice(x - half, x + half + 1)) for x, y in places]
         sharp, blurred = (frame.light[window].copy() for frame, window in zip(frames, cut, strict=True))
@@ -168,7 +168,7 @@ def cut_pairs(
 
 
 def _matched(still: Frame, moved: Frame, magnification: float) -> list[tuple[Dot, Dot]]:
-    """Dots of a grid in both pictures, from the centre outwards: each moves along the line to the centre."""
+    """Pairs the dots of a grid in both pictures, from the centre outwards: each moves on its line to the centre."""
     first, second = (find_dots(frame.light, file=str(frame.file), smallest=0.3) for frame in (still, moved))
     middle, pairs = still.middle, []
     for dot in sorted(first, key=lambda d: math.dist((d.x, d.y), middle)):

@@ -1,4 +1,4 @@
-"""A folder of photographs of a dot, described by its `capture.toml`: read, and cut into windows around the dot."""
+"""Reads a folder of photographs of a dot, described by its `capture.toml`, and cuts windows around the dot."""
 
 import math
 import os
@@ -37,42 +37,42 @@ def read_captures(
     colours: Colours | None = None,
     root: str | os.PathLike[str] | None = None,
 ) -> list[Captures]:
-    """Read a folder of photographs described by its `capture.toml`.
+    """Reads a folder of photographs described by its `capture.toml`.
 
     ```toml
     focus_m = 0.20                # the lens stays focused here
     sharp = "0200mm.png"          # the dot at that distance
-    focal_length_mm = 50.0        # what is left out of camera is read from EXIF; all three make the table know its unit
+    focal_length_mm = 50.0        # missing camera fields are read from EXIF; with all three the table's unit is known
     f_number = 2.8
     sensor_width_mm = 36.0
-    transfer = "srgb"             # or "linear"; left out, floats are linear, and integers sRGB with a warning
+    transfer = "srgb"             # or "linear"; if missing, floats are linear, and integers sRGB with a warning
 
     [[shot]]                      # by increasing distance
     file = "0500mm.png"
     distance_m = 0.50
 
-    # at will, before the shots: full_width_px = 6000 of the whole frame, if the pictures were cropped before;
-    # crop = [left, top, width, height] in px; dark = "dark.png", lens cap on; exposure_s, here and of each shot;
-    # dots = "centre", "each" or "field" of a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
+    # optional, before the shots: full_width_px = 6000 of the whole frame, if the pictures were cropped before;
+    # crop = [left, top, width, height] in px; dark = "dark.png", with the lens cap on; exposure_s, here and in each
+    # shot; dots = "centre", "each" or "field" for a grid; colours = "each"; bayer = "RGGB" for a sensor's mosaic; name
     ```
 
     Args:
-        folder: with the manifest and the pictures, or the manifest's path.
-        dots: instead of the manifest's "dots".
-        colours: instead of the manifest's "colours".
-        root: folder that the manifest and every picture must lie in, links followed, for a service that reads
-            manifests of strangers. None reads whatever they name, `../` and absolute paths among it.
+        folder: folder with the manifest and the pictures, or path of the manifest.
+        dots: replaces the manifest's "dots".
+        colours: replaces the manifest's "colours".
+        root: folder that must contain the manifest and every picture, after following links, for services that read
+            untrusted manifests. None allows any path, including `../` and absolute ones.
 
     Returns:
-        One `Captures`; with `dots="each"` or "field" one for every dot of the grid, the most central first.
+        One `Captures`; with `dots="each"` or "field" one for each dot of the grid, the most central first.
 
     Raises:
-        FitError: of kind "manifest" where that is missing, is not TOML, or a field is wrong; of kind "distance" where
-            distances are not increasing or that of the focus; or a picture's kind of trouble, with its file.
+        FitError: of kind "manifest" if it is missing, is not TOML, or has an invalid field; of kind "distance" if
+        distances are not increasing or equal the focus; or the error of a picture, with its file.
         OSError: a picture is missing or damaged.
 
     Warns:
-        FitWarning: of kind "not linear" for integers whose transfer nobody stated: they are taken for sRGB.
+        FitWarning: of kind "not linear" for integers whose transfer is not stated: sRGB is assumed.
     """
     if not isinstance(folder, str | os.PathLike):
         raise FitError(f"folder must be the path of a folder or of its {MANIFEST}, got {show(folder)}", "manifest")
@@ -111,7 +111,7 @@ def read_captures(
     if known["transfer"] is None and encoded:
         more = f" and {len(encoded) - 1} more" if len(encoded) > 1 else ""
         text = (
-            f"nobody said how {encoded[0]}{more} are encoded, and they are taken for sRGB. A camera's own tone curve "
+            f"the encoding of {encoded[0]}{more} is not stated; sRGB is assumed. A camera's own tone curve "
             "or sharpening makes the kernel up to 15 % too small and need not show: develop to linear light without "
             "them. Then say transfer = 'linear', or 'srgb' if that is all that was done"
         )
@@ -143,7 +143,7 @@ def read_captures(
 
 
 def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
-    """Refuse a file that does not lie in a folder, wherever its name and links lead."""
+    """Raises an error if a file, after following links, lies outside a folder."""
     folder, real = os.path.realpath(root), os.path.realpath(file)
     if not os.path.isdir(folder):
         raise FitError(f"root must be a folder, got {show(str(root))}", "manifest", file=where)
@@ -153,7 +153,7 @@ def inside(file: Path, root: str | os.PathLike[str], where: str) -> None:
 
 
 def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The fields of a manifest and those of its shots, all of which have names that are known."""
+    """The fields of a manifest and those of its shots, with known names only."""
     where = str(path)
     if not path.is_file():
         raise FitError("there is no such manifest; write a capture.toml beside the pictures", "manifest", file=where)
@@ -172,7 +172,7 @@ def _manifest(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 
 def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
-    """A field of the manifest, None where it was left out and may be; a refusal where it is not as it must be."""
+    """A valid field of the manifest, or None if it is missing and optional."""
     value = fields.get(name)
     if value is None and name not in _NEEDED:
         return None
@@ -193,7 +193,7 @@ def _field(fields: Mapping[str, Any], name: str, where: str) -> Any:
 
 
 def _check_alike(first: Frame, second: Frame, where: str) -> None:
-    """Refuse pictures of unlike size, and those between which the lens was changed."""
+    """Raises an error for pictures of different size, or if the lens was changed between them."""
     if first.light.shape != second.light.shape:
         text = f"{second.file.name} is {size_of(second.light)}, {first.file.name} is {size_of(first.light)}"
         raise FitError(text, "manifest", file=where)

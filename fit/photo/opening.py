@@ -1,9 +1,9 @@
-"""Blur that is not round: the lens's opening, as a polygon of blades where that explains it, else as a picture.
+"""Blur that is not round: the lens's opening as a polygon of blades if that explains it, otherwise as a picture.
 
-The picture is the dot's deconvolved from the defocused one. Its pixels are free but for four things: none is negative,
-they sum to 1, neighbours are alike as far as the noise leaves them undetermined, and there is no light where a first
-estimate has next to none (it would be noise that could not be negative). The smoothing is the one under which pixels
-that were kept back are foretold best.
+The picture is the blurred dot deconvolved with the sharp one. Its pixels are free, except that they are non-negative,
+sum to 1, are smooth where the noise leaves them undetermined, and are 0 where a first estimate is almost dark
+(non-negative noise would accumulate there). The strength of smoothing is found by cross-validation: it predicts
+withheld pixels best.
 """
 
 import math
@@ -22,24 +22,24 @@ from .forward import Forward, Solution
 from .noise import independent_share
 
 _BLADES = range(3, 10)
-_SHOWN = 25.0  # chi squared of a polygon's harmonic, of two degrees of freedom, from which on it is tried
-_BETTER = 10.0  # by which a polygon's BIC must be lower: seven numbers of blades were looked at
-_FORETOLD = 24.0  # by how much the log likelihood of pixels that were kept back must grow, doubled
-_UNEXPLAINED = 2.0  # residual over noise
-_FINEST = 8  # samples of an opening's picture a pixel of the kernel
+_SHOWN = 25.0  # chi squared of a polygon's harmonic (two degrees of freedom) above which a polygon is fitted
+_BETTER = 10.0  # required decrease of BIC for a polygon; accounts for the choice among seven numbers of blades
+_FORETOLD = 24.0  # required increase of twice the log likelihood of withheld pixels, for a picture
+_UNEXPLAINED = 2.0  # residual over noise above which a picture is tried
+_FINEST = 8  # samples of an opening's picture for each pixel of the kernel
 _MOST_SIDE = 64
 _SMOOTHNESS = 10.0 ** np.arange(0.0, -6.5, -0.5)
-_STEPS, _STILL = 150, 1e-4  # the most, and the change over the peak that ends them
-_KEPT_BACK = 0.2
-_LIT = 0.06  # of the peak of a first estimate, smoothed by a pixel, below which the kernel is dark
-_WORSE = 3  # strengths of smoothing in a row that foretell worse, after which weaker ones are not tried
+_STEPS, _STILL = 150, 1e-4  # most steps, and change relative to the peak that ends them
+_KEPT_BACK = 0.2  # share of pixels withheld
+_LIT = 0.06  # share of the peak of a first estimate, smoothed by a pixel, below which the kernel is dark
+_WORSE = 3  # number of successively worse strengths of smoothing after which weaker ones are not tried
 
 
 def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution, str] | None:
-    """The opening that explains what the free round profile leaves, or None where nothing is left that one explains.
+    """The opening that explains the residual of the free round profile, or None if none does.
 
     Returns:
-        The pair with its opening, the solution, of family "polygon" or "image", and how it was chosen.
+        The pair with its opening, the solution of family "polygon" or "image", and the reason for it.
     """
     known, what, why = (pair, round_one), "round", ""
     blades, shown, _ = _harmonic(pair, round_one)
@@ -55,14 +55,14 @@ def solve_opening(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
         if gained > _FORETOLD:
             known = solve_image(*known, kernel)
             why = (
-                f"the blur is not {what}: pixels that were kept back are foretold better by a picture of it "
+                f"the blur is not {what}: a picture of it predicts withheld pixels better "
                 f"(log likelihood higher by {gained / 2:.0f})"
             )
     return (*known, why) if why else None
 
 
 def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution]:
-    """The regular polygon whose harmonic stands out most in what a round profile leaves."""
+    """Fits the regular polygon whose harmonic is the most significant one in a round profile's residual."""
     blades, _, corner = _harmonic(pair, round_one)
     size = np.sqrt(2) * size_of_blur(pair, round_one)[0]
     start = {
@@ -74,11 +74,11 @@ def solve_polygon(pair: Forward, round_one: Solution) -> tuple[Forward, Solution
 
 
 def solve_image(pair: Forward, before: Solution, kernel: Array | None = None) -> tuple[Forward, Solution]:
-    """The opening as a picture, of a kernel if that is known; the moves begin from those of a solution before."""
+    """Fits the opening as a picture, from a kernel if given; the moves start from those of `before`."""
     kernel = _deconvolved(pair, before)[0] if kernel is None else kernel
     y, x = center_of_mass(kernel)
     rows, columns = np.nonzero(kernel > 0.01 * kernel.max())
-    half = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0  # of the opening's square, px
+    half = float(np.ceil(np.hypot(rows - y, columns - x).max())) + 1.0  # half the side of the opening's square, px
     side = int(min(_MOST_SIDE, round(2 * half * _FINEST)))
     places = ((np.arange(side) + 0.5) / side * 2 - 1) * half
     fine = map_coordinates(kernel, np.meshgrid(places + y, places + x, indexing="ij"), order=3, mode="constant")
@@ -89,7 +89,7 @@ def solve_image(pair: Forward, before: Solution, kernel: Array | None = None) ->
 def _solved(
     pair: Forward, before: Solution, opening: Aperture, family: str, start: dict[str, float]
 ) -> tuple[Forward, Solution]:
-    """The pair with an opening, and its solution; the magnification starts from that of a solution before."""
+    """The pair with an opening, and its solution; the magnification starts from that of `before`."""
     shaped = replace(
         pair, opening=opening, start={family: start}, prior={}, held_magnification=before.moves["magnification"]
     )
@@ -97,13 +97,13 @@ def _solved(
 
 
 def _harmonic(pair: Forward, round_one: Solution) -> tuple[int, float, float]:
-    """Blades of the polygon that stands out most in a round profile's residual.
+    """Number of blades of the polygon that is most significant in a round profile's residual.
 
-    A polygon is a circle whose radius depends on the angle: what that adds lies on a ring, and goes round as often as
-    there are blades.
+    A polygon is a circle with an angle-dependent radius. The difference from the circle lies on a ring and has one
+    period for each blade.
 
     Returns:
-        Their number, chi squared of its two amplitudes, and the angle of a corner, degrees from the right, clockwise on
+        The number, chi squared of its two amplitudes, and the angle of a corner in degrees from the right, clockwise on
         the screen.
     """
     size = np.sqrt(2) * size_of_blur(pair, round_one)[0]
@@ -125,16 +125,16 @@ def _harmonic(pair: Forward, round_one: Solution) -> tuple[int, float, float]:
 
 
 def turned(opening: Aperture) -> Aperture:
-    """The same opening turned by half: as it shows on the other side of the focus plane."""
+    """The opening rotated by half a turn, as seen on the other side of the focus plane."""
     if opening.mask is not None:
         return replace(opening, mask=opening.mask.flip(0, 1))
     return replace(opening, rotation_deg=float(opening.rotation_deg) + 180.0)
 
 
 def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
-    """One opening for all distances, as it shows behind the focus; the larger a blur, the more it shows.
+    """One opening for all distances, as seen behind the focus; larger blurs have more weight.
 
-    The fits are all "polygon", or all "image"; nearer than the focus an opening shows turned by half.
+    The fits are all "polygon", or all "image"; in front of the focus an opening is seen rotated by half a turn.
     """
     found = [f.aperture if not near else turned(f.aperture) for f, near in zip(fits, nearer, strict=True) if f.aperture]
     weight = np.array([f.radius**2 for f in fits])
@@ -157,15 +157,15 @@ def common_opening(fits: Sequence[BlurFit], nearer: Sequence[bool]) -> Aperture:
 
 
 def _deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
-    """The kernel of a pair of pictures, from a solution to begin with that gives the moves and the kernel's reach.
+    """Deconvolves a pair of pictures, starting from a solution, which gives the moves and the kernel's reach.
 
     Returns:
-        The kernel `[k, k]`, k odd, not negative, summing to 1; and twice the log likelihood of pixels that were kept
-        back, over that of the solution it began from.
+        The kernel `[k, k]`, k odd, non-negative, summing to 1; and twice the increase of the log likelihood of withheld
+        pixels over the solution.
     """
     source = pair.moved_source(shape.moves)
     half = min(int(np.ceil(float(shape.params["radius"]))) + 2, pair.half - 1)
-    # a fifth of the pixels is kept back; the smoothing under which they are foretold best is taken
+    # withhold a fifth of the pixels, and take the smoothing that predicts them best
     kept_back = np.random.default_rng(0).random(pair.values.size) < _KEPT_BACK
     judged = kept_back & pair.lit[pair.used]
     tried: list[tuple[float, float, Array]] = []
@@ -189,7 +189,7 @@ def _deconvolved(pair: Forward, shape: Solution) -> tuple[Array, float]:
 def _descend(
     pair: Forward, source: Array, start: Array, smoothness: float, fitted: Mask, lit: Mask | None = None
 ) -> tuple[Array, Array]:
-    """The kernel and the model of the pixels used, by accelerated projected gradients on those that may be lit.
+    """The kernel and the model of the used pixels, by accelerated projected gradient descent on the lit kernel pixels.
 
     Reference:
         Beck and Teboulle, "A fast iterative shrinkage-thresholding algorithm", SIAM J. Imaging Sciences 2(1), 2009.

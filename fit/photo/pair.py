@@ -1,4 +1,4 @@
-"""One pair of pictures, sharp and defocused, to one fitted kernel."""
+"""Fits one kernel to a pair of pictures, sharp and defocused."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -30,10 +30,10 @@ SourceKind = Literal["auto", "image", "dot"]
 
 _SMALLEST_WINDOW = 15
 _SMALLEST_DOT_PX = 0.2
-_AS_GOOD = 2e-3
+_AS_GOOD = 2e-3  # rms of an edge over the dot's level, up to which an ideal dot may represent a magnified one
 _GROWN, _ALMOST = 0.02, 0.02  # px^2 of false variance that matters; rms of an edge over the dot's level that does not
-_EXACT_PX = 4.0  # radius of a dot, and of its blur, below which pixels leave what looks like a tone curve
-_SIGNIFICANT = 12.0  # drop of chi squared that calls for a fitted magnification: 3.5 sigma
+_EXACT_PX = 4.0  # smallest radius of a dot and its blur; below, pixels have an effect like a tone curve
+_SIGNIFICANT = 12.0  # decrease of chi squared for which the magnification is fitted: 3.5 sigma
 
 
 def fit_pair(
@@ -55,48 +55,46 @@ def fit_pair(
     softness: float | None = None,
     files: tuple[str | None, str | None] = (None, None),
 ) -> BlurFit:
-    """The kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
+    """Fits the kernel that turns a picture of a sharp dot into the picture of the same dot out of focus.
 
     The forward model explains every pixel of the window: `blurred = gain * (kernel convolved with the sharp picture,
-    moved and magnified) + background`. Exposure, stray light, displacement and magnification are fitted, so they do
-    not bias the kernel. The kernel is what the fitted PSF does to a picture made of pixels, as in rendering
+    moved and magnified) + background`. Exposure, stray light, displacement and magnification are fitted, so they do not
+    bias the kernel. As in rendering, the kernel is the effect of the fitted PSF on a picture made of pixels
     (`torchdof.optics.psf`): a pixel's own blur, 1/12 px^2 of variance, is in both pictures and not in the parameters.
 
     `model="ratio"` is the paper's: `blurred / sharp` along spokes inside the dot, then eq. (1). It measures the dot
-    convolved with the kernel, so its widths depend on the dot. Use it to compare with the paper.
+    convolved with the kernel, so its widths depend on the dot. Use it for comparison with the paper.
 
     Args:
-        sharp: `[H, W]`, linear light, the dot in focus on a dark ground; None for a point of light (a star).
-        blurred: `[H, W]`, linear light, the same dot out of focus, the whole blur inside the window.
-        family: "gaussian", "ring", "disc", "softm", "radial"; "polygon", the opening that a lens's blades leave;
-            "image", a kernel of any shape; or "auto": the cheapest that reaches `accuracy_db`, round unless the
-            pictures say otherwise. Detail finer than the dot is smooth in an "image": a dot of a third of the blur's
-            size shows most.
+        sharp: `[H, W]`, linear light, the dot in focus on dark ground; None for a point of light (a star).
+        blurred: `[H, W]`, linear light, the same dot out of focus, with the whole blur inside the window.
+        family: "gaussian", "ring", "disc", "softm", "radial"; "polygon", an opening formed by blades; "image", a kernel
+            of any shape; or "auto": the cheapest that reaches `accuracy_db`, round unless the pictures contradict that.
+            An "image" does not resolve detail finer than the dot: use a dot of about a third of the blur's size.
         model: "forward" or "ratio".
-        accuracy_db: PSNR on a natural image that "auto" asks of a family, against the free profile `radial`.
-        source: what stands for the sharp dot. "image": its picture; "dot": an ideal round dot fitted to it, which has
-            no noise; "auto": the ideal one where it explains the picture to within its noise, or that is clipped.
+        accuracy_db: PSNR on a natural image against the free profile `radial` that "auto" requires of a family.
+        source: represents the sharp dot. "image": its picture; "dot": an ideal round dot fitted to it, without noise;
+            "auto": the ideal dot if it explains the picture within its noise, or if that is clipped.
         magnification: expected size of the dot in the blurred picture over its size in the sharp one.
-        fit_magnification: True fits it, False holds it, None fits it only where the pictures contradict the expected
-            one by more than 3.5 standard errors. Where it is held, the standard errors take it as known.
-        white: level at and above which a pixel is clipped; None looks for a plateau.
-        start: a fit of a similar pair, to start from (several distances of one lens).
-        prior: expected value and standard deviation of parameters of `family`, known from elsewhere (the neighbouring
-            distances), in px; the result is what both the pictures and it allow, and so are its standard errors.
-        knots: number of values of a "radial" profile; None takes two a pixel.
-        reach: where a "radial" profile ends, px; None finds it from a soft disc.
-        aperture: the lens's opening as it shows in `blurred`, if it is known (from another distance), for the family
-            "image": its size alone is then fitted.
-        softness: of the sharp dot's edge in focus (sigma, px), where that is known to be less than in `sharp`: of a
-            colour that is not the one in focus. An ideal dot then stands for the sharp one.
-        files: names of the two pictures, for errors and warnings.
+        fit_magnification: True fits it, False keeps the expected one, None fits it only if the pictures contradict the
+            expected one by more than 3.5 standard errors. If it is not fitted, the standard errors treat it as known.
+        white: level from which pixels are clipped; None searches for a plateau.
+        start: a fit of a similar pair, to start from (for several distances of one lens).
+        prior: expected values and standard deviations of parameters of `family`, in px, from other knowledge
+            (neighbouring distances); result and standard errors combine it with the pictures.
+        knots: number of values of a "radial" profile; None uses two for each pixel.
+        reach: end of a "radial" profile, px; None uses a fitted soft disc.
+        aperture: the lens's opening as seen in `blurred`, if it is known (from another distance), for the family
+            "image"; then only its size is fitted.
+        softness: sigma of the sharp dot's edge in focus, px, if it is known to be less than in `sharp`, as for a colour
+            that is not in focus. An ideal dot then represents the sharp one.
+        files: names of the two pictures, for messages.
 
     Returns:
         A `BlurFit` with lengths in pixels.
 
     Raises:
-        FitError: wrong arguments, or what is wrong with the capture, by its `kind`; what to doubt about a result is
-            warned about in the same way.
+        FitError: invalid arguments, or problems of the capture, see its `kind`. Doubtful results give a `FitWarning`.
 
     Reference:
         Sato, Dobashi, Yamamoto, section 2 (model="ratio").
@@ -114,7 +112,7 @@ def fit_pair(
     a_choice("model", model, get_args(Model))
     a_choice("source", source, get_args(SourceKind))
     a_number("accuracy_db", accuracy_db, -np.inf, unit="dB")
-    a_number("magnification", magnification, 1e-3, 1e3)  # beyond this the dot of one picture is not seen in the other
+    a_number("magnification", magnification, 1e-3, 1e3)  # a larger ratio makes one dot invisible
     for name, value, least in (("white", white, -1e100), ("reach", reach, 0), ("softness", softness, -1e-9)):
         if value is not None:
             a_number(name, value, least, 1e100)
@@ -146,19 +144,19 @@ def fit_pair(
         if start is not None:
             pair.start[start.family] = {k: float(v) for k, v in start.params.items() if not isinstance(v, np.ndarray)}
         pair.prior = prior or {}
-        # whether the magnification is settled before the fit: a point has none
+        # whether the magnification is known before the fit: a point has none
         held = True if sharp is None else None if fit_magnification is None else not fit_magnification
         pair.fit_moves = ALL_MOVES if held is False else ("dx", "dy")
         pair.opening = aperture
         free_profile = family in ("auto", "radial", *OPENINGS) and aperture is None
-        # no wrong family can mislead a free profile about the magnification
+        # a free profile gives an unbiased magnification, unlike a wrong family
         expected = freest = solution = solve_round(pair, knots, reach) if free_profile else pair.solve(family)
         if held is None:
             unheld = replace(pair, fit_moves=ALL_MOVES)
             radius = float(solution.params["radius"]) if free_profile else 0.0
             free = solve_radial(unheld, solution.moves, radius, knots) if free_profile else unheld.solve(family)
-            # the scale of chi squared: what remains, or the rounding of a spline where there is no noise; and noise
-            # that goes together in neighbours does not average out over them
+            # scale of chi squared: the residual or, without noise, the rounding of a spline; correlated noise counts
+            # less
             floor = max(free.squares / pair.values.size, (1e-4 * pair.unit) ** 2)
             gained = (solution.squares - free.squares) / floor * independent_share(pair.noise_correlation)
             if gained > _SIGNIFICANT:
@@ -178,12 +176,12 @@ def fit_pair(
                 pair, solution, why = opened
                 freest = expected = solution
         fit = describe(pair, solution, why)
-        # a family that was chosen for being cheap is not to blame for what the freest kernel explains
+        # a family chosen for its cost is not to blame if the freest kernel explains the rest
         judged = fit if freest is solution else describe(pair, freest, "")
         check_fit(pair, solution, fit, files[1], judged)
         if edge is not None:
-            # a residual far above the noise was said already, whatever it goes with. A picture of a kernel is smoothed,
-            # and what that leaves goes with the level, too
+            # a residual far above the noise has been reported already. A picture of a kernel is smoothed, which makes
+            # the residual depend on the level
             most = EXPLAINED if freest.family in OPENINGS else FAR_ABOVE
             large = min(fit.radius, edge.radius * fit.magnification) > _EXACT_PX
             if linear and large and judged.residual_over_noise < most:
@@ -201,9 +199,9 @@ def prepared_pair(
     files: tuple[str | None, str | None] = (None, None),
     softness: float | None = None,
 ) -> tuple[Forward, Edge | None, bool]:
-    """Find the dots, leave out what is clipped, and decide what stands for the sharp dot.
+    """Finds the dots, excludes clipped pixels, and chooses the representation of the sharp dot.
 
-    With it come the sharp dot's edge, and whether the sharp picture seems to be in linear light.
+    Also returns the sharp dot's edge, and whether the sharp picture appears to be in linear light.
     """
     data_dot = find_dot(data, file=files[1])
     used = used_pixels(data, data_dot, white, files[1], "blurred")
@@ -221,7 +219,7 @@ def prepared_pair(
     if edge.radius * magnification < _SMALLEST_DOT_PX:
         text = (
             f"by the distances the dot, {edge.radius:.1f} px in focus, would have a radius of "
-            f"{edge.radius * magnification:.2g} px here, and nothing of it be seen; is the distance misread, or in "
+            f"{edge.radius * magnification:.2g} px here, which is too small to see; is the distance misread, or in "
             "another unit?"
         )
         raise FitError(text, "distance", file=files[1], number=magnification)
@@ -231,8 +229,8 @@ def prepared_pair(
             "for it"
         )
         warn(text, "saturated", file=files[0], number=float(clipped))
-    # an ideal dot explains a sharp picture as well as its own pixels would: a spline between the pixels of a hard edge
-    # is itself off by a few thousandths once it is magnified, and so is the sensor's softness, which does not grow
+    # an ideal dot is as good as the dot's own pixels: a spline between the pixels of a hard edge is wrong by a few
+    # thousandths once it is magnified, and so is the sensor's softness, which does not grow with the dot
     unexplained = edge.rms * np.sqrt(max(1 - 1 / max(edge.misfit, 1e-9) ** 2, 0.0))
     magnified = edge.softness**2 * abs(1 - magnification**2) > _GROWN
     close = edge.misfit < EXPLAINED or (edge.rms < _AS_GOOD and magnification != 1)
@@ -251,7 +249,7 @@ def prepared_pair(
 
 
 def _choose(pair: Forward, radial: Solution, accuracy_db: float) -> tuple[Solution, str, dict[str, float]]:
-    """Fit every family at the free profile's magnification and choose; the chosen one's is then fitted with it."""
+    """Fits every family at the free profile's magnification and chooses one, which is then fitted with it."""
     fit_moves, pair.fit_moves = pair.fit_moves, ("dx", "dy")
     solutions = {"radial": radial} | {f: pair.solve(f) for f in COST[:-1]}
     kernels = {f: pair.kernel(s) for f, s in solutions.items()}

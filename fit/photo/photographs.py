@@ -1,7 +1,7 @@
-"""Photographs of the printed target as they come from a camera or phone; they tell distances, focus and tone curve.
+"""Reads photographs of the printed target from a camera or phone, and determines distances, focus and tone curve.
 
-The square's size gives each distance, the sharpest picture is the one in focus, EXIF knows the lens; a tone curve gives
-itself away (`tone`) and is undone.
+The square's size gives each distance, the sharpest picture is the one in focus, and EXIF describes the lens. A tone
+curve is detected (`tone`) and undone.
 """
 
 import os
@@ -25,31 +25,31 @@ from .target import DOT_MM, SQUARE_MM, Target, find_target
 from .tone import WINDOW, Tone, tone_curve, untoned
 
 _READ = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
-_SAME_PLACE = 0.03  # as a share of the distance
-_FEWEST = 4  # photographs from which on they tell of a tone curve
+_SAME_PLACE = 0.03  # relative difference of distance up to which a photograph is at the focus
+_FEWEST = 4  # fewest photographs from which a tone curve can be found
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph with the target in it."""
+    """A photograph of the target."""
 
     file: str
     light: Array  # [H, W], mean of the colours in linear light, the tone curve undone
     target: Target
-    distance_m: float  # of the target from the lens, by its size
+    distance_m: float  # from the lens, by the target's size
     sharpness: float  # steepest slope of the dot's edge over its height, 1/px
-    clipped: bool  # whether the paper is at the top of the scale
+    clipped: bool  # whether the paper is clipped
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """A folder of photographs, ready to be fitted.
+    """A folder of photographs, ready for fitting.
 
     Attributes:
         captures: for `fit_captures`.
-        pictures: every photograph with a target, by distance.
-        tone: three numbers of the tone curve that was undone, see :func:`untoned`.
-        advice: what to do better, a sentence each.
+        pictures: every photograph of the target, by distance.
+        tone: three parameters of the tone curve that was undone, see :func:`untoned`.
+        advice: improvements, a sentence each.
     """
 
     captures: Captures
@@ -65,23 +65,23 @@ def read_photographs(
     colours: Colours = "mean",
     root: str | os.PathLike[str] | None = None,
 ) -> Photographs:
-    """Read a folder of photographs of the target, without any description.
+    """Reads a folder of photographs of the target, without a description.
 
     Args:
-        folder: with the photographs; other files are left alone.
+        folder: folder with the photographs; other files are ignored.
         square_mm: side of the black square as printed, mm.
-        colours: "mean", or "each" for a kernel a colour in the table.
-        root: folder that every photograph must lie in, links followed, for a service that reads folders of strangers.
-            None reads wherever links lead.
+        colours: "mean", or "each" for a kernel for each colour in the table.
+        root: folder that must contain every photograph, after following links, for services that read untrusted
+            folders. None follows any link.
 
     Raises:
-        FitError: fewer than two photographs show the target, no EXIF tells the lens, one lies outside of the root, or
-            one has no three colours where each is asked for.
-        ValueError: the square's side is none.
+        FitError: fewer than two photographs show the target, EXIF does not describe the lens, a photograph lies outside
+        of the root, or "each" is used for one without three colours.
+        ValueError: the square's side is invalid.
         OSError: a picture is damaged.
 
     Warns:
-        FitWarning: of kind "not linear" for integers, where photographs are too few to tell a tone curve.
+        FitWarning: of kind "not linear" for integers, if there are too few photographs to find a tone curve.
     """
     number("square_mm", square_mm, low=1e-2, high=1e5, unit="millimetres")
     where = str(folder)
@@ -127,14 +127,14 @@ def read_photographs(
         raise FitError("; ".join(["fewer than two photographs show the target", *advice]), file=where)
     missing = [name for name in CAMERA if name not in facts]
     if missing:
-        text = f"EXIF does not tell {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
+        text = f"EXIF has no {', '.join(missing)}: share the originals, or describe them in a {MANIFEST}"
         raise FitError(text, "manifest", file=where)
     tone, taken = None, {p.file: p.light for p in pictures}
     if integers and len(pictures) >= _FEWEST:
         tone = tone_curve([(p.light, p.target) for p in pictures], square_mm)
     elif integers:
         text = (
-            f"{len(pictures)} photographs do not tell whether they have a tone curve, which makes the kernel up to "
+            f"{len(pictures)} photographs are too few to find a tone curve, which would make the kernel up to "
             f"15 % too small: take {_FEWEST} or more"
         )
         warn(text, "not linear", file=where, number=float(len(pictures)))
@@ -149,7 +149,7 @@ def read_photographs(
         )
     sharp = max(pictures, key=lambda p: p.sharpness)
     focal_px = facts["focal_length_mm"] * width / facts["sensor_width_mm"]
-    # by the size of the square in focus and the thin lens, 1 / focal length = 1 / focus + 1 / image distance
+    # distance of the focus, from the square's size there and the thin lens: 1/focal length = 1/focus + 1/image distance
     focus_m = (focal_px * square_mm / sharp.target.side_px + facts["focal_length_mm"]) / 1000
     image_px = focal_px / (1 - facts["focal_length_mm"] / 1000 / focus_m)
     pictures = sorted(
@@ -180,7 +180,7 @@ def read_photographs(
 def _pair(
     folder: Path, sharp: Photograph, blurred: Photograph, taken: Mapping[str, Array], tone: Tone | None, each: bool
 ) -> Capture:
-    """The windows of the dot in two photographs; and, of what was `taken`, with the tone curve a standard error off."""
+    """Windows of the dot in two photographs; also, from `taken`, for tone curves a standard error away."""
     half = int(WINDOW * min(sharp.target.side_px, blurred.target.side_px))
 
     def cut(light: Array, target: Target) -> Array:
@@ -207,7 +207,7 @@ def _pair(
 def _advice(
     pictures: Sequence[Photograph], moved: Sequence[Photograph], sharp: Photograph, focus_m: float
 ) -> list[str]:
-    """What to do better, a sentence each."""
+    """Improvements, a sentence each."""
     advice = []
     dot_px = sharp.target.side_px * DOT_MM / SQUARE_MM / 2
     if dot_px < 6:

@@ -1,4 +1,4 @@
-"""The paper's procedure: blur strength along spokes around a dot, and eq. (1) or another profile fitted to it."""
+"""The paper's procedure: blur strength along spokes around a dot, and a fit of eq. (1) or another profile."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from ..validation import a_choice, a_picture
 from .dot import find_dot
 
 _NAMES = {"gaussian": ("N", "sigma"), "ring": ("N", "r_c", "sigma"), "softm": ("N", "radius", "sigma", "b", "m")}
-# in units of the largest r; N in units of the largest strength
+# relative to the largest r; N relative to the largest strength
 _BOUNDS = {
     "N": (0.0, np.inf),
     "r_c": (0.0, 3.0),
@@ -32,35 +32,35 @@ _STARTS = {
     "ring": [[1.0, 0.05, 0.3], [1.0, 0.5, 0.2], [1.0, 0.1, 1.0]],
     "softm": [[1.0, 0.5, 0.1, 0.0, 2.0], [1.0, 0.9, 0.1, 0.0, 4.0], [1.0, 0.3, 0.1, 0.5, 2.0]],
 }
-_BENT = 8.0
+_BENT = 8.0  # F statistic of a parabola against a constant, below which samples are flat: 1 chance in 1500
 _SMALLEST, _LARGEST = 1e-60, 1e60  # their squares enter the covariance
-_SMALLEST_PX = 5  # noise is taken from second differences of second differences
+_SMALLEST_PX = 5  # noise is estimated from second differences
 _STEP_DEG = 10
 
 
 def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, groups: ArrayLike | None = None) -> BlurFit:
-    """Fit `f(r) = N exp(-(r - r_c)^2 / (2 sigma^2))`, or another profile times N, to samples of blur strength.
+    """Fits `f(r) = N exp(-(r - r_c)^2 / (2 sigma^2))`, or another profile times N, to samples of blur strength.
 
-    Radii may be in any unit (the paper's are metres on the paper): they are normalised inside, and the lengths among
-    the parameters come back in the caller's unit.
+    Radii may have any unit (the paper's are metres on the paper). They are normalised internally, and the lengths among
+    the parameters are returned in the caller's unit.
 
     Args:
         r: distance from the dot's centre `[n]`, >= 0.
         strength: blur strength `[n]`, in any positive unit.
         family: "gaussian", "ring" (the paper's) or "softm".
-        groups: which samples have errors in common `[n]` integers (the spoke a sample lies on); the standard errors
-            then allow for it. None takes every sample as independent.
+        groups: group of each sample `[n]`, integers (its spoke); samples of a group have common errors, which the
+            standard errors then include. None treats every sample as independent.
 
     Returns:
         A `BlurFit` with the family's parameters and "N".
 
     Raises:
-        FitError: wrong shapes, too few samples, negative radii, unknown family, NaN; of kind "flat profile" where the
-            strength does not vary beyond its noise, so that nothing fixes a width.
+        FitError: wrong shapes, too few samples, negative radii, unknown family, NaN; of kind "flat profile" if the
+        strength does not vary beyond its noise.
 
     Warns:
-        FitWarning: of kind "flat profile" for a parameter that the samples do not determine, of kind "boundary" for
-            one that ended on its bound.
+        FitWarning: of kind "flat profile" for a parameter that the samples do not determine, of kind "boundary" for one
+        that ended on its bound.
 
     Reference:
         Sato, Dobashi, Yamamoto, eq. (1): N -> "N", r_c -> "r_c", sigma -> "sigma" (the paper prints sigma^2).
@@ -81,7 +81,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     order = np.argsort(radii, kind="stable")
     unit, peak = float(radii.max()), float(np.abs(values).max())
     x, y = radii[order] / unit, values[order] / peak
-    # from differences of neighbours in r: what no smooth curve can explain
+    # noise from second differences of samples sorted by r
     noise = float(np.sqrt(np.mean((y[2:] - 2 * y[1:-1] + y[:-2]) ** 2) / 6.0))
     _refuse_flat(x, y, noise)
     together = None if groups is None else np.asarray(labels[order])
@@ -108,7 +108,7 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
     )
     for name in LENGTHS.intersection(names):
         value, error, bound = float(fit.params[name]), float(fit.stderr[name]), _BOUNDS[name][1] * unit
-        # a ring whose peak is at the centre has an r_c of 0 +- something: judged against the width
+        # compare the error of r_c with sigma if r_c is smaller, because a peak at the centre has r_c near 0
         whole = max(value, float(fit.params["sigma"]) if name == "r_c" else 0.0)
         if not error < 0.25 * whole:
             text = (
@@ -122,14 +122,14 @@ def fit_profile(r: ArrayLike, strength: ArrayLike, family: str = "ring", *, grou
 
 
 def evaluate(family: str, r: Array, params: dict[str, float | Array]) -> Array:
-    """`N f(r)` of a profile fit at radii `[n]`, N = 1 where there is none."""
+    """`N f(r)` of a profile fit at radii `[n]`; N = 1 if it has none."""
     shape = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in params.items() if k != "N"}
     strength = float(params.get("N", 1.0))
     return strength * profile(family, torch.from_numpy(np.ascontiguousarray(r)), shape).numpy()
 
 
 def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Array]:
-    """Radii and strengths `[n]` as float64, of at least so many radii, or a refusal that says what is wrong."""
+    """Radii and strengths `[n]` as float64 with at least `least` different radii, or an error."""
     try:
         if np.iscomplexobj(r) or np.iscomplexobj(strength):
             raise TypeError
@@ -158,13 +158,13 @@ def _checked(r: ArrayLike, strength: ArrayLike, least: int) -> tuple[Array, Arra
 
 
 def _refuse_flat(x: Array, y: Array, noise: float) -> None:
-    """Refuse samples that a parabola over r explains no better than a constant does."""
+    """Raises an error if a parabola over r explains the samples no better than a constant."""
     level = y - y.mean()
     bent = np.stack([np.ones_like(x), x, x * x], axis=1)
     residual = y - bent @ np.linalg.lstsq(bent, y, rcond=None)[0]
     explained, unexplained = float(level @ level - residual @ residual), float(residual @ residual)
     variation = float(np.sqrt(max(explained, 0.0) / y.size))
-    # Fisher's test of a parabola against a constant: 8 is one chance in 1500
+    # F test of a parabola against a constant
     if variation < 1e-8 or explained / 2 < _BENT * unexplained / (y.size - 3):
         text = (
             f"the profile is flat: it varies by {variation:.3g} of its peak over r, in a noise of {noise:.3g}; sample "
@@ -174,7 +174,7 @@ def _refuse_flat(x: Array, y: Array, noise: float) -> None:
 
 
 def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Array, Array, Array]:
-    """Parameters, their covariance (errors may be correlated within groups: a sandwich) and the fitted curve."""
+    """Parameters, their covariance (with groups a sandwich estimator for correlated errors) and the fitted curve."""
     names = _NAMES[family]
 
     def model(p: Array) -> Array:
@@ -195,19 +195,18 @@ def _fitted(x: Array, y: Array, family: str, groups: Array | None) -> tuple[Arra
 
 
 def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, Indices]:
-    """`I_b(r, theta) / I(r, theta)` from the dot's centre to its circumference, every pixel of r and 10 degrees.
+    """`I_b(r, theta) / I(r, theta)` from the dot's centre to its edge, at every pixel of r and every 10 degrees.
 
-    The centre is the dot's in the sharp picture, as in the paper: a displaced defocused dot is not followed. What is
-    measured is the dot convolved with the kernel, not the kernel, and it ends at the dot's circumference: use it to
-    compare with the paper, and the forward model to render.
+    As in the paper, the centre is that of the dot in the sharp picture; a displacement of the defocused dot is not
+    corrected. The result is the dot convolved with the kernel, up to the dot's edge: use it for comparison with the
+    paper, and the forward model for rendering.
 
     Args:
         sharp: `[H, W]`, linear light, the dot in focus.
         blurred: `[H, W]`, linear light, the same dot out of focus.
 
     Returns:
-        Radii in px, strengths (levels are bilinear between pixels) and the number of the spoke of each sample, all
-        `[n]`.
+        Radii in px, strengths (interpolated bilinearly) and the number of each sample's spoke, all `[n]`.
 
     Raises:
         FitError: no usable dot.
@@ -224,7 +223,7 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
     """
     still, moved = a_picture("sharp", sharp, _SMALLEST_PX), a_picture("blurred", blurred, _SMALLEST_PX)
     dot, soft = find_dot(still), find_dot(moved)
-    # the last pixel of the dot is half paper
+    # the outermost pixel of the dot is half paper
     r = np.arange(0.0, max(dot.radius - 1.0, 1.0) + 1e-9)
     theta = np.deg2rad(np.arange(0, 360, _STEP_DEG))[:, None]
     where = [dot.y + r * np.sin(theta), dot.x + r * np.cos(theta)]
@@ -236,7 +235,7 @@ def blur_strength(sharp: ArrayLike, blurred: ArrayLike) -> tuple[Array, Array, I
 
 
 def fit_ratio(sharp: Array | None, blurred: Array, family: str) -> BlurFit:
-    """The paper's procedure: a profile fitted to the blur strength, errors that a spoke has in common allowed for."""
+    """The paper's procedure: fits a profile to the blur strength; standard errors allow for those common to a spoke."""
     if sharp is None:
         raise FitError("model='ratio' divides by the sharp picture, got sharp=None; use model='forward'")
     r, strength, spokes = blur_strength(sharp, blurred)

@@ -1,4 +1,4 @@
-"""The `radial` family: a table over r found by non-negative least squares, as smooth as the data ask for."""
+"""The `radial` family: a table over r by non-negative least squares, with a smoothness chosen by the data."""
 
 import numpy as np
 import torch
@@ -9,14 +9,15 @@ from torchdof.optics.psf import pixel_kernels
 from ..result import Array
 from .forward import Forward, Solution, without_level
 
-# plain cross-validation (1) follows the noise now and then; 3 costs nothing without noise and up to 12 dB less with it
+# factor of the effective parameters in cross-validation: 1 (the usual one) sometimes follows the noise; 3 is as good
+# without noise, and up to 12 dB better with it
 _CAUTION = 3.0
 _SMOOTHNESS = 10.0 ** np.arange(-8.0, 0.0)
-_LIMIT = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # of a step
+_LIMIT = {"dx": 0.5, "dy": 0.5, "magnification": 0.02}  # largest step of an iteration
 
 
 def solve_round(pair: Forward, knots: int | None = None, reach: float | None = None) -> Solution:
-    """A free profile that ends a little beyond where a soft disc says, or at `reach` px."""
+    """A free profile that ends slightly outside a fitted soft disc, or at `reach` px."""
     soft = pair.solve("softm")
     if reach is None:
         reach = float(soft.params["radius"]) + 3.5 * float(soft.params["sigma"]) + 1.0
@@ -24,19 +25,19 @@ def solve_round(pair: Forward, knots: int | None = None, reach: float | None = N
 
 
 def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: int | None = None) -> Solution:
-    """Values of the profile at equal steps of r, the moves refined beside them.
+    """Fits values of the profile at equal steps of r, and refines the moves.
 
-    The profile is linear in its values: each is the weight of one hat function, whose kernel is convolved with the
-    sharp dot. A penalty on second differences, chosen by generalised cross-validation, ties the values to each other
-    where the data alone do not fix them (near the centre, where few pixels lie). The profile ends at `radius` px;
-    `knots` None takes two values a pixel, between 8 and 48. They are densities per square pixel.
+    The profile is linear in its values: each is the weight of a hat function, whose kernel is convolved with the sharp
+    dot. A penalty on second differences, chosen by generalised cross-validation, smooths the values that the data do
+    not determine (near the centre, where there are few pixels). The profile ends at `radius` px; if `knots` is None it
+    has two values for each pixel, between 8 and 48. The values are densities per square pixel.
     """
     count = knots if knots is not None else int(np.clip(np.ceil(2 * radius), 8, 48))
     half = min(int(np.ceil(radius)) + 1, pair.half)
     values = torch.eye(count, dtype=torch.float64)
     hats = pixel_kernels("radial", {"values": values, "radius": radius}, 2 * half + 1).numpy()
     h = radius / (count - 1)
-    mass = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # of each hat, over the plane
+    mass = 2 * np.pi * h * h * np.arange(count, dtype=np.float64)  # integral of each hat over the plane
     mass[0], mass[-1] = np.pi * h * h / 3, 2 * np.pi * (radius * h / 2 - h * h / 6)
     moves = dict(moves)
     for _ in range(10):
@@ -47,7 +48,7 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
         shaped = columns.T @ weights / gain
         fitted, gain, background = pair.project(shaped)
         residual = pair.values - fitted
-        # one Gauss-Newton step of the moves with the kernel held
+        # one Gauss-Newton step of the moves, for a constant kernel
         slopes = gain * np.stack(pair.move_columns(moves, pair.fit_moves, kernel), axis=1)
         step = np.linalg.lstsq(without_level(slopes, shaped), residual, rcond=None)[0]
         for name, change in zip(pair.fit_moves, step, strict=True):
@@ -74,7 +75,7 @@ def solve_radial(pair: Forward, moves: dict[str, float], radius: float, knots: i
 
 
 def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
-    """Weights `[knots]`, and the matrix of the penalty under which they were found."""
+    """Weights `[knots]`, and the matrix of the penalty with which they were found."""
     centred = columns - columns.mean(axis=1, keepdims=True)
     level = data - data.mean()
     normal, right, total = centred @ centred.T, centred @ level, float(level @ level)
@@ -83,7 +84,7 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
     tried = []
     for strength in _SMOOTHNESS:
         smooth = strength * penalty
-        # the normal equations' Cholesky factor has the same minimum as the tall matrix
+        # the Cholesky factor of the normal equations has the same minimum as the tall matrix
         factor = np.linalg.cholesky(normal + smooth + 1e-12 * np.trace(normal) * np.eye(len(normal)))
         weights, _ = nnls(factor.T, np.linalg.solve(factor, right))
         free = weights > 0
@@ -94,13 +95,13 @@ def _non_negative(columns: Array, data: Array) -> tuple[Array, Array]:
 
 
 def size_of_profile(solution: Solution) -> tuple[float, float]:
-    """Rms radius of a free profile and its standard error, px: its second moment is linear in its values."""
+    """Rms radius of a free profile and its standard error, px; the second moment is linear in the values."""
     values, radius = np.asarray(solution.params["values"]), float(solution.params["radius"])
     r = np.linspace(0, radius, 64 * values.size + 1)
     place = r / radius * (values.size - 1)
     hats = np.clip(1 - np.abs(place[None, :] - np.arange(values.size)[:, None]), 0, None)
     light, moment = hats @ r, hats @ r**3
     rms = float(np.sqrt(moment @ values / (light @ values)))
-    # of a quotient: the total light is part of both
+    # derivative of a quotient: the total light depends on the values too
     slope = (moment - rms**2 * light) / (light @ values) / (2 * rms)
     return rms, float(np.sqrt(max(slope @ solution.covariance @ slope, 0.0)))

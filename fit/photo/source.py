@@ -1,4 +1,4 @@
-"""What stands for the sharp dot in the forward model: its picture, an ideal dot fitted to it, or a point of light."""
+"""Representations of the sharp dot in the forward model: its picture, an ideal dot fitted to it, or a point."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from .dot import Dot, distance_from, inner_pixels
 from .noise import fine_variance, noise_beside, noise_of
 
 UNFOCUSED_PX = 1.0
-"""Sigma of an edge, px, above which it is out of focus: no camera leaves a softer one in focus."""
+"""Sigma of an edge, px, above which it is out of focus; every camera gives a sharper edge in focus."""
 
-_FOCUSED_PX = 0.5  # what a camera leaves on average: between a perfect lens and a demosaiced picture
+_FOCUSED_PX = 0.5  # typical for cameras: between a perfect lens and a demosaiced picture
 _FINE = 6  # samples across a pixel near the edge
 
 
 Draw = Callable[[Array, Array, float, float, float], Array]
-"""From rows, columns, the centre (x, y) and the magnification of a dot to the level of each pixel."""
+"""Computes each pixel's level from rows, columns, the centre (x, y) and the magnification of a dot."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What stands for the sharp dot; lengths in px."""
+    """A representation of the sharp dot; lengths in px."""
 
-    x: float  # where it is in the sharp picture
+    x: float  # position in the sharp picture
     y: float
     radius: float  # of a uniform disc with the same second moment
-    reach: float  # beyond which it is dark
+    reach: float  # dark beyond this radius
     draw: Draw
     noise: float = 0.0  # standard deviation of its pixels
-    ideal: bool = False  # whether it was drawn, without noise and never softer than a camera in focus leaves it
+    ideal: bool = False  # whether it is an ideal dot: without noise, and not softer than in focus
 
 
 def picture_of_dot(picture: Array, dot: Dot) -> Source:
-    """The dot as photographed `[H, W]`, between its pixels by cubic splines; what lies beyond its reach is dark."""
+    """The dot as photographed `[H, W]`, interpolated by cubic splines; dark beyond its reach."""
     reach = dot.reach + 2.0
     inside = distance_from(dot, picture.shape) <= reach
     draw = _drawn_by_splines(np.where(inside, picture - dot.background, 0.0), dot.x, dot.y)
@@ -47,9 +47,9 @@ def picture_of_dot(picture: Array, dot: Dot) -> Source:
 
 
 def point_source(shape: tuple[int, ...], dot: Dot) -> Source:
-    """A point of light at the pixel nearest to a blurred dot's centre, blurred as the integral over a pixel is.
+    """A point of light at the pixel nearest to a blurred dot's centre, integrated over that pixel.
 
-    Kernels hold the optical blur alone; the pixel's own, a variance of 1/12 px^2 along each axis, is the source's.
+    Kernels have only the optical blur; the source has the pixel's own, a variance of 1/12 px^2 along each axis.
     """
     x, y = int(round(dot.x)), int(round(dot.y))
     picture = np.zeros(shape)
@@ -70,16 +70,16 @@ def _drawn_by_splines(picture: Array, x: float, y: float) -> Draw:
 
 
 def ideal_dot(edge: Edge) -> Source:
-    """A soft disc fitted to the photographed dot: no noise of its own, and exact at any place and size.
+    """A soft disc fitted to the photographed dot: without noise, and exact at any position and size.
 
-    Softer than any camera in focus leaves it, it is drawn as it would be in focus. The softness is the sensor's, not
-    the print's: it does not grow with the dot.
+    If its edge is softer than that of any camera in focus, it is drawn as in focus. The softness belongs to the sensor,
+    not to the print: it does not grow with the dot.
     """
     edge = edge.with_softness(_FOCUSED_PX) if edge.softness > UNFOCUSED_PX else edge
     radius, softness = edge.radius, edge.softness
 
     def draw(rows: Array, columns: Array, x: float, y: float, magnification: float) -> Array:
-        square = magnification**2 * (radius**2 + softness**2) - softness**2  # as the light of a soft disc
+        square = magnification**2 * (radius**2 + softness**2) - softness**2  # from the light of a soft disc
         return edge.level * _coverage(rows, columns, x, y, np.sqrt(max(square, 0.0)), softness)
 
     return Source(edge.x, edge.y, radius, radius + 5 * softness + 1.0, draw, ideal=True)
@@ -87,33 +87,33 @@ def ideal_dot(edge: Edge) -> Source:
 
 @dataclass(frozen=True)
 class Edge:
-    """Where a dot ends, and how softly: a uniform disc with a soft edge, integrated over the pixels; lengths in px."""
+    """A dot's edge: a uniform disc with a soft edge, integrated over the pixels; lengths in px."""
 
     x: float
     y: float
-    radius: float  # where the level is half
-    softness: float  # sigma of the edge beyond the pixel's own
+    radius: float  # at half the level
+    softness: float  # sigma of the edge, without the pixel's own blur
     level: float  # of the dot above its background
-    exponent: float  # 1 in linear light; of the edge's levels, where it was fitted
-    rms: float  # of what the ideal dot does not explain, over the dot's peak
-    misfit: float  # the same over the noise expected there
-    # by how much of its level the edge's upper half is brighter than its pixels' coverage, and the lower darker: an
-    # S-curve spreads the levels of half-covered pixels apart; no blur does: it brings them together
+    exponent: float  # of the light in the edge's levels, if fitted; 1 in linear light
+    rms: float  # residual of the ideal dot, over the dot's peak
+    misfit: float  # the same over the expected noise
+    # mean residual of the edge's upper half minus that of its lower half, over the level. An S-curve separates the
+    # levels of half-covered pixels; blur only brings them together
     steepness: float
     steepness_error: float
-    shot_noise: float  # by how much the variance of a pixel's noise grows from the paper to the dot
+    shot_noise: float  # growth of a pixel's noise variance from the paper to the dot
 
     def with_softness(self, softness: float) -> Edge:
-        """The edge of the same dot through another blur: its light, pi (radius^2 + softness^2), stays."""
+        """The edge of the same dot with another softness: its light, pi (radius^2 + softness^2), is kept."""
         square = self.radius**2 + self.softness**2 - softness**2
         return replace(self, radius=float(np.sqrt(max(square, 0.0))), softness=softness)
 
 
 def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_exponent: bool = False) -> Edge:
-    """Fit a soft disc to a dot in a picture `[H, W]`; pixels at `white` or above may be brighter than they look.
+    """Fits a soft disc to a dot in a picture `[H, W]`; pixels from level `white` up may be clipped.
 
-    With `fit_exponent` levels are a power of the light. A round white dot has as much light missing inside its edge as
-    there is outside; encoding (a power of about 0.45) breaks that balance and so shows itself.
+    With `fit_exponent`, levels are a power of the light. A round white dot loses as much light inside its edge as it
+    gains outside; encoding (a power of about 0.45) breaks this balance and can be detected.
     """
     grid = np.indices(picture.shape).astype(np.float64)
     near = distance_from(dot, picture.shape) <= dot.reach + 3
@@ -168,10 +168,10 @@ def soft_edge(picture: Array, dot: Dot, white: float | None = None, *, fit_expon
 
 
 def _coverage(rows: Array, columns: Array, x: float, y: float, radius: float, softness: float) -> Array:
-    """Level, 0 to 1, of a soft disc in each pixel, integrated over it."""
+    """Level, 0 to 1, of a soft disc, integrated over each pixel."""
     distance = np.hypot(columns - x, rows - y)
     level = (distance < radius).astype(np.float64)
-    # within the fine grid's own step an edge is soft anyway
+    # the fine grid's own step softens the edge
     sigma = max(softness, 0.3 / _FINE)
     band = np.abs(distance - radius) < 0.75 + 5 * sigma
     step = (np.arange(_FINE) + 0.5) / _FINE - 0.5

@@ -1,4 +1,4 @@
-"""Fits at several distances to one blur table, keyed by the signed circle of confusion, smooth between its nodes."""
+"""Makes one blur table of fits at several distances, keyed by the signed circle of confusion."""
 
 import datetime
 import math
@@ -12,7 +12,7 @@ from torchdof.optics.blur_table import BlurTable
 from torchdof.optics.psf import FAMILIES, LENGTHS
 from torchdof.validation import show
 
-from ..problems import FitError, unheard, warn
+from ..problems import FitError, warn, without_warnings
 from ..result import Array, BlurFit
 from ..validation import a_choice
 from .agreement import check_agreement
@@ -21,23 +21,23 @@ from .distances import Colour, counted, fit_colours, fit_distances, fit_one, fit
 from .family_choice import COST
 from .forward import OPENINGS, SHAPES
 
-_EXPOSED = 1.3
+_EXPOSED = 1.3  # ratio of fitted to stated exposure above which to warn
 _ORDER = (*COST, *OPENINGS)
 
 
 @dataclass(frozen=True)
 class TableFit:
-    """A table and the fits it was made of.
+    """A table and the fits from which it was made.
 
     Attributes:
         table: the blur table.
         fits: one for each pair, by increasing distance.
-        coc_px: signed circle of confusion of each, px of the frame.
-        why: how the family was chosen.
-        scale: where the circles of confusion come from: "camera" or "measured".
-        colours: red, green and blue by themselves, where the captures have colours: the table then holds a kernel for
-            each, and `fits` are those of their mean.
-        coc_per_dioptre_px: the circle of confusion over 1/focus - 1/distance [1/m], px of the frame.
+        coc_px: signed circle of confusion of each pair, px of the frame.
+        why: reason for the family.
+        scale: source of the circles of confusion: "camera" or "measured".
+        colours: fits of red, green and blue, if the captures have colours; the table then has a kernel for each, and
+            `fits` are those of their mean.
+        coc_per_dioptre_px: circle of confusion over 1/focus - 1/distance [1/m], px of the frame.
     """
 
     table: BlurTable
@@ -52,8 +52,8 @@ class TableFit:
 def fit_table(captures: Captures, family: str = "auto", **options: Any) -> BlurTable:
     """The blur table of a camera from photographs of a dot at one or more distances: `fit_captures(...).table`.
 
-    Arguments and errors are those of `fit_captures`. The table is in mm of the sensor where its width is known, else in
-    fractions of the frame's width.
+    Arguments and errors are those of `fit_captures`. The table is in mm of the sensor if its width is known, otherwise
+    in fractions of the frame's width.
 
     Example:
         >>> import torch
@@ -79,35 +79,35 @@ def fit_captures(
     command: str = "torchdof.fit.fit_table",
     scale_of: TableFit | None = None,
 ) -> TableFit:
-    """Fit every distance, and make one table of the fits.
+    """Fits every distance, and makes one table of the fits.
 
-    Nodes are keyed by the thin lens's signed circle of confusion at their distance. Where focal length and f-number
-    are known it is the camera's; else its scale is measured: the radius of the uniform disc with the fitted kernels'
-    second moment, by least squares over all distances.
+    Nodes are keyed by the thin lens's signed circle of confusion at their distance. If focal length, f-number and
+    sensor width are known it is the camera's. Otherwise its scale is measured: the radius of the uniform disc with the
+    same second moment as the fitted kernels, by least squares over all distances.
 
-    Each fit starts from its outer neighbour's, scaled by geometry, from both ends towards focus, and leaves that
-    branch only where the pictures clearly ask for it. Then all are fitted once more, each loosely expecting what lies
-    on the line between its neighbours; free profiles are given radii on one line instead.
+    Each fit starts from that of its outer neighbour, scaled by geometry, from both ends towards focus; it uses another
+    start only if that fits clearly better. Then all are refitted with a loose prior on the line between their
+    neighbours; free profiles get radii on a line instead.
 
     Args:
         captures: pairs at increasing distances.
-        family: "auto" takes the cheapest family that is enough at every distance; or one of the families of `fit_pair`.
-            A blur that is not round at one distance is not round at any: "polygon" and "image" make one opening of all
-            distances, turned by half in front of the focus, and fit its size at each.
-        accuracy_db: what "auto" asks for, see `fit_pair`.
-        smooth: whether neighbouring distances inform each other.
-        progress: called with (done, all, what) after each fit.
+        family: "auto" uses the cheapest family that is accurate enough at every distance; or a family of `fit_pair`. If
+            the blur is not round at one distance it is not round at any: "polygon" and "image" use one opening for all
+            distances, rotated by half a turn in front of the focus, and fit its size at each.
+        accuracy_db: accuracy for "auto", see `fit_pair`.
+        smooth: whether neighbouring distances share information.
+        progress: called with (number done, total, text) after each fit.
         command: recorded in the table's provenance.
-        scale_of: the fit of another dot of the same photographs, whose scale is taken where the camera is not known.
-            Measured dot by dot, the scale would make the centre and the corner of a frame the same table.
+        scale_of: the fit of another dot in the same photographs, whose scale is used if the camera is unknown. With a
+            scale of its own for each dot, the centre and the corner of a frame would get the same table.
 
     Returns:
         The table and its fits.
 
     Raises:
-        FitError: a pair cannot be fitted; the message names its file. Of kind "camera" where the fitted blur is far
-            from what the camera's numbers promise. It warns where that differs less, where a fitted gain contradicts
-            the stated exposures, of a single distance, and of what `fit_pair` warns about.
+        FitError: a pair cannot be fitted (the message names its file), or, of kind "camera", the fitted blur is far
+        from the camera's numbers. It warns if that differs less, if a fitted gain contradicts the stated exposures, of
+        a single distance, and of the problems listed at `fit_pair`.
     """
     if not isinstance(captures, Captures):
         raise FitError(
@@ -133,13 +133,13 @@ def fit_captures(
         report(pair)
 
     why, firsts, opening = f"family {family!r} was asked for", list[BlurFit](), None
-    if twice:  # every pair by itself, which tells the family, or the lens's opening; the fit that is kept will warn
+    if twice:  # each pair alone determines the family or the opening; the final fits warn
         for pair in pairs:
-            with unheard():
+            with without_warnings():
                 firsts.append(fit_one(pair, captures.focus_m, family, accuracy_db=accuracy_db))
             report(pair)
     if family == "auto":
-        # the richest family that any distance needs serves all
+        # the richest family needed at any distance is used for all
         needs_most = max(range(len(pairs)), key=lambda i: _ORDER.index(firsts[i].family))
         family = firsts[needs_most].family
         why = f"{family}, for {pairs[needs_most].distance_m:g} m: {firsts[needs_most].why}"
@@ -186,9 +186,9 @@ def fit_captures(
 
 
 def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
-    """Parameters of a table of these fits by name, px: `[N]`, and `values` `[N, P]`."""
+    """Parameters of a table of these fits, px: `[N]`, and `values` `[N, P]`."""
     if family == "radial":
-        # free profiles, each as smooth over r as its own data ask; relative to their radius they hardly change
+        # profiles relative to their radius change little over distance
         radius = np.array([float(f.params["radius"]) for f in fits])
         values = np.stack([np.asarray(f.params["values"]) for f in fits]) * radius[:, None] ** 2
         return {"values": values, "radius": radius}
@@ -197,7 +197,7 @@ def _params(fits: Sequence[BlurFit], family: str) -> dict[str, Array]:
 
 
 def _provenance(captures: Captures, fits: Sequence[BlurFit], colours: Sequence[Colour]) -> dict[str, Any]:
-    """Where a table of these fits comes from."""
+    """Provenance of a table of these fits."""
     ratios = [f.residual_over_noise for f in fits]
     known = {
         "source": "photographs of a dot",

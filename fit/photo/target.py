@@ -1,7 +1,7 @@
-"""The printed target: a white dot in a black square on white paper, and where it is in a photograph.
+"""The printed target (a white dot in a black square on white paper), and its detection in a photograph.
 
-The square gives the scale, and so the distance; the dot gives the blur; the white paper beside the square says how
-bright white is, whatever the light.
+The square gives the scale, and so the distance; the dot gives the blur; the white paper around the square gives the
+level of white in any light.
 """
 
 import math
@@ -26,22 +26,22 @@ SQUARE_MM = 100.0
 """Side of the black square, mm."""
 
 DOT_MM = 5.0
-"""Diameter of the white dot in its middle, mm."""
+"""Diameter of the white dot in its centre, mm."""
 
-_SEARCHED_PX = 500  # width of the copy in which the square is looked for
-_LEVELS = np.linspace(0.1, 0.75, 14)  # of the way from dark to bright
-_SMALLEST, _LARGEST = 0.004, 0.6  # share of the frame that the square may take
+_SEARCHED_PX = 500  # width of the reduced copy in which the square is searched
+_LEVELS = np.linspace(0.1, 0.75, 14)  # thresholds, as fractions between dark and bright
+_SMALLEST, _LARGEST = 0.004, 0.6  # limits of the square's share of the frame
 
 
 def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
-    """Write the target, which lies beside this file, as a PDF of one page, to be printed at 100 %.
+    """Writes the target as a PDF of one page, to be printed at 100 %.
 
     Args:
         path: ends in .pdf.
         paper: "a4" or "letter".
 
     Raises:
-        FitError: another suffix or paper.
+        FitError: wrong suffix or paper.
         OSError: the file cannot be written.
 
     Example:
@@ -64,20 +64,19 @@ def write_target(path: str | os.PathLike[str], paper: Paper = "a4") -> None:
 class Target:
     """The target in a photograph."""
 
-    x: float  # middle of the square, px
+    x: float  # centre of the square, px
     y: float  # the same, downwards
     side_px: float
-    elongation: float  # longer over shorter side; above 1 the camera looked at an angle
+    elongation: float  # longer side over shorter side; above 1 if seen at an angle
     white: float  # level of the paper around the square
     black: float  # level of the square
 
 
 def find_target(light: Array, *, file: str | None = None) -> Target:
-    """Find the black square on its white paper in a picture `[H, W]` in linear light.
+    """Finds the black square on white paper in a picture `[H, W]` in linear light.
 
     Raises:
-        FitError: of kind "no dot" where there is no dark square with something bright in its middle and bright paper
-            around.
+        FitError: of kind "no dot" if there is no dark square with a bright centre and bright paper around it.
     """
     step = max(1, round(light.shape[1] / _SEARCHED_PX))
     rows, columns = (n // step for n in light.shape)
@@ -101,7 +100,7 @@ def find_target(light: Array, *, file: str | None = None) -> Target:
 
 
 def _squares(small: Array, dark: Mask) -> Sequence[Target]:
-    """Dark patches that are square, hold something bright in their middle and lie on something bright."""
+    """Dark areas that are square, have a bright centre and bright surroundings."""
     labels, count = ndimage.label(dark)
     found = []
     for i, box in enumerate(ndimage.find_objects(labels)[:count], start=1):
@@ -114,7 +113,7 @@ def _squares(small: Array, dark: Mask) -> Sequence[Target]:
         area = float(filled.sum())
         y, x = np.nonzero(filled)
         covariance = np.cov(np.stack([x, y]))
-        # of any parallelogram the area is 12 sqrt(det cov); it fills its box unless it is turned
+        # any parallelogram has the area 12 sqrt(det cov)
         if abs(area / (12 * math.sqrt(max(float(np.linalg.det(covariance)), 1e-9))) - 1) > 0.06:
             continue
         side = math.sqrt(area)
@@ -132,14 +131,14 @@ def _squares(small: Array, dark: Mask) -> Sequence[Target]:
 
 
 def _square_distance(shape: tuple[int, ...], target: Target) -> Array:
-    """Distance from the square's middle in half sides, the larger of both axes: 1 on its edge."""
+    """Distance from the square's centre in half sides, the larger of both axes: 1 on its edge."""
     rows, columns = np.indices(shape)
     away = np.maximum(np.abs(rows - target.y), np.abs(columns - target.x))
     return np.asarray(away / (target.side_px / 2))
 
 
 def _refined(light: Array, rough: Target) -> Target:
-    """Middle, side and levels from the whole square's light, which blur moves but does not take away."""
+    """Centre, side and levels from the light of the whole square, which blur moves but keeps."""
     target = rough
     for _ in range(2):
         half = int(0.62 * target.side_px) + 2
@@ -153,7 +152,7 @@ def _refined(light: Array, rough: Target) -> Target:
         white = plane @ np.linalg.lstsq(plane[paper], crop[paper], rcond=None)[0]
         black = float(np.median(crop[ink] / white[ink]))
         share = np.clip((1 - crop / white) / (1 - black), -0.2, 1.2)
-        share[distance < 0.5] = 1.0  # the dot is not ink
+        share[distance < 0.5] = 1.0  # the dot counts as part of the square
         share[distance > 1.15] = 0.0
         area = float(share.sum())
         x, y = float((share * columns).sum() / area), float((share * rows).sum() / area)

@@ -1,7 +1,7 @@
-"""A tone curve that nobody told of: it gives itself away in the light of the dot and in the edges of the square.
+"""Detects an unknown tone curve, from the light of the dot and the edges of the square.
 
-The light of the dot, in units of the white paper beside it, must be its printed area however it is blurred. And a
-blurred edge between black and white must be as much brighter on its dark side as it is darker on its bright side.
+Relative to the white paper, the light of the dot must equal its printed area for any blur. And across a blurred edge
+between black and white, the dark side must gain as much light as the bright side loses.
 """
 
 import math
@@ -18,32 +18,32 @@ from ..result import Array
 from .target import DOT_MM, Target
 
 WINDOW = 0.36
-"""Half the dot's window, of the square's side."""
+"""Half side of the dot's window, relative to the square's side."""
 
-_PRINTED = 0.005  # how exactly the dot's light can be known
-_BENT = (0.7, 0.7, 0.2)  # expected size of the three numbers of a tone curve
-_CERTAIN = 9.0  # drop of chi squared that calls for a tone curve: noise alone does as much once in thirty times
-_ASIDE, _ALONG = 0.1, 0.35  # how far an edge is looked at to either side, and along it, of the square's side
+_PRINTED = 0.005  # relative error of the dot's expected light
+_BENT = (0.7, 0.7, 0.2)  # expected size of the three parameters
+_CERTAIN = 9.0  # decrease of chi squared required for a tone curve; noise alone exceeds it in 1 of 30 cases
+_ASIDE, _ALONG = 0.1, 0.35  # reach across and along an edge, relative to the square's side
 _BIN = 0.5  # px
-_EVEN, _PLACES = 0.006, 8  # how exactly two opposite edges can be known to be even, at so many places
-_BLURRED = 2.3  # px from a tenth to nine tenths, from which on an edge is wide enough to look at
+_EVEN, _PLACES = 0.006, 8  # error of the symmetry of two opposite edges, and number of independent positions
+_BLURRED = 2.3  # px from 10 % to 90 % above which an edge is wide enough
 _LEVELS = np.linspace(0.0, 1.0, 1025)
 
 
 @dataclass(frozen=True)
 class Tone:
-    """A tone curve, as far as pictures tell it."""
+    """A tone curve estimated from pictures."""
 
-    bend: tuple[float, float, float]  # see `untoned`; zeros where noise would explain the pictures as well
-    errors: Array  # steps by one standard error, in independent directions [3, 3]; with what was not believed
+    bend: tuple[float, float, float]  # parameters of `untoned`; zero if noise would explain the pictures as well
+    errors: Array  # steps of one standard error in independent directions [3, 3]; includes an insignificant curve
 
 
 def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
-    """Light with a tone curve undone.
+    """Undoes a tone curve.
 
-    On the encoded level e, with u = 2 e - 1, undoing has the slope `exp(b1 u + b2 (u^2 - 1/3) + b3 (u^3 - 3/5 u))`, but
-    for the factor that keeps white white: whatever the three numbers, darker stays darker. An S-curve that mixes a
-    share t of `e^2 (3 - 2 e)` in is undone by b2 near t.
+    With the encoded level e and u = 2 e - 1, the slope of the inverse curve is `exp(b1 u + b2 (u^2 - 1/3) + b3 (u^3 -
+    3/5 u))`, times a factor that keeps white. So it is monotonic for any parameters. For a mix with a share t of the
+    S-curve `e^2 (3 - 2 e)`, b2 is near t.
     """
     u = 2 * _LEVELS - 1
     slope = np.exp(bend[0] * u + bend[1] * (u**2 - 1 / 3) + bend[2] * (u**3 - 0.6 * u))
@@ -54,7 +54,7 @@ def untoned(light: Array, bend: Sequence[float] | Array) -> Array:
 
 
 def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> Tone:
-    """The tone curve under which dots and edges are what they must be; none where noise would explain them as well."""
+    """The tone curve for which dots and edges are as expected; zero if noise would explain them as well."""
     dots = [_dot(light, target, square_mm) for light, target in pictures]
     edges = [pair for light, target in pictures for pair in _edges(light, target)]
 
@@ -70,7 +70,7 @@ def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> To
 
     solution = least_squares(misfit, np.zeros(4), x_scale=0.1)
     straight = least_squares(lambda v: misfit(np.array([0.0, 0.0, 0.0, v[0]])), [0.0])
-    # what no curve explains makes the curve less certain
+    # unexplained residuals make the curve less certain
     seen = len(dots) + _PLACES * len(edges)
     spread = np.linalg.inv(solution.jac.T @ solution.jac)[:3, :3] * max(2 * solution.cost / seen, 1.0)
     clear = 2 * (straight.cost - solution.cost) > _CERTAIN
@@ -80,22 +80,22 @@ def tone_curve(pictures: Sequence[tuple[Array, Target]], square_mm: float) -> To
 
 
 def _dot(light: Array, target: Target, square_mm: float) -> tuple[Array, Array, Array, float, float, float]:
-    """The dot's window, which of it holds the dot, which the ink around it; white, the dot's area and its error."""
+    """The dot's window, masks of the dot and of the ink around it, white, and the dot's area and its error."""
     half = int(WINDOW * target.side_px)
     y, x = round(target.y), round(target.x)
     window = light[y - half : y + half + 1, x - half : x + half + 1]
     distance = np.hypot(*(np.indices(window.shape) - half))
     inside, around = distance < 0.12 * target.side_px, (distance > 0.2 * target.side_px) & (distance < half)
     area = math.pi * (DOT_MM / 2 * target.side_px / square_mm) ** 2
-    # a demosaiced pixel's noise goes together in about nine neighbours
+    # the noise of a demosaiced pixel is correlated with about nine neighbours
     noise = 3 * float(window[around].std()) * math.sqrt(inside.sum()) / (target.white * area)
     return window, inside, around, target.white, area, math.hypot(noise, _PRINTED)
 
 
 def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
-    """Levels across two opposite sides of the square, from paper to ink in steps of `_BIN`; of blurred sides alone.
+    """Levels across two opposite sides of the square, from paper to ink in steps of `_BIN`, if they are blurred.
 
-    Light that falls off from one side to the other bends both edges, against each other.
+    Uneven light bends opposite edges in opposite directions, so their errors cancel.
     """
     reach, along = int(_ASIDE * target.side_px), int(_ALONG * target.side_px)
     pairs = []
@@ -130,13 +130,13 @@ def _edges(light: Array, target: Target) -> list[tuple[Array, Array]]:
 
 
 def _unevenness(one: Array, other: Array) -> Array:
-    """How far both sides of an edge are from alike, at equal distances from its middle: of two, over the error."""
+    """Asymmetry of two opposite edges at equal distances from their centres, over its error."""
     uneven: Array = np.zeros(1)
     for level in (one, other):
         end = level.size // 6
         paper, ink = float(level[:end].mean()), float(level[-end:].mean())
         share = (level - ink) / (paper - ink)
-        middle = float(share.sum()) - 0.5  # of an even edge, in bins
+        middle = float(share.sum()) - 0.5  # of a symmetric edge, in bins
         away = np.arange(1.0, level.size // 3)
         bins = np.arange(level.size)
         uneven = uneven + np.interp(middle + away, bins, share) + np.interp(middle - away, bins, share) - 1

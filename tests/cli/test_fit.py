@@ -45,12 +45,12 @@ def test_pictures_whose_transfer_nobody_stated_are_said(run: Run, folder: Path, 
     manifest = tmp_path / "lens" / "capture.toml"
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
     told = run("fit", tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc")
-    assert "warning: " in told and "nobody said how 0500mm.png and 3 more are encoded" in told
+    assert "warning: " in told and "the encoding of 0500mm.png and 3 more is not stated" in told
     facts = json.loads(run("fit", tmp_path / "lens", "-o", tmp_path / "mine.json", "--family", "disc", "--json"))
     assert facts["name"] == "my lens" and facts["focus_m"] == 0.5 and facts["family"] == "disc"
     assert [fit["distance_m"] for fit in facts["fits"]] == [0.4, 0.8, 1.0]
     assert all(fit["stderr"]["radius"] > 0 for fit in facts["fits"])
-    assert "nobody said how 0500mm.png" in facts["warnings"][0]
+    assert "the encoding of 0500mm.png" in facts["warnings"][0]
 
 
 def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(
@@ -63,9 +63,9 @@ def test_what_was_said_of_a_grid_is_not_said_of_each_of_its_dots(
     manifest.write_text(manifest.read_text().replace('transfer = "srgb"', ""))
     options = ("-o", tmp_path / "mine.json", "--family", "disc", "--dots", "each")
     told = run("fit", folder, *options)
-    assert "dot 1 at" in told and told.count("nobody said how") == 1
+    assert "dot 1 at" in told and told.count("the encoding of") == 1
     lines = run("fit", folder, *options, "--json").splitlines()  # each is for a table of its own
-    assert ["nobody said how" in json.loads(line)["warnings"][0] for line in lines] == [True, True]
+    assert ["the encoding of" in json.loads(line)["warnings"][0] for line in lines] == [True, True]
 
 
 def test_a_polygon_becomes_a_table_with_its_blades(run: Run, simulator: ModuleType, tmp_path: Path) -> None:

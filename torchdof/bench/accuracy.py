@@ -1,4 +1,4 @@
-"""How close to the truth renderers come, on scenes whose depth of field is known, with exact depth and with worse."""
+"""Compares renderers with the truth, on scenes whose depth of field is known, with exact and with degraded depth."""
 
 import functools
 import runpy
@@ -33,7 +33,7 @@ def _lens_views(views: int, image: Tensor, coc_px: Tensor) -> Tensor:
 
 
 def renderers(degraded: bool) -> dict[str, Renderer]:
-    """What is compared, by name, with disc kernels.
+    """The renderers compared, by name, with disc kernels.
 
     Example:
         >>> list(renderers(degraded=False))
@@ -48,14 +48,14 @@ def renderers(degraded: bool) -> dict[str, Renderer]:
 
 
 def read_peer(path: Path) -> tuple[str, Renderer]:
-    """Another renderer: a Python file with ``blur(image, coc_px)``, such as those in ``examples/benchmarks/tools``.
+    """Loads another renderer: a Python file with ``blur(image, coc_px)``, as in ``examples/benchmarks/tools``.
 
     Returns:
-        Its name with the version that it tells, and what renders.
+        Its name and version, and its function.
 
     Raises:
-        OSError: If there is no such file.
-        ValueError: If it holds no renderer, or lacks what it needs.
+        OSError: If the file is missing.
+        ValueError: If it has no such function, or cannot run here.
     """
     peer = runpy.run_path(str(path))
     if not callable(peer.get("blur")):
@@ -67,18 +67,18 @@ def read_peer(path: Path) -> tuple[str, Renderer]:
 
 
 def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers: Sequence[Path]) -> None:
-    """Scores every renderer on every scene of a folder, prints and writes tables and a picture of the worst places.
+    """Scores every renderer on every scene of a folder; prints and writes tables and a picture of the worst regions.
 
     Args:
-        truth: Folder of scenes, as :func:`torchdof.reference.scenes.read_scenes` takes it.
+        truth: Folder of scenes, see :func:`torchdof.reference.scenes.read_scenes`.
         out: Folder for ``accuracy.csv``, ``.md`` and ``.png``, or ``degraded.csv`` and ``.md``.
-        views: Points on the lens for renderings of the reference renderer.
-        degraded: Instead of the exact depth with every kind of worse depth.
-        peers: Further renderers, as :func:`read_peer` takes them.
+        views: Numbers of views with which the reference renderer is compared as well.
+        degraded: Use every kind of degraded depth instead of the exact depth.
+        peers: Further renderers, see :func:`read_peer`.
 
     Raises:
-        ValueError: If a scene or a peer is not as described.
-        OSError: If there is no scene, or a file cannot be read or written.
+        ValueError: If a scene or a peer is invalid.
+        OSError: If the folder has no scene, or a file cannot be read or written.
     """
     compared = renderers(degraded) | dict(map(read_peer, peers))
     for count in sorted({*views}):
@@ -107,18 +107,18 @@ def compare(truth: Path, out: Path, views: Sequence[int], degraded: bool, peers:
         "Means": summary(rows, ["depth", "renderer"], statistics.fmean),
         "Scenes": rows,
     }
-    remark = "psnr_inner: without the border that light from outside the frame reaches; flip: less is better."
+    remark = "psnr_inner: without the border reached by light from outside the frame; flip: smaller is better."
     if degraded:
         publish("What inexact depth costs", tables, [remark], out / "degraded")
         return
-    remark += f" accuracy.png: a row a scene, the {side} pixels where torchdof is farthest from the truth."
+    remark += f" accuracy.png: for each scene, the {side} x {side} pixels with torchdof's largest error."
     sheet = {name: torch.cat(parts, 2) for name, parts in panels.items()}
     draw = functools.partial(write_sheet, panels=sheet)
     publish("Accuracy against the truth", tables, [remark], out / "accuracy", draw)
 
 
 def _worst(picture: Tensor, scene: Scene, side: int) -> tuple[Any, ...]:
-    """The square with the largest squared error, as displayed."""
+    """The window with the largest squared error of the displayed picture."""
     squares = (metrics.display(picture) - metrics.display(scene.truth)).square().mean(1, keepdim=True)
     top, left = divmod(int((means := functional.avg_pool2d(squares, side, stride=1)).argmax()), means.shape[-1])
     return ..., slice(top, top + side), slice(left, left + side)

@@ -1,4 +1,4 @@
-"""The one measurement of all benchmarks: what first pictures cost, and how far they are from the right ones."""
+"""The measurement that all benchmarks use: time of the first picture by a camera, and its error."""
 
 import dataclasses
 import functools
@@ -24,18 +24,18 @@ _Result = TypeVar("_Result")
 
 
 class Seconds(NamedTuple):
-    """What a call took: seconds of the clock, and of the processor over all threads of this process."""
+    """Duration of a call: wall-clock seconds, and processor seconds over all threads of this process."""
 
     wall: float
     cpu: float = math.nan
 
 
 Renderer = Callable[[Tensor, Tensor], Any]
-"""The picture of an image ``[B, C, H, W]`` by its coc ``[B, 1, H, W]``; or picture and seconds, if it times itself."""
+"""Renders an image ``[B, C, H, W]`` by its coc ``[B, 1, H, W]``; returns the picture, or (picture, seconds)."""
 
 
 def timed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Seconds]:
-    """What a call returns, and what it took."""
+    """Result and duration of a call."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = work(*arguments)
     seconds = Seconds(time.perf_counter() - wall, time.process_time() - cpu)
@@ -46,14 +46,14 @@ def timed(work: Callable[..., Any], *arguments: Any) -> tuple[Any, Seconds]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BenchScene:
-    """What is rendered.
+    """A scene to be rendered.
 
     Args:
-        name: For the report.
+        name: Title in the report.
         image: ``[B, C, H, W]``, linear light, without alpha.
         coc_px: ``[B, 1, H, W]``, signed radius in pixels.
         remark: Camera and focus, in words.
-        table: Of the lens; the disc unless given.
+        table: Blur table of the lens; the disc by default.
     """
 
     name: str
@@ -70,46 +70,46 @@ class BenchScene:
             raise ValueError(f"{self.name}: is {width} x {height}; speed is measured from {_LEAST_PX} pixels a side on")
 
     def seen(self, focus: float, radius_px: float) -> "BenchScene":
-        """By another camera: focused nearer (down to -1) or farther (up to 1), with another largest radius.
+        """The scene by another camera: focused nearer (down to -1) or farther (up to 1), with another largest radius.
 
-        A thin lens's circle of confusion is linear in 1 / distance: another focus adds a constant to it, here at most
-        half of what lies between its least and its greatest, and another opening multiplies it.
+        A thin lens's circle of confusion is linear in 1 / distance: another focus adds a constant, here at most half of
+        its range, and another opening multiplies it.
         """
         moved = self.coc_px - 0.5 * focus * (self.coc_px.max() - self.coc_px.min())
         return dataclasses.replace(self, coc_px=moved * (radius_px / moved.abs().max().clamp_min(1e-9)))
 
     def cameras(self, count: int, least: float, seed: str) -> "list[BenchScene]":
-        """By so many cameras at random, the same for each seed, the largest radius ``least`` to 1 times this one."""
+        """The scene by ``count`` random cameras, which depend on the seed; radii are ``least`` to 1 times its own."""
         dice, widest_px = random.Random(seed), float(self.coc_px.abs().max())
         return [self.seen(dice.uniform(-0.5, 0.5), widest_px * least ** dice.random()) for _ in range(count)]
 
     def pull(self, count: int) -> "list[BenchScene]":
-        """A sequence whose focus moves through the scene."""
+        """A sequence of ``count`` pictures whose focus moves through the scene."""
         widest_px = float(self.coc_px.abs().max())
         return [self.seen(2 * k / max(1, count - 1) - 1, widest_px) for k in range(count)]
 
     def resized(self, share: float) -> "BenchScene":
-        """The same picture in a frame of another size, as blurred for its width."""
+        """The scene in a frame of another size; the blur is scaled with the width."""
         height, width = (max(_LEAST_PX, round(share * n)) for n in self.image.shape[-2:])
         image = functional.interpolate(self.image, (height, width), mode="area")
-        coc_px = functional.interpolate(self.coc_px, (height, width), mode="nearest")  # no radius that no surface has
+        coc_px = functional.interpolate(self.coc_px, (height, width), mode="nearest")  # no radii between two surfaces
         return dataclasses.replace(self, image=image, coc_px=coc_px * (width / self.image.shape[-1]))
 
 
 def measure(
     blur: Renderer, scene: BenchScene, beside: Callable[[], Any] | None = None, again: bool = True
 ) -> tuple[Tensor, dict[str, float]]:
-    """Renders a scene by a camera that was not rendered before, then the same again, then a reference run.
+    """Renders a scene with a camera that was not rendered before, once more with the same camera, and a reference run.
 
     Args:
-        blur: What renders.
-        scene: By that camera.
-        beside: The reference run; None is unit Y, a depthwise 17 x 17 convolution of ``[1, 16, 540, 960]``, channels
-            last: times over its time compare between machines.
-        again: Whether to render the same again.
+        blur: The renderer.
+        scene: The scene by that camera.
+        beside: The reference run; its time makes results comparable between machines. None is a depthwise 17 x 17
+            convolution of ``[1, 16, 540, 960]``, channels last.
+        again: Whether to render with the same camera once more.
 
     Returns:
-        The picture, and a row whose columns :data:`torchdof.bench.report.LEGEND` explains.
+        The picture, and a row with the columns explained in :data:`torchdof.bench.report.LEGEND`.
 
     Raises:
         RuntimeError: If the picture is not finite.
@@ -130,20 +130,20 @@ def measure(
 
 
 def error(picture: Tensor, wanted: Tensor) -> dict[str, float]:
-    """How far a picture is from the right one, as displayed: RMS of 255, PSNR in dB, SSIM."""
+    """Difference of two pictures as displayed: RMS of 255, PSNR in dB, SSIM."""
     shown, right = metrics.display(picture), metrics.display(wanted)
     rms = math.sqrt(float((shown.double() - right.double()).square().mean()))
     return {"rms_255": 255 * rms, "psnr_db": metrics.psnr(shown, right), "ssim": metrics.ssim(shown, right)}
 
 
 def peak_of(work: Callable[[], _Result]) -> tuple[_Result, float]:
-    """What a call returns, and by how many MiB resident memory grew; beforehand what was held unused is given back."""
+    """Result of a call, and the growth of resident memory in MiB; frees unused memory first."""
     held_mb = memory.reset_peak()
     return work(), memory.peak_mb() - held_mb
 
 
 def shipped(height: int = 540, width: int = 960) -> BenchScene:
-    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m, with a blur radius of up to a 60th of the width.
+    """A slope from 1 m to 10 m behind posts at 0.9 m to 1 m; the largest blur radius is 1/60 of the width.
 
     Example:
         >>> shipped(54, 96).image.shape
@@ -153,5 +153,5 @@ def shipped(height: int = 540, width: int = 960) -> BenchScene:
     near = posts(width / 6, width / 40)(x, y)
     light = torch.where(near, waves(2, (0.6, 0.3, 0.2))(x, y), waves(1)(x, y)).float()[None]
     nearness = torch.where(near, 1.0 + 0.1 * x / width, 0.1 + 0.9 * y / height).float()[None, None]
-    coc_px = (0.6 - nearness) * (width / 60 / 0.5)  # as blurred far away as at the posts
+    coc_px = (0.6 - nearness) * (width / 60 / 0.5)  # equally blurred at the far end and at the posts
     return BenchScene("slope with posts", light, coc_px, "a thin lens focused at 1.67 m")

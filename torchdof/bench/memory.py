@@ -1,4 +1,4 @@
-"""Memory that this process holds, as Linux tells it; NaN where a system does not."""
+"""Resident memory of this process as Linux reports it; NaN on other systems."""
 
 import contextlib
 import ctypes
@@ -9,9 +9,9 @@ __all__ = ["peak_mb", "reset_peak"]
 
 
 def peak_mb() -> float:
-    """Most memory this process has held since it started or since :func:`reset_peak`, in MiB.
+    """Peak memory of this process since it started or since :func:`reset_peak`, in MiB.
 
-    Unlike ``ru_maxrss`` it leaves out what a parent held when it started the process.
+    Unlike ``ru_maxrss``, it does not include the memory of the parent process at its start.
     """
     try:
         lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
@@ -21,9 +21,9 @@ def peak_mb() -> float:
 
 
 def reset_peak() -> float:
-    """Forget the peak; returns what the process holds now, in MiB."""
+    """Resets the peak; returns the memory in use, in MiB."""
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)  # else what was freed before would serve unseen
+        ctypes.CDLL(None).malloc_trim(0)  # memory freed before would otherwise be reused unnoticed
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:

@@ -1,4 +1,4 @@
-"""What every benchmark prints and writes: the machine it ran on, tables to read, and the numbers as CSV."""
+"""Output of all benchmarks: the machine, tables for reading, and the numbers as CSV."""
 
 import contextlib
 import csv
@@ -20,7 +20,7 @@ from ..io.columns import print_columns
 __all__ = ["LEGEND", "Row", "publish", "summary"]
 
 Row = Mapping[str, Any]
-"""A line of a table: values by the names of its columns."""
+"""A row of a table: values by column name."""
 
 LEGEND = (
     "new_ms, spread_ms: median and interquartile range of the clock over pictures by cameras that were not rendered "
@@ -32,7 +32,7 @@ LEGEND = (
 
 
 def summary(rows: Sequence[Row], keys: Sequence[str], mean: Callable[[list[float]], float]) -> list[dict[str, Any]]:
-    """A row for each combination of what stands under the keys: means of what its rows hold as fractions.
+    """Groups rows by their values under the keys; returns a row for each group with the means of float columns.
 
     Example:
         >>> rows = [{"a": "x", "new_ms": v, "spread_ms": 0.0} for v in (4.0, 1.0, 2.0, 3.0, 20.0)]
@@ -65,11 +65,11 @@ def publish(
     """Prints the first table and the remarks; writes ``stem.md``, ``.csv`` of the last table and ``.png``: all or none.
 
     Args:
-        title: Above everything.
-        tables: Rows by what stands above them; what one lacks stays empty.
-        remarks: Paragraphs, which hardware, threads, versions and :data:`LEGEND` precede.
+        title: Heading.
+        tables: Rows by heading; missing values stay empty.
+        remarks: Paragraphs that follow hardware, threads, versions and :data:`LEGEND`.
         stem: Folder and name of the files; None writes none.
-        picture: Writes a picture to a path; None: there is none.
+        picture: Writes a picture to a path; None writes none.
         quiet: Print nothing.
 
     Raises:
@@ -105,7 +105,7 @@ def publish(
 
 
 def _cell(value: object) -> str:
-    """Numbers to four digits, NaN as nothing."""
+    """A number with four digits; NaN as an empty string."""
     if isinstance(value, float):
         return "" if value != value else f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     return {True: "yes", False: "NO"}[value] if isinstance(value, bool) else str(value)

@@ -1,4 +1,4 @@
-"""Speed against error: what each way to render one's own scene costs, and how far it stays from the exact rendering."""
+"""Speed against error: time of each setting for one's own scene, and its difference from the exact rendering."""
 
 import functools
 import math
@@ -25,20 +25,20 @@ __all__ = ["Runtime", "compare", "report", "works"]
 
 Runtime = Literal["compiled", "onnxruntime"]
 
-_LEVELS = (8.0, 4.0, 2.0, 1.0, 0.5, 0.0)  # of 255
+_LEVELS = (8.0, 4.0, 2.0, 1.0, 0.5, 0.0)  # tolerances, in 1/255
 _RADII_PX, _SIZES = (4.0, 8.0, 16.0, 32.0, 64.0), (0.25, 0.5)
-_FOLD_PX = 128  # width for the literal scatter, which holds k * k columns a pixel
+_FOLD_PX = 128  # width for the literal scatter, which takes k * k columns for each pixel
 _ROUNDING = 1e-6
 
 
 def works(
     scene: BenchScene, occlusion: bool, repeat: int, runtimes: Sequence[Runtime] = (), scan: bool = False
 ) -> Iterator[tuple[dict[str, Any], Renderer, BenchScene, bool]]:
-    """What is measured: first columns of its row, renderer, scene by a camera, and whether its error or its time.
+    """The measurements: first columns of the row, renderer, scene by a camera, and whether to measure its error.
 
-    Coarse to exact, and further runtimes; a focus pull; the first pictures of processes; the literal scatter beside
-    layers on a small frame; with ``scan`` other largest radii, and smaller frames with a blur as large for their width.
-    Errors are those of the scene's own camera, times those of ``repeat`` others, for each way different ones.
+    The settings are tolerances from coarse to exact, further runtimes, a focus pull, first pictures of new processes,
+    the literal scatter beside layers on a small frame and, with ``scan``, other radii and frame sizes. Errors are
+    measured with the scene's own camera, times with ``repeat`` other cameras, different ones for each setting.
     """
     blur = functools.partial(blur_by_coc, table=scene.table, occlusion=occlusion)
     small = scene.resized(min(1.0, _FOLD_PX / scene.image.shape[-1]))
@@ -66,7 +66,7 @@ def works(
 
 
 def _prepared(runtime: Runtime, scene: BenchScene, occlusion: bool) -> Renderer:
-    """Renders at 1/255 with ``torch.compile`` or an exported file, compiled or written beforehand."""
+    """A renderer at 1/255 with ``torch.compile`` or an exported file, compiled or exported beforehand."""
     reach = max(1.0, float(math.ceil(scene.coc_px.abs().max())))
     options: dict[str, Any] = {"table": scene.table, "occlusion": occlusion, "max_coc_px": reach, "check": False}
     if runtime == "compiled":
@@ -86,7 +86,7 @@ def _prepared(runtime: Runtime, scene: BenchScene, occlusion: bool) -> Renderer:
 
 
 def _in_a_fresh_process(blur: Renderer, image: Tensor, coc_px: Tensor) -> tuple[Tensor, Seconds]:
-    """The first picture of a process, timed there, without its start and imports."""
+    """The first picture of a new process, timed in it, without its start and imports."""
     spawn, threads = multiprocessing.get_context("spawn"), torch.get_num_threads()
     with ProcessPoolExecutor(1, spawn, torch.set_num_threads, (threads,)) as process:
         return process.submit(timed, blur, image, coc_px).result()
@@ -95,17 +95,17 @@ def _in_a_fresh_process(blur: Renderer, image: Tensor, coc_px: Tensor) -> tuple[
 def compare(
     scene: BenchScene, repeat: int, console: Console | None = None, runtimes: Sequence[Runtime] = (), scan: bool = False
 ) -> list[Row]:
-    """A row for each of :func:`works`, with and without occlusion.
+    """Measures every setting of :func:`works`, with and without occlusion; a row for each.
 
     Args:
-        scene: What is rendered.
-        repeat: How many cameras each.
-        console: Where to show progress; None shows none.
+        scene: The scene.
+        repeat: Number of cameras for each setting.
+        console: Console for the progress bar; None shows none.
         runtimes: ``compiled`` needs a C++ compiler, ``onnxruntime`` the extra ``export``; both take minutes.
-        scan: Whether to show how cost grows with blur and frame.
+        scan: Whether to measure other blur radii and frame sizes too.
 
     Raises:
-        ValueError: If ``repeat`` is no positive number.
+        ValueError: If ``repeat`` is not a positive number.
     """
     whole("--repeat", repeat, 1, 10000)
     silent, rows = console is None or not console.is_terminal, []
@@ -126,7 +126,7 @@ def compare(
 
 
 def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool = False) -> None:
-    """Prints a table unless quiet; with a folder, writes ``speed.csv``, ``.md`` and ``.png``: all of them or none.
+    """Prints a table unless quiet; writes ``speed.csv``, ``.md`` and ``.png`` to a folder: all of them or none.
 
     Raises:
         OSError: If a file cannot be written.
@@ -136,8 +136,8 @@ def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool
     title = f"{scene.name}, blur radius {low:.1f} to {high:.1f} px, {scene.table!r}"
     broken = "; ".join(row["setting"] for row in rows if not row["kept"])
     remarks = [
-        f"{scene.remark}. A focus pull is a sequence; a fresh process has rendered nothing before. kept: RMS against "
-        "the exact rendering with the same occlusion is within the tolerance.",
+        f"{scene.remark}. A focus pull is a sequence; a fresh process renders its first picture. kept: the RMS error "
+        "against the exact rendering with the same occlusion is within the tolerance.",
         f"**The tolerance was not kept by: {broken}.**" if broken else "Every tolerance was kept.",
     ]
     draw = functools.partial(_plot, rows=rows, title=title)
@@ -145,8 +145,8 @@ def report(rows: Sequence[Row], scene: BenchScene, out: Path | None, quiet: bool
 
 
 def _plot(path: Path, rows: Sequence[Row], title: str) -> None:
-    """Draws RMS error over the time of a new camera, both logarithmic, to a PNG file."""
-    # no pyplot: it would choose a screen and keep every figure alive
+    """Plots the RMS error over the time of a new camera, both logarithmic, as PNG."""
+    # not pyplot, which would choose a display and keep every figure in memory
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

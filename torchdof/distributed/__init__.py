@@ -1,4 +1,4 @@
-"""Data sets of blurred images, made by many processes: a callable for Ray Data, and what drives it."""
+"""Data sets of blurred images, made by many processes: a callable for Ray Data, and a function that runs it."""
 
 from .dataset import Summary, make_dataset, pairs_in, summary_of
 from .shards import Pair, RenderShards, shard_rows

@@ -1,4 +1,4 @@
-"""A whole data set on a Ray cluster: the shards that are missing, what was left out, the card that describes it."""
+"""Makes a whole data set on a Ray cluster: missing shards, a list of broken inputs, and a card with its facts."""
 
 import dataclasses
 import hashlib
@@ -27,24 +27,24 @@ Made by torchdof.
 
 @dataclasses.dataclass(frozen=True)
 class Summary:
-    """What is in a data set: samples and the shards that hold them; image and error of each sample that is left out."""
+    """Contents of a data set: number of samples and shards, and image and error of each broken input."""
 
     samples: int
     shards: int
     broken: list[tuple[str, str]]
-    seconds: float  # of the processor, over all samples
+    seconds: float  # processor time for all samples
 
 
 def pairs_in(images: str | os.PathLike[str], depths: str | os.PathLike[str] | None = None) -> list[Pair]:
-    """The images of a folder, each with the depth file of another that has its name but for the suffix; full paths.
+    """Pairs each image of a folder with the depth file of the same name in another folder; full paths.
 
     Args:
         images: Folder of images.
-        depths: Folder of depth maps; None takes the depth channels of the images.
+        depths: Folder of depth maps; None uses the depth channels of the images.
 
     Raises:
-        FileNotFoundError: If a folder is not there or holds no image.
-        ValueError: If an image has no depth, or several.
+        FileNotFoundError: If a folder is missing or has no image.
+        ValueError: If an image has no depth file, or several.
     """
     photographs, maps = _by_stem(images, _IMAGES), {} if depths is None else _by_stem(depths, _DEPTHS)
     if not photographs:
@@ -87,26 +87,26 @@ def make_dataset(
     say: Callable[[str], object] = print,
     **render: Any,
 ) -> Summary:
-    """Makes the shards of a data set that are missing, on the Ray cluster in use, or on this machine.
+    """Makes the missing shards of a data set, on the Ray cluster in use or on this machine.
 
-    Stopped at any moment, it goes on from the shards that are complete when it is called again with the same arguments.
+    After an interruption, a call with the same arguments continues with the shards that are not complete.
 
     Args:
         pairs: Images and depths.
-        out: Folder of the data set; made if it is not there. On a cluster all machines must see it.
-        blur: A :class:`torchdof.augmentation.RandomDepthOfField`; None takes its defaults.
+        out: Folder of the data set; made if it is missing. All machines of a cluster must see it.
+        blur: A :class:`torchdof.augmentation.RandomDepthOfField`; None uses its defaults.
         workers: Processes, each on one core.
         per_shard: Samples in a shard.
-        copies: How often each image is blurred.
+        copies: Number of blurred samples of each image.
         format: "webdataset" or "parquet".
-        say: Told how it goes: a line for each shard, and the throughput at the end.
+        say: Gets a line of text for each shard, and the throughput at the end.
         **render: Further arguments of :class:`RenderShards`.
 
     Returns:
-        What is in the folder now: also as ``README.md``, and the broken inputs as ``broken.txt``.
+        Contents of the folder, also written as ``README.md``; broken inputs are listed in ``broken.txt``.
 
     Raises:
-        ValueError: If an argument is not as described, or the folder holds the shards of another data set.
+        ValueError: If an argument is invalid, or the folder has the shards of another data set.
         ModuleNotFoundError: If Ray is not installed.
     """
     try:
@@ -118,10 +118,10 @@ def make_dataset(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     rows = shard_rows(pairs, per_shard, copies)
-    made = RenderShards(out, blur, format=format, **render)  # wrong arguments are refused before Ray starts
+    made = RenderShards(out, blur, format=format, **render)  # validates the arguments before Ray starts
     digest = hashlib.sha256(json.dumps(rows).encode()).hexdigest()
     settings = {"images": len(pairs), "copies": copies, "per_shard": per_shard, "sha256_of_samples": digest}
-    settings = json.loads(json.dumps(settings | made.settings()))  # with lists for tuples
+    settings = json.loads(json.dumps(settings | made.settings()))  # tuples become lists
     _same_as_before(out / "plan.json", settings)
     missing = [row for row in rows if samples_of(out / name_of(row["shard"], format)) is None]
     say(f"{len(rows) - len(missing)} of {len(rows)} shards are there already")
@@ -131,8 +131,8 @@ def make_dataset(
         cores = int(ray.cluster_resources().get("CPU", 0))
         if workers > cores:
             raise ValueError(f"workers must be at most the cores of the Ray cluster, {cores}, got {workers}")
-        ray.data.DataContext.get_current().enable_progress_bars = False  # each shard is told instead
-        told = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
+        ray.data.DataContext.get_current().enable_progress_bars = False  # a line for each shard is printed instead
+        results = ray.data.from_items(missing, override_num_blocks=len(missing)).map_batches(
             RenderShards,
             fn_constructor_args=(str(out.resolve()), blur),
             fn_constructor_kwargs={"format": format, "threads": 1, **render},
@@ -141,7 +141,7 @@ def make_dataset(
             num_cpus=1,
         )
         start, count, left = time.perf_counter(), 0, {row["shard"]: len(json.loads(row["samples"])) for row in missing}
-        for row in told.iter_rows():
+        for row in results.iter_rows():
             count += not row["error"]
             left[row["shard"]] -= 1
             if not left[row["shard"]]:
@@ -156,7 +156,7 @@ def make_dataset(
 
 
 def summary_of(out: str | os.PathLike[str]) -> Summary:
-    """What is in the complete shards of a folder; ``FileNotFoundError`` if there is none."""
+    """Contents of the complete shards of a folder; ``FileNotFoundError`` if the folder is missing."""
     shards = [path for path in sorted(_there(out).glob("shard-*")) if path.suffix in SUFFIXES.values()]
     noted = [samples for samples in map(samples_of, shards) if samples is not None]
     rows = [row for samples in noted for row in samples]
@@ -165,7 +165,7 @@ def summary_of(out: str | os.PathLike[str]) -> Summary:
 
 
 def _same_as_before(path: Path, settings: dict[str, Any]) -> None:
-    """Refuse to go on in a folder that was begun with other settings, or note them."""
+    """Writes the settings of a new folder, or refuses a folder that was begun with other settings."""
     if not path.is_file():
         write_text(path, json.dumps(settings, indent=1))
     try:
@@ -181,7 +181,7 @@ def _same_as_before(path: Path, settings: dict[str, Any]) -> None:
 
 
 def _describe(out: Path, summary: Summary, settings: dict[str, Any]) -> None:
-    """The data set's card, and the list of what was left out."""
+    """Writes the data set's card and the list of broken inputs."""
     facts: dict[str, Any] = {"samples": summary.samples, "shards": summary.shards}
     facts |= {"inputs left out": f"{len(summary.broken)}, listed in broken.txt"}
     facts |= {"time": f"{summary.seconds / max(1, summary.samples):.3f} s of one core a sample", **settings}

@@ -1,7 +1,7 @@
-"""One shard of a data set: images read, blurred by random or given cameras, and written whole or not at all.
+"""Makes one shard of a data set: reads images, blurs them with random or given cameras, writes all samples or none.
 
-A shard is named by its number, and what is in it depends on nothing but its row and the seed. So a run that was stopped
-goes on with the shards that are missing, and ends with the files that it would have ended with undisturbed.
+A shard's file name is its number, and its contents depend only on its row and the seed. A run that was interrupted can
+therefore continue with the missing shards, and gives the same files as an uninterrupted one.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ _KEPT = ("blurred", "sharp", "depth")
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """An image file and its depth file, None for the image's own depth channel; what None is of a camera is drawn.
+    """An image file and its depth file. A depth of None uses the image's depth channel; other values of None are drawn.
 
     Raises:
         ValueError: If a number is not positive.
@@ -65,12 +65,12 @@ class Pair:
 
 
 def shard_rows(pairs: Sequence[Pair], per_shard: int = 64, copies: int = 1) -> list[dict[str, Any]]:
-    """Rows for ``ray.data.from_items``, one for each shard: its number, and as JSON its samples, a pair and a key each.
+    """Rows for ``ray.data.from_items``, one for each shard: its number, and its samples (pair and key) as JSON.
 
     Args:
         pairs: Images and depths.
         per_shard: Samples in a shard.
-        copies: How often each image is blurred, each time by another camera.
+        copies: Number of samples of each image, each with another camera.
 
     Raises:
         ValueError: If there are no pairs, or a number is not at least 1.
@@ -95,7 +95,7 @@ def name_of(shard: int, format: Format) -> str:
 
 
 def samples_of(shard: Path) -> list[dict[str, Any]] | None:
-    """What is noted of the samples of a shard; None if the shard is not there or not complete."""
+    """Notes about the samples of a shard; None if the shard is missing or incomplete."""
     try:
         notes = json.loads(shard.with_suffix(".json").read_bytes())
         return list(notes["samples"]) if notes["bytes"] == shard.stat().st_size else None
@@ -104,30 +104,30 @@ def samples_of(shard: Path) -> list[dict[str, Any]] | None:
 
 
 class RenderShards:
-    """Makes shards: a callable for ``ray.data.Dataset.map_batches``, which needs nothing of Ray itself.
+    """Makes shards: a callable for ``ray.data.Dataset.map_batches``; works without Ray.
 
-    Each row of a batch is a shard of :func:`shard_rows`. A shard that is complete is not made again. An input that
-    cannot be read or rendered is left out and listed in ``shard-NNNNNN.json`` beside the shard, with its error.
+    Each row of a batch is a shard of :func:`shard_rows`. Complete shards are not made again. An input that cannot be
+    read or rendered is skipped and listed with its error in ``shard-NNNNNN.json`` beside the shard.
 
-    A WebDataset shard holds for each key ``KEY.blurred.png``, ``KEY.sharp.png``, ``KEY.depth.npy`` (metres, float32)
-    and ``KEY.json`` with all parameters; a Parquet shard the same as columns, pictures as the bytes of their files.
+    A WebDataset shard has for each key ``KEY.blurred.png``, ``KEY.sharp.png``, ``KEY.depth.npy`` (metres, float32) and
+    ``KEY.json`` with all parameters. A Parquet shard has the same as columns; pictures are the bytes of their files.
 
     Args:
-        out: Folder of the shards; it must be there.
-        blur: Draws focus, f-number and lens, and renders; its ``p`` does not count, every sample is blurred.
-        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`; or, of depth
+        out: Folder of the shards; it must exist.
+        blur: Draws focus, f-number and lens, and renders. Its ``p`` is ignored: every sample is blurred.
+        depth: How to read depth maps: keyword arguments of :func:`torchdof.depth.reading.read_depth`; or, for depth
             without a scale, ``{"kind": "relative", "near_m": 1.0, "far_m": 8.0}``, with ``relative_kind``,
             ``value_range`` and ``unknown`` as in :func:`torchdof.depth.from_relative`, and ``fill`` and ``channel``.
-        format: "webdataset" or "parquet"; they need the packages webdataset and pyarrow.
-        keep: What is written of each sample: of "blurred", "sharp" and "depth".
-        seed: Of the draws; a sample's own draw depends on it and on its key alone.
-        transfer: How images are encoded; None takes integers as sRGB and floats as linear.
+        format: "webdataset" or "parquet"; requires the package webdataset or pyarrow.
+        keep: Files written for each sample: any of "blurred", "sharp" and "depth".
+        seed: Seed of the draws; a sample's draw depends only on the seed and its key.
+        transfer: Encoding of the images; None reads integers as sRGB and floats as linear.
         picture: Suffix of the pictures: ".png" (8 bits, sRGB) or ".exr" (half, linear).
-        threads: Threads of one process; Ray gives each process a core.
+        threads: Threads of each process; Ray gives each process a core.
 
     Raises:
-        ValueError: If an argument is not as described.
-        FileNotFoundError: If there is no such folder.
+        ValueError: If an argument is invalid.
+        FileNotFoundError: If the folder is missing.
         ModuleNotFoundError: If the package that writes the format is not installed.
 
     Example:
@@ -180,11 +180,11 @@ class RenderShards:
             torch.set_num_threads(whole("threads", threads, 1, 4096))
 
     def __call__(self, batch: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Make the shards of a batch with the columns ``shard`` and ``samples``.
+        """Makes the shards of a batch with the columns ``shard`` and ``samples``.
 
         Returns:
-            Columns ``shard``, ``key``, ``image``, ``error`` ("" where there is none) and ``seconds`` of the processor:
-            a row for each sample.
+            Columns ``shard``, ``key``, ``image``, ``error`` ("" if none) and ``seconds`` (processor time), a row for
+            each sample.
 
         Raises:
             OSError: If a shard cannot be written.
@@ -197,7 +197,7 @@ class RenderShards:
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
     def settings(self) -> dict[str, Any]:
-        """All that the shards depend on beside their rows, as JSON holds it."""
+        """Everything except the rows that determines the shards, as JSON values."""
         lenses = [rendering.table for rendering in self.blur.renderings]
         return {
             **{name: getattr(self, name) for name in ("format", "keep", "picture", "transfer", "seed", "depth")},
@@ -208,26 +208,26 @@ class RenderShards:
         }
 
     def _make(self, path: Path, samples: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Render one shard and write it; the notes of its samples."""
+        """Renders and writes one shard; returns the notes about its samples."""
         records, rows = [], []
         for sample in samples:
             start, error = time.process_time(), ""
             try:
                 records.append(self._record(**sample))
-            except (OSError, ValueError, MemoryError, RuntimeError) as broken:  # torch's allocator raises the last
+            except (OSError, ValueError, MemoryError, RuntimeError) as broken:  # torch's allocator raises RuntimeError
                 error = _text(str(broken) or type(broken).__name__)
             row = {"key": sample["key"], "image": _text(sample["image"]), "error": error}
             rows.append({**row, "seconds": round(time.process_time() - start, 4)})
         with whole_file(path) as part:
             (_write_tar if self.format == "webdataset" else _write_parquet)(part, records)
             notes = {"bytes": part.stat().st_size, "samples": rows}
-            write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # a shard that is there has its notes
+            write_text(path.with_suffix(".json"), json.dumps(notes, indent=1))  # before the shard
         return rows
 
     def _record(
         self, key: str, image: str, depth: str | None, focus_m: float | None, f_number: float | None
     ) -> dict[str, Any]:
-        """One sample: its key, the bytes of its files by their names, and its parameters as ``json``."""
+        """One sample: its key, the contents of its files by name, and its parameters as ``json``."""
         source = read_image(image, self.transfer)
         metres = at_size_of(source.pixels, self._read_depth(depth or image, **self.depth))
         own = hashlib.sha256(f"{self.seed} {key}".encode()).digest()
@@ -261,32 +261,32 @@ def _read_relative(
     path: str, kind: str, near_m: float, far_m: float, relative_kind: Any = "disparity",
     value_range: Any = None, unknown: float | None = None, fill: Any = None, channel: str | None = None,
 ) -> Tensor:  # fmt: skip
-    """Depth without a scale from a file to metres, ``[1, 1, H, W]``, without holes."""
+    """Reads depth without a scale and converts it to metres, ``[1, 1, H, W]``, without holes."""
     values = read_values(path, channel)
     metres = from_relative(values, near_m, far_m, relative_kind, value_range=value_range, unknown=unknown)
     return resolve_holes(metres, path, fill)[0]
 
 
 def _text(name: str) -> str:
-    """The name of a file as UTF-8 holds it: of other bytes, their numbers."""
+    """A file name that UTF-8 can encode: other bytes become escapes."""
     return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _plain(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers and words of a camera or of options, as JSON holds them."""
+    """Numbers and strings of a camera or of options, as JSON values."""
     numbers = {name: float(value) if isinstance(value, Tensor) else value for name, value in arguments.items()}
     return {name: value for name, value in numbers.items() if name != "table"}
 
 
 def _bytes(name: str, write: Callable[[Path], object]) -> bytes:
-    """What a function writes to a file of some name."""
+    """The bytes that ``write`` writes to a file with this name."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / name)
         return (Path(folder) / name).read_bytes()
 
 
 def _write_tar(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    """A WebDataset shard; the same records give the same bytes."""
+    """Writes a WebDataset shard; the same records give the same bytes."""
     import webdataset
 
     with webdataset.TarWriter(str(path), mtime=0) as tar:
@@ -295,7 +295,7 @@ def _write_tar(path: Path, records: Sequence[dict[str, Any]]) -> None:
 
 
 def _write_parquet(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    """A Parquet shard: pictures as bytes, each parameter a column."""
+    """Writes a Parquet shard: pictures as bytes, each parameter a column."""
     import pyarrow
     import pyarrow.parquet
 

@@ -1,8 +1,8 @@
-"""The compiled engine: what :mod:`torchdof.render` states in PyTorch, for eager inference on the CPU.
+"""The compiled engine: the computations of :mod:`torchdof.render` in C++, for eager inference on the CPU.
 
-It is C++ behind a plain C interface (``src/api.h``), built when the package is installed. Where it could not be built,
-the plain engine serves. The environment variable ``TORCHDOF_ENGINE`` chooses: ``auto`` (the default) takes the compiled
-engine where it can serve, ``native`` refuses to go on without it, ``torch`` leaves it out.
+It has a plain C interface (``src/api.h``) and is built when the package is installed. Without it the PyTorch engine is
+used. The environment variable ``TORCHDOF_ENGINE`` selects: ``auto`` (the default) uses the compiled engine where it
+can, ``native`` requires it, ``torch`` disables it.
 """
 
 import ctypes
@@ -35,14 +35,15 @@ __all__ = [
 ]
 
 Kind = Literal["image", "background", "stack"]
-"""What surfaces are: one image; an image and what lies behind it; any number that cover each other, near to far."""
+"""Meaning of the surfaces: one image; an image and the background behind it; any number of surfaces that cover each
+other, near to far."""
 
 HALF_LARGEST = 256
-"""Kernels reach at most so many pixels of their layer's resolution to each side; larger ones are the plain engine's."""
+"""Largest half width of a kernel, in pixels of its layer; larger kernels need the PyTorch engine."""
 
 _KINDS: dict[Kind, int] = {"image": 0, "background": 1, "stack": 2}
 _SUFFIXES = {"win32": ".dll", "darwin": ".dylib"}
-_SMALL_FRAME = 2**16  # pixels; up to there no thread of its own is started, which costs a tenth of a millisecond
+_SMALL_FRAME = 2**16  # pixels; up to this size the main thread renders itself, which saves 0.1 ms
 _NO_MEMORY, _CANCELLED, _TOO_BRIGHT = 1, 2, 3
 _REVISION = 5  # of ``src/api.h``
 
@@ -50,19 +51,19 @@ _Floats = ctypes.POINTER(ctypes.c_float)
 
 
 class FieldShares(Protocol):
-    """What the field lets through of kernels of a radius: :class:`torchdof.optics.placed_kernels.Shares`."""
+    """Transmittance of the lens's field over kernels of one radius: :class:`torchdof.optics.placed_kernels.Shares`."""
 
     @property
     def values(self) -> Tensor:
-        """Shares ``[1 or C, distances, rows, columns]``."""
+        """Transmittance ``[1 or C, distances, rows, columns]``."""
 
     @property
     def boxes(self) -> Tensor:
-        """Where these lie, ``[distances, 3]``."""
+        """Positions of these samples, ``[distances, 3]``."""
 
     @property
     def coc_px(self) -> float:
-        """The radius, signed."""
+        """Signed radius in pixels."""
 
 
 class _Shares(ctypes.Structure):
@@ -79,39 +80,39 @@ class _Shares(ctypes.Structure):
 
 
 class KernelSpots(Protocol):
-    """What kernels are made from: :class:`torchdof.optics.kernel_bank.Spots`."""
+    """Input from which kernels are made: :class:`torchdof.optics.kernel_bank.Spots`."""
 
     @property
     def templates(self) -> list[Tensor]:
-        """Cells of the templates in use, float32."""
+        """Cells of the templates, float32."""
 
     @property
     def which(self) -> list[tuple[int, int, int, int]]:
-        """Which of these, four for each kernel."""
+        """Indices of four templates for each kernel."""
 
     @property
     def part(self) -> list[float]:
-        """How far each kernel lies on the way to the next node."""
+        """Interpolation weight of the next node, for each kernel."""
 
     @property
     def finer(self) -> list[float]:
-        """Share of the finer templates."""
+        """Interpolation weight of the finer templates."""
 
     @property
     def reach(self) -> list[list[float]]:
-        """Radius of each colour."""
+        """Radius in pixels for each colour."""
 
     @property
     def fade(self) -> list[list[float]]:
-        """Share of each colour's kernel against a single pixel."""
+        """Weight of each colour's kernel against an unblurred pixel."""
 
     @property
     def flipped(self) -> list[bool]:
-        """Whether each is turned by half."""
+        """Whether each kernel is rotated by half a turn."""
 
     @property
     def half(self) -> list[int]:
-        """Pixels that each reaches to each side."""
+        """Half width of each kernel in pixels."""
 
 
 class _Spots(ctypes.Structure):
@@ -181,10 +182,10 @@ class _Map(ctypes.Structure):
 
 
 def chosen() -> bool:
-    """Whether the compiled engine serves.
+    """Whether the compiled engine is used.
 
     Raises:
-        ValueError: If ``TORCHDOF_ENGINE`` names no engine, or is ``native`` and it is missing.
+        ValueError: If ``TORCHDOF_ENGINE`` is not one of the three values, or is ``native`` and the engine is missing.
     """
     wanted = os.environ.get("TORCHDOF_ENGINE", "auto")
     if wanted not in ("auto", "native", "torch"):
@@ -198,7 +199,7 @@ def chosen() -> bool:
 
 
 def describe() -> str:
-    """Which engine is in use, and why, for people.
+    """Name of the engine in use, and the reason if it is not the compiled one.
 
     Example:
         >>> describe().split()[0] in ("native", "torch")
@@ -212,7 +213,7 @@ def describe() -> str:
 
 
 def use_instructions(name: Literal["avx2", "baseline"]) -> bool:
-    """Choose the processor's instructions, for tests; False if it lacks them."""
+    """Selects the instruction set, for tests; False if the processor lacks it."""
     return bool(_engine().torchdof_use(name.encode()))
 
 
@@ -232,30 +233,30 @@ def render(
     ray_shares: Callable[[list[int]], Sequence[FieldShares]],
     squeeze: float,
 ) -> Tensor:
-    """Depth of field of one item, on as many threads as PyTorch uses.
+    """Renders depth of field for one image, with as many threads as PyTorch uses.
 
     Args:
-        surfaces: Light ``[C, H, W]``, signed coc in pixels ``[H, W]`` and weight ``[H, W]`` (None: 1) of each, float32.
-        kind: What they are.
-        nodes: Places of the layers on the blur axis, near to far.
-        layers: Kernel ``[1 or C, k, k]`` and resolution (every so many pixels) of each.
+        surfaces: Light ``[C, H, W]``, signed coc in pixels ``[H, W]`` and weight ``[H, W]`` (None: 1) of each surface,
+            float32.
+        kind: Meaning of the surfaces.
+        nodes: Positions of the layers on the blur axis, near to far.
+        layers: Kernel ``[1 or C, k, k]`` and pixel size of each layer.
         psfs: Kernels ``[1 or C, k, k]`` for signed radii of highlights, in steps of 1/32 pixel.
         occlusion: As in :class:`torchdof.DepthOfField`.
         normalize: As in :class:`torchdof.DepthOfField`.
-        masked: Values may be NaN or infinite; such pixels pass through.
-        highlights: Highlights are splatted ray by ray where layers would not do.
-        crisp_px: Blur from which on layers soften highlights.
-        shares: What the field lets through of each layer's kernel, float32 and contiguous; none where kernels are alike
-            everywhere.
-        ray_shares: The same of kernels of highlights, for their radii; by growing radius.
-        squeeze: Height of the blur over its width.
+        masked: Whether values may be NaN or infinite; such pixels are copied.
+        highlights: Whether highlights are rendered ray by ray where layers would soften them.
+        crisp_px: Blur in pixels above which layers soften highlights.
+        shares: Transmittance of the field for each layer, float32 and contiguous; empty if the lens has no field.
+        ray_shares: The same for highlights, from their radii in steps of 1/32 pixel; in ascending order of radius.
+        squeeze: Height of the blur divided by its width.
 
     Returns:
         ``[C, H, W]``, float32; the same bits for any number of threads.
 
     Raises:
-        MemoryError: If there is too little.
-        OverflowError: If an image's light is beyond 2 to the 28th, whose powers could overflow; scale it down.
+        MemoryError: If there is not enough memory.
+        OverflowError: If an image's light exceeds 2^28, whose square sums could overflow; scale it down.
     """
     lights = [light.float().contiguous() for light, _, _ in surfaces]
     cocs = [coc.float().contiguous() for _, coc, _ in surfaces]
@@ -312,20 +313,20 @@ def render(
 
 
 def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_coc: bool = False) -> Tensor:
-    """What :func:`torchdof.depth.edges.repair` computes, of one item, on as many threads as PyTorch uses.
+    """Repairs the edges of a depth map, as :func:`torchdof.render.edges.repair`, for one image.
 
     Args:
         light: ``[C, H, W]``, float32.
         nearness: ``[H, W]``, float32.
         step: ``[H, W]`` or ``[]``, float32.
-        auto: As there.
-        of_coc: As there.
+        auto: As in that function.
+        of_coc: As in that function.
 
     Returns:
-        ``[H, W]``, float32; the same bits for any number of threads. The given map itself, if its edges are right.
+        ``[H, W]``, float32; the same bits for any number of threads. The input itself if it needs no repair.
 
     Raises:
-        MemoryError: If there is too little.
+        MemoryError: If there is not enough memory.
     """
     light, nearness, step = light.contiguous(), nearness.contiguous(), step.contiguous()
     out, cancelled, changed = torch.empty_like(nearness), ctypes.c_int32(0), ctypes.c_int32(0)
@@ -354,19 +355,19 @@ def repair_edges(light: Tensor, nearness: Tensor, step: Tensor, auto: bool, of_c
 
 
 def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> Tensor:
-    """Signed circle of confusion of depths, what :meth:`torchdof.Camera.coc_px` computes for a lens without tilt.
+    """Signed circle of confusion, as :meth:`torchdof.Camera.coc_px` for a lens without tilt.
 
     Args:
-        depth: Metres, any shape, float32; NaN comes out where one is not > 0.
-        scale: Pixels of radius for each dioptre that a depth is away from focus.
+        depth: Metres, any shape, float32. The result is NaN where depth is not > 0.
+        scale: Radius in pixels for each dioptre between a depth and the focus.
         nearest_m: Nearest distance in focus.
         farthest_m: Farthest distance in focus.
 
     Returns:
-        The depths' shape, float32, in pixels.
+        Pixels, float32, in the shape of ``depth``.
 
     Raises:
-        MemoryError: If there is too little.
+        MemoryError: If there is not enough memory.
     """
     depth = depth.contiguous()
     out, threads = torch.empty_like(depth), torch.get_num_threads()
@@ -376,18 +377,18 @@ def coc_px(depth: Tensor, scale: float, nearest_m: float, farthest_m: float) -> 
 
 
 def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
-    """Layers for a frame, and the tolerance they are for: what ``torchdof.render.plan.Plan.of_frame`` computes.
+    """Positions of the layers for a frame, as ``torchdof.render.plan.Plan.of_frame``.
 
     Args:
         coc_px: Signed coc of the frame, ``[B, 1, H, W]``, float32, in pixels.
-        tolerance: What the picture is to keep.
+        tolerance: Largest error of the picture.
 
     Returns:
-        Places of the layers on the blur axis, near to far, and the tolerance, smaller where blurs are as large as the
+        Positions of the layers on the blur axis, near to far, and the tolerance, reduced if blurs are as large as the
         frame.
 
     Raises:
-        MemoryError: If there is too little.
+        MemoryError: If there is not enough memory.
     """
     coc_px, kept, count, capacity = coc_px.contiguous(), ctypes.c_double(tolerance), ctypes.c_int32(), 256
     while True:
@@ -402,19 +403,19 @@ def plan(coc_px: Tensor, tolerance: float) -> tuple[tuple[float, ...], float]:
 
 
 def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool) -> list[Tensor]:
-    """Kernels of a lens, on as many threads as PyTorch uses.
+    """Makes the kernels of a lens, with as many threads as PyTorch uses.
 
     Args:
-        spots: What they are made from.
-        squeeze: Height of the blur over its width.
+        spots: Input from which they are made.
+        squeeze: Height of the blur divided by its width.
         is_round: Whether they are symmetric about both axes.
-        is_even: Whether they are even light within their radius.
+        is_even: Whether they are constant within their radius.
 
     Returns:
-        ``[C, 2 half + 1, 2 half + 1]`` of each, float32, non-negative, summing to 1 where nothing is cut off.
+        Kernels ``[C, 2 half + 1, 2 half + 1]``, float32, non-negative; they sum to 1 unless they are cropped.
 
     Raises:
-        MemoryError: If there is too little.
+        MemoryError: If there is not enough memory.
     """
     count, colours = len(spots.reach), len(spots.reach[0])
     sides = [2 * half + 1 for half in spots.half]
@@ -434,12 +435,12 @@ def kernels(spots: KernelSpots, *, squeeze: float, is_round: bool, is_even: bool
 
 
 def ends(values: Tensor) -> tuple[float, float]:
-    """Least and largest of some numbers, float32, on as many threads as PyTorch uses; NaN if one of them is NaN.
+    """Smallest and largest of some float32 values; NaN if any value is NaN.
 
-    PyTorch's own threads would wait for their next work beside the engine's, which takes the processor from these.
+    PyTorch's own reduction would leave its threads spinning, which slows down the engine's threads.
 
     Raises:
-        MemoryError: If there is too little.
+        MemoryError: If there is not enough memory.
     """
     values, low, high = values.contiguous(), ctypes.c_float(), ctypes.c_float()
     threads = torch.get_num_threads()
@@ -448,7 +449,7 @@ def ends(values: Tensor) -> tuple[float, float]:
 
 
 def convolve(values: Tensor, kernel: Tensor) -> Tensor:
-    """Values ``[H, W]`` spread with a kernel ``[k, k]``, float32; what falls outside is lost."""
+    """Convolves values ``[H, W]`` with a kernel ``[k, k]``, float32; light that leaves the frame is lost."""
     out, values, kernel = torch.empty_like(values), values.contiguous(), kernel.contiguous()
     _engine().torchdof_convolve(
         values.data_ptr(), *values.shape, kernel.data_ptr(), kernel.shape[-1] // 2, out.data_ptr()
@@ -457,10 +458,10 @@ def convolve(values: Tensor, kernel: Tensor) -> Tensor:
 
 
 def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32, pixels: int) -> None:
-    """Run something that takes long outside of Python, for so many pixels; Ctrl-C stops it.
+    """Runs a long computation outside Python so that Ctrl-C stops it.
 
-    Only the main thread hears of signals, and only between two steps of Python. So there the work goes to another
-    thread, and the main thread waits for it, which signals can interrupt. A small frame is over before anybody would.
+    Python delivers signals to the main thread, and only between two of its instructions. Therefore another thread does
+    the work, and the main thread waits in a call that signals can interrupt. A small frame is rendered directly.
     """
     if pixels <= _SMALL_FRAME or threading.current_thread() is not threading.main_thread():
         run()
@@ -473,19 +474,19 @@ def _interruptible(run: Callable[[], None], cancelled: ctypes.c_int32, pixels: i
         try:
             with torch.inference_mode(inference), torch.set_grad_enabled(grad_enabled):
                 run()
-        except BaseException as error:  # whatever it is, the main thread raises it
+        except BaseException as error:  # of any kind: the main thread raises it
             failure.append(error)
         finally:
             finished.set()
 
-    # Not Thread.join: interrupted, Python 3.11's takes a thread that still runs for ended, and a second one returns at
-    # once. Then the arrays are freed, or the process ends, under a running engine.
+    # Not Thread.join: once interrupted, in Python 3.11 it takes a running thread for finished, and the next call
+    # returns at once. The arrays would then be freed, or the process end, while the engine still runs.
     interruption: BaseException | None = None
     threading.Thread(target=guarded, name="torchdof").start()
     while not finished.is_set():
         try:
             finished.wait()
-        except BaseException as error:  # Ctrl-C, once or often
+        except BaseException as error:  # Ctrl-C, possibly several times
             cancelled.value, interruption = 1, error
     if interruption:
         raise interruption
@@ -528,7 +529,7 @@ def _engine() -> ctypes.CDLL:
 
 
 def _fits(library: ctypes.CDLL) -> bool:
-    """Whether a library takes what this file passes: an old one can lie beside new sources that were not installed."""
+    """Whether a library has this file's interface: an old build may be left beside new sources."""
     try:
         interface = library.torchdof_interface
     except AttributeError:
@@ -540,7 +541,7 @@ def _fits(library: ctypes.CDLL) -> bool:
 
 @functools.cache
 def _library() -> tuple[ctypes.CDLL | None, str]:
-    """The compiled engine, or why there is none."""
+    """The compiled engine, or the reason why it is missing."""
     file = importlib.resources.files(__name__) / f"_engine{_SUFFIXES.get(sys.platform, '.so')}"
     if not file.is_file():
         return None, "the compiled engine was not built when torchdof was installed"
@@ -548,7 +549,7 @@ def _library() -> tuple[ctypes.CDLL | None, str]:
         with importlib.resources.as_file(file) as path:
             library = ctypes.CDLL(str(path))
     except OSError as error:
-        if "failed to map segment" in str(error) and "permitted" not in str(error):  # a file system may forbid it, too
+        if "failed to map segment" in str(error) and "permitted" not in str(error):  # a file system may also forbid it
             raise MemoryError("there is too little memory to load the compiled engine") from None
         return None, f"the compiled engine cannot be loaded: {error}"
     if not _fits(library):

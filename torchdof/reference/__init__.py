@@ -1,1 +1,1 @@
-"""What is compared with: many views through the lens, scenes whose truth is known, and measures of difference."""
+"""References for comparison: many views through the lens, scenes with known truth, measures of difference."""

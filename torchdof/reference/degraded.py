@@ -1,7 +1,7 @@
-"""Exact depth made as bad as measured and estimated depth is.
+"""Degrades exact depth like measured and estimated depth.
 
-Estimators and upsampling smooth 1 / depth across edges; stereo puts edges some pixels off; files quantise. The truth of
-a scene stays what it is, so the distance from it says what the bad depth costs.
+Estimators and upsampling smooth 1 / depth across edges; stereo displaces edges; files quantise. Rendering with degraded
+depth and comparing with the unchanged truth gives the cost of the degradation.
 """
 
 from collections.abc import Callable, Mapping
@@ -14,7 +14,7 @@ __all__ = ["KINDS", "degrade"]
 
 
 def degrade(depth: Tensor, kind: str) -> Tensor:
-    """Depth of a kind.
+    """Depth degraded in one way.
 
     Args:
         depth: ``[1, 1, H, W]``, metres, exact.
@@ -53,14 +53,14 @@ def _quantised(depth: Tensor, levels: int) -> Tensor:
 
 
 def _grown(depth: Tensor, reach: int) -> Tensor:
-    """The nearest depth of a square around each pixel; with a negative reach the farthest."""
+    """The nearest depth within ``reach`` pixels (square window), or the farthest within ``-reach``."""
     side = 2 * abs(reach) + 1
     sign = -1.0 if reach > 0 else 1.0
     return sign * functional.max_pool2d(sign * depth, side, 1, abs(reach))
 
 
 def _displaced(depth: Tensor, sigma: float) -> Tensor:
-    """Edges off by some pixels, now to one side and now to the other."""
+    """Displaces edges by some pixels, with slowly varying direction."""
     height, width = depth.shape[-2:]
     dice = torch.Generator().manual_seed(0)
     coarse = torch.randn(1, 2, height // 12 + 1, width // 12 + 1, generator=dice)
@@ -83,8 +83,8 @@ KINDS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "near -2px": lambda z: _grown(z, -2),
     "near +1px": lambda z: _grown(z, 1),
     "displaced": lambda z: _displaced(z, 1.5),
-    "blur 1.5": lambda z: _blurred(z, 1.5),  # as estimators leave it
+    "blur 1.5": lambda z: _blurred(z, 1.5),  # typical of estimators
     "8 bit": lambda z: _quantised(z, 255),
     "noise 1%": lambda z: _noisy(z, 0.01),
 }
-"""What is done to exact depth, by name."""
+"""The degradations, by name."""

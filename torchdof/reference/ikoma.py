@@ -1,4 +1,4 @@
-"""The layered formula that torchdof builds on, as published: what renderings are compared with."""
+"""The layered formula on which torchdof builds, as published, for comparison."""
 
 import torch
 import torch.nn.functional as functional
@@ -11,19 +11,19 @@ __all__ = ["ikoma", "layered_fft"]
 
 
 def ikoma(scene: Scene, spacing_px: float = 0.75) -> Tensor:
-    """:func:`layered_fft` of a scene, in float64: what torchdof builds on, with dense layers and exact discs."""
+    """:func:`layered_fft` of a scene in float64, with dense layers and exact discs."""
     return layered_fft(scene.image.double(), scene.coc_px, spacing_px).to(scene.image.dtype)
 
 
 def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tensor:
-    """The formula that torchdof builds on, as published: nothing hidden, no mixed pixels, exact discs, by FFT.
+    """The published layered formula: no hidden surfaces, no mixed pixels, exact discs, by FFT.
 
-    The frame is continued outwards as it is at its border; where a hole is left the rest is scaled up.
+    The frame is padded with its border; where layers leave a hole, the rest is scaled up.
 
     Args:
-        image: ``[1, C, H, W]``, linear light; its type is the one that is computed in.
+        image: ``[1, C, H, W]``, linear light; the computation uses its dtype.
         coc_px: ``[1, 1, H, W]``, signed circle of confusion.
-        spacing_px: Largest distance between layers, in circle of confusion.
+        spacing_px: Largest difference in circle of confusion between layers.
 
     Returns:
         ``[1, C, H, W]``, linear light.
@@ -38,9 +38,9 @@ def layered_fft(image: Tensor, coc_px: Tensor, spacing_px: float = 0.75) -> Tens
     half = kernels.shape[-1] // 2
     light, place = (functional.pad(x, (half,) * 4, mode="replicate") for x in (image, place))
     height, width = (n + 2 * half for n in image.shape[-2:])
-    size = [-(-(n + 2 * half) // 16) * 16 for n in image.shape[-2:]]  # of small factors, which is fast
+    size = [-(-(n + 2 * half) // 16) * 16 for n in image.shape[-2:]]  # multiples of 16, which make the FFT fast
     out, at_or_behind, covered = torch.zeros_like(image), torch.zeros_like(place), torch.zeros_like(image[:, :1])
-    least = 1e-6 if image.dtype == torch.float64 else 1e-3  # what is less is the noise of an FFT in float32
+    least = 1e-6 if image.dtype == torch.float64 else 1e-3  # smaller values are rounding noise of the FFT
     for k in reversed(range(len(nodes))):  # far to near
         weight = (1.0 - (place - k).abs()).clamp_min(0.0)
         at_or_behind = at_or_behind + weight

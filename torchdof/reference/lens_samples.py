@@ -1,4 +1,4 @@
-"""Points on the lens and how far each shifts the picture of a surface: what makes many views equal a blur kernel."""
+"""Points on the lens, and the shift of the picture for each: with many points, the views sum to the blur kernel."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from ..optics.blur_table import BlurTable
 __all__ = ["LensSamples", "spread_points"]
 
 _STEPS = 4096
-_NODES = 33  # circles of confusion a side at which the kernel's radii are tabulated, linear in between
+_NODES = 33  # circles of confusion on each side of 0 at which radii are tabulated; linear in between
 
 
 def spread_points(count: int) -> tuple[Tensor, Tensor]:
@@ -29,18 +29,18 @@ def spread_points(count: int) -> tuple[Tensor, Tensor]:
 
 
 class LensSamples:
-    """A lens seen from ``views`` points, each standing for the same share of its light.
+    """A lens seen from ``views`` points, each representing the same share of its light.
 
-    A point at radius ``rho`` shifts a surface by the radius within which the share ``rho^2`` of the surface's kernel
-    lies, to opposite sides in front of and behind the focus plane.
+    A point at radius ``rho`` shifts a surface by the radius that contains the share ``rho^2`` of the surface's kernel,
+    in opposite directions in front of and behind the focus plane.
 
     Args:
-        table: Kernels.
+        table: Blur table of the lens.
         channel: Channel of the table.
-        views: Points that see the scene.
-        cocs: Circles of confusion in pixels that will be asked for.
+        views: Number of points.
+        cocs: Maps of the circles of confusion that will be used, in pixels.
         width: Width of the image in pixels.
-        points_per_view: Points of the finer set, on average, that are nearest to each view.
+        points_per_view: Mean number of points of a finer set that belong to each view.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class LensSamples:
         return shift * x, shift * y, slope * x, slope * y
 
     def points_of(self, view: int, coc_px: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Shifts along x and y for each point of a finer set that is nearer to this view than to any other."""
+        """Shifts along x and y for each point of the finer set that belongs to this view, its nearest one."""
         for point in self._owner[view]:
             shift, _ = self._shift(self._points.radii[point], coc_px)
             x, y = self._points.directions[point].tolist()
@@ -86,7 +86,7 @@ class _Points(NamedTuple):
     def of(cls, count: int, radii: Tensor) -> "_Points":
         rho, angle = spread_points(count)
         directions = torch.stack([angle.cos(), angle.sin()], -1)
-        # place of each share rho^2 among the tabulated ones, linear in between
+        # interpolate between the tabulated shares
         where = rho**2 * (radii.shape[0] - 1)
         low = where.floor().long().clamp(max=radii.shape[0] - 2)
         return cls(
@@ -95,14 +95,14 @@ class _Points(NamedTuple):
 
 
 def _radii(table: BlurTable, channel: int, nodes: Tensor, width: int) -> Tensor:
-    """Radius within which each of evenly spaced shares of the light lies: ``[shares, nodes]``, signed like the coc."""
+    """Radius that contains each of the evenly spaced shares of the light: ``[shares, nodes]``, signed like the coc."""
     columns = []
     for coc in nodes:
         params = {name: value[channel] for name, value in table.params(coc, width).items()}
         reach = psf.support(table.family, params)
         r = torch.linspace(0.0, reach, _STEPS + 1, dtype=torch.float64)
         middle = 0.5 * (r[1:] + r[:-1])
-        # radii below a thousandth of a pixel are as good as none
+        # for radii below a thousandth of a pixel the profile does not matter
         ring = psf.profile(table.family, middle, params) * middle if reach > 1e-3 else middle
         inside = torch.cat([ring.new_zeros(1), ring.cumsum(0)])
         shares = torch.linspace(0.0, float(inside[-1]), _STEPS + 1, dtype=torch.float64)
@@ -114,7 +114,7 @@ def _radii(table: BlurTable, channel: int, nodes: Tensor, width: int) -> Tensor:
 
 
 def _nearest(points: Tensor, views: Tensor) -> list[list[int]]:
-    """For each view the points that are nearer to it than to any other."""
+    """For each view, the points nearest to it."""
     owner = torch.cat([torch.cdist(part, views).argmin(1) for part in points.split(4096)])
     owned: list[list[int]] = [[] for _ in range(len(views))]
     for point, view in enumerate(owner.tolist()):

@@ -1,9 +1,9 @@
-"""Depth of field from many views through the lens: slow, plain, and what everything faster is measured against.
+"""Depth of field from many views through the lens: slow and simple, the reference for all faster methods.
 
-Every point of the lens sees its own sharp picture. Each pixel of the image is a small square of surface, which that
-view shifts by ``coc_px`` times the place on the lens; what comes to lie in front hides what is behind; the views are
-averaged. Nothing is blurred, so nothing has to be composited. What one image does not show, because something stands in
-front of it, weighs nothing, unless it is given as a further surface.
+Every point of the lens sees its own sharp picture. Each pixel of the image is a small square of a surface; a view
+shifts it by ``coc_px`` times the position on the lens. Nearer squares hide farther ones, and the views are averaged.
+Nothing is blurred, so nothing has to be composited. Areas hidden in the image have no weight, unless they are given as
+further surfaces.
 
 References:
     Cook, Porter, Carpenter, "Distributed ray tracing", SIGGRAPH 1984.
@@ -25,18 +25,18 @@ from .lens_samples import LensSamples
 
 __all__ = ["LensViews", "lens_views", "lens_views_by_coc"]
 
-_SAME_SURFACE_PX = 1.0  # neighbours whose coc differs by less lie on one surface, which does not tear
+_SAME_SURFACE_PX = 1.0  # neighbours whose coc differs by less belong to one surface without gaps
 _SAME_DEPTH_PX = 0.5  # surfaces whose coc differs by less do not hide each other
-_BRIGHT = 8.0  # light above this many times the mean is drawn from more points of the lens than there are views
+_BRIGHT = 8.0  # light above this multiple of the mean is drawn from more points of the lens than there are views
 
 
 class LensViews(NamedTuple):
-    """The average of all views, and how much of it is known.
+    """The average of all views, and the share of views that contributed.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
-        known: ``[B, 1, H, W]``, share of the views in [0, 1] that saw a surface. Below 1 something hidden, or outside
-            the frame, would have to be known.
+        known: ``[B, 1, H, W]``, share of the views in [0, 1] that saw a surface. Below 1, some views saw hidden
+            surfaces or the outside of the frame.
     """
 
     image: Tensor
@@ -45,7 +45,7 @@ class LensViews(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Squares:
-    """Pixels as squares of surface, one a row: place, light, cover, coc and their slopes along x and y."""
+    """Pixels as squares of surface, one in each row: position, light, cover, coc, and slopes along x and y."""
 
     x: Tensor
     y: Tensor
@@ -68,26 +68,27 @@ def lens_views(
 ) -> LensViews:
     """Renders depth of field from many views through the lens.
 
-    Time and not memory grows with ``views``: about 0.05 s a view and megapixel on one core. Not differentiable.
+    The time grows with ``views``, the memory does not: about 0.05 s for each view and megapixel on one core. Not
+    differentiable.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
         depth: ``[B, 1, H, W]`` or ``[1, 1, H, W]``, metres, > 0, ``inf`` allowed.
         camera: The camera.
-        table: Blur measured from a lens; None takes the ideal disc. A view at radius ``rho`` of the lens shifts a
-            surface by the radius that holds the share ``rho^2`` of its kernel's light: any radial kernel comes out.
-        views: Points of the lens, well spread. The picture converges as they grow; a blur of radius ``r`` wants about
-            ``r^2`` of them.
-        surfaces: Further surfaces, such as what is hidden: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
+        table: Blur table of a lens; None is the ideal disc. A view at radius ``rho`` of the lens shifts a surface by
+            the radius that contains the share ``rho^2`` of its kernel's light. This reproduces any radial kernel.
+        views: Number of points on the lens. The picture converges as it grows; a blur of radius ``r`` pixels needs
+            about ``r^2``.
+        surfaces: Further surfaces, such as hidden ones: pairs of premultiplied colour and cover ``[B, C + 1, H, W]``
             and depth like ``depth``.
-        mixed_edges: Whether pixels that hold two surfaces are told apart (:func:`torchdof.render.matting.matte`); None:
-            where no surfaces are given, for beside those the matte's guess does more harm than good.
+        mixed_edges: Whether to split pixels that show two surfaces (:func:`torchdof.render.matting.matte`). None splits
+            them if no surfaces are given; with given surfaces the estimate does more harm than good.
 
     Returns:
-        Image and the known share, in the image's dtype; pixels that no view knows are those of ``image``.
+        Image and known share, in the image's dtype; pixels known in no view are copied from ``image``.
 
     Raises:
-        ValueError: If an argument is not as described.
+        ValueError: If an argument is invalid.
 
     Example:
         >>> image, depth = torch.rand(1, 3, 8, 12), torch.full((1, 1, 8, 12), 3.0)
@@ -114,7 +115,7 @@ def lens_views_by_coc(
     surfaces: Sequence[tuple[Tensor, Tensor]] = (),
     mixed_edges: bool | None = None,
 ) -> LensViews:
-    """The same from a signed circle of confusion.
+    """Renders depth of field from many views through the lens, from a signed circle of confusion.
 
     Args:
         image: ``[B, C, H, W]``, linear light.
@@ -128,7 +129,7 @@ def lens_views_by_coc(
         As :func:`lens_views`.
 
     Raises:
-        ValueError: If an argument is not as described.
+        ValueError: If an argument is invalid.
     """
     table = BlurTable.disc() if table is None else table
     if table.aperture is not None:
@@ -168,7 +169,7 @@ def lens_views_by_coc(
 
 
 def _matted(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Light, coc and cover of the surface in front, and of the one behind it where a pixel holds two."""
+    """Splits mixed pixels: light, coc and cover of the surface in front, and of the one behind it."""
     own, other, other_coc, other_weight = matte(image, coc)
     mixed = other_weight > 1e-3
     in_front, behind = mixed & (other_coc < coc), mixed & (other_coc >= coc)
@@ -183,7 +184,7 @@ def _matted(image: Tensor, coc: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
 def _average(
     stack: Sequence[tuple[Tensor, Tensor, Tensor]], lens: LensSamples, height: int, width: int
 ) -> tuple[Tensor, Tensor]:
-    """Mean of all views ``[1, C, H, W]`` and the share of views that saw something ``[1, 1, H, W]``."""
+    """Mean of all views ``[1, C, H, W]`` and the share of views that saw a surface ``[1, 1, H, W]``."""
     limit = _BRIGHT * stack[0][0].mean()
     plain = [(light.clamp(max=limit), coc, cover) for light, coc, cover in stack]
     squares = _squares(plain)
@@ -195,12 +196,12 @@ def _average(
 
     count, channels = height * width, extra.shape[-1]
     device = extra.device
-    # In float64 the mean of equal views is exact: what is in focus comes back unchanged.
+    # In float64 the mean of equal views is exact: pixels in focus are returned unchanged.
     total = torch.zeros(count, channels, dtype=torch.float64, device=device)
     glare, seen = torch.zeros_like(total), torch.zeros(count, dtype=torch.float64, device=device)
     dice = torch.rand(squares.cover.shape, generator=torch.Generator().manual_seed(0)).to(device)
     for view in range(lens.views):
-        # A square that covers 30 % of its pixel is there in 30 % of the views.
+        # A square that covers 30 % of its pixel is drawn in 30 % of the views.
         is_drawn = ((dice + view * 0.7548776662466927) % 1.0) < squares.cover
         source, target, light = _draw(squares, is_drawn, *lens.shift(view, squares.coc), height, width)
         front = torch.full((count,), torch.inf, device=device)
@@ -213,13 +214,13 @@ def _average(
         seen += covered > 0
         if bright.numel():
             _draw_points(glare, front, squares, bright, extra, lens, view, height, width)
-    # What is unknown looks like what is known, except for highlights: they are not made up.
+    # Unknown views get the mean of the known ones, but no highlights.
     image = (total / seen.clamp_min(1.0)[:, None] + glare / lens.views).clamp_min(0.0).float()
     return image.T.reshape(1, channels, height, width), (seen / lens.views).float().reshape(1, 1, height, width)
 
 
 def _squares(stack: Sequence[tuple[Tensor, Tensor, Tensor]]) -> _Squares:
-    """One row for every pixel of every surface that covers anything."""
+    """One row for every pixel of every surface with cover."""
     parts = []
     for light, coc, cover in stack:
         height, width = coc.shape[-2:]
@@ -234,7 +235,7 @@ def _squares(stack: Sequence[tuple[Tensor, Tensor, Tensor]]) -> _Squares:
 
 
 def _sides(values: Tensor, coc: Tensor, dim: int) -> tuple[Tensor, Tensor]:
-    """Differences to the neighbour before and to the one after, 0 where that one lies on another surface."""
+    """Differences to the previous and the next neighbour; 0 if it belongs to another surface."""
     step = torch.diff(values, dim=dim)
     step = torch.where(torch.diff(coc, dim=dim).abs() < _SAME_SURFACE_PX, step, 0.0)
     edge = torch.zeros_like(step.narrow(dim, 0, 1))
@@ -242,16 +243,16 @@ def _sides(values: Tensor, coc: Tensor, dim: int) -> tuple[Tensor, Tensor]:
 
 
 def _coc_slope(coc: Tensor) -> Tensor:
-    """The steeper of both sides, so that squares of a curved surface overlap, not crack: ``[2, H, W]``."""
+    """The steeper slope of both sides, so that squares of a curved surface overlap without gaps: ``[2, H, W]``."""
     slopes = [torch.where(b.abs() > a.abs(), b, a) for b, a in (_sides(coc, coc, dim) for dim in (-1, -2))]
     return torch.cat(slopes, 1)[0]
 
 
 def _light_slope(light: Tensor, coc: Tensor) -> Tensor:
-    """Slope of the light within a square: ``[2, C, H, W]``.
+    """Slope of the light used within a square: ``[2, C, H, W]``.
 
-    A square of constant light, moved to every place within a pixel, blurs by the pixel's width once more than the lens
-    does (variance + 1/12 px^2); one that follows the light's full slope sharpens by as much; half of it does neither.
+    Squares of constant light would blur by the pixel's width in addition to the lens (variance + 1/12 px^2); squares
+    with the light's full slope would sharpen by the same amount. Half the slope does neither.
     """
     slopes = []
     for dim in (-1, -2):
@@ -263,10 +264,10 @@ def _light_slope(light: Tensor, coc: Tensor) -> Tensor:
 def _draw(
     squares: _Squares, is_drawn: Tensor, dx: Tensor, dy: Tensor, ddx: Tensor, ddy: Tensor, height: int, width: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Squares of a view as (row of the square, pixel it covers the centre of, its light there)."""
+    """Draws the squares of a view: row of the square, pixel whose centre it covers, and its light there."""
     x, y = squares.x + dx, squares.y + dy
     slope_x, slope_y = squares.coc_slope
-    # The view maps a step (a, b) along the surface to (a, b) + (ddx, ddy) (slope . (a, b)); det is that map's area.
+    # With slope s the view maps a step v on the surface to v + (ddx, ddy) (s . v); det is the determinant of that map.
     det = 1.0 + ddx * slope_x + ddy * slope_y
     det = torch.where(det.abs() < 0.05, 0.05, det)
     sources, targets, lights = [], [], []
@@ -297,9 +298,9 @@ def _draw_points(
     height: int,
     width: int,
 ) -> None:
-    """Adds light far above the mean from all points of the lens that are nearest to this view, as it sees it.
+    """Adds light far above the mean, from all points of the lens that belong to this view, where it is visible.
 
-    A highlight of one pixel is one dot in each view; without more points its disc would be a pattern of dots.
+    A highlight of one pixel is one dot in each view; with these additional points its disc is even.
     """
     coc = squares.coc[bright]
     for dx, dy in lens.points_of(view, coc):

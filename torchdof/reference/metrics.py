@@ -1,4 +1,4 @@
-"""How far a rendering is from the truth: PSNR in linear light and as displayed, SSIM, FLIP."""
+"""Differences between a rendering and the truth: PSNR in linear light and as displayed, SSIM, FLIP."""
 
 import importlib
 import importlib.util
@@ -42,13 +42,13 @@ def psnr(image: Tensor, truth: Tensor, mask: Tensor | None = None) -> float:
     Args:
         image: ``[B, C, H, W]``; pass both through :func:`display` for display-encoded values.
         truth: ``[B, C, H, W]``.
-        mask: ``[B or 1, 1, H, W]``, bool: pixels that count; None counts them all.
+        mask: ``[B or 1, 1, H, W]``, bool: pixels to compare; None compares all.
 
     Returns:
         dB; ``inf`` where both are equal.
 
     Raises:
-        ValueError: If shapes or types are not as described, no pixel counts, or one that counts is not finite.
+        ValueError: If shapes or types are invalid, the mask is empty, or a compared pixel is not finite.
 
     Example:
         >>> round(psnr(torch.zeros(1, 3, 4, 4), torch.full((1, 3, 4, 4), 0.1)), 6)
@@ -83,7 +83,7 @@ def ssim(image: Tensor, truth: Tensor) -> float:
         Mean over pixels and channels, at most 1.
 
     Raises:
-        ValueError: If shapes or types are not as described, or a value is not finite.
+        ValueError: If shapes or types are invalid, or a value is not finite.
 
     Reference:
         Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment", IEEE TIP 2004; computed by kornia.
@@ -97,7 +97,7 @@ def ssim(image: Tensor, truth: Tensor) -> float:
 
 
 def has_flip() -> bool:
-    """Whether FLIP can be computed: whether the package ``flip-evaluator`` is installed."""
+    """Whether FLIP can be computed, that is, the package ``flip-evaluator`` is installed."""
     return importlib.util.find_spec("flip_evaluator") is not None
 
 
@@ -107,7 +107,7 @@ def flip(image: Tensor, truth: Tensor) -> float:
 
 
 def flip_map(image: Tensor, truth: Tensor) -> Tensor:
-    """Difference that a viewer notices when flipping between two images on a display (67 pixels a degree).
+    """Difference visible when flipping between two images on a display (67 pixels a degree).
 
     Args:
         image: ``[1, 3, H, W]``, display-encoded, in [0, 1].
@@ -133,7 +133,7 @@ def flip_map(image: Tensor, truth: Tensor) -> Tensor:
 
 
 def _alike(image: Tensor, truth: Tensor, finite: bool = False) -> None:
-    """Refuse two images that cannot be compared: other shapes or devices, or values that are not finite where asked."""
+    """Raises an error if two images cannot be compared: other shapes or devices or, if asked, values not finite."""
     for name, value in (("image", image), ("truth", truth)):
         real_tensor(name, value, "[B, C, H, W]")
         if value.ndim != 4 or not value.numel():

@@ -1,4 +1,4 @@
-"""Scenes whose depth of field is known: read from a folder, or made of textured planes and computed.
+"""Scenes with known depth of field: read from a folder, or rendered from textured planes.
 
 A folder holds ``sharp.exr`` (all in focus, linear light), ``depth.exr`` (metres along the optical axis), one
 ``truth_K.exr`` for each setting of the lens, and ``meta.json``::
@@ -6,8 +6,8 @@ A folder holds ``sharp.exr`` (all in focus, linear light), ``depth.exr`` (metres
     {"name": "planes", "F_px": 1055.03,
      "truths": [{"file": "truth_0.exr", "aperture_radius_m": 0.02, "focus_distance_m": 8.0, "margin_px": 20}]}
 
-``F_px`` is the image distance in pixels, whatever part of the frame the files show. ``margin_px`` may be left out:
-it is the largest circle of confusion, where that one lies outside what the files show.
+``F_px`` is the image distance in pixels, also if the files show only a part of the frame. ``margin_px`` is needed only
+where the largest circle of confusion lies outside the files.
 """
 
 import dataclasses
@@ -38,14 +38,15 @@ __all__ = [
 ]
 
 Light = Callable[[Tensor, Tensor], Tensor]
-"""Linear light ``[C, ...]`` at places x, y ``[...]``, in pixels of the frame."""
+"""Linear light ``[C, ...]`` at positions x, y ``[...]``, in pixels of the frame."""
 
 Shape = Callable[[Tensor, Tensor], Tensor]
-"""Whether a surface is there (bool ``[...]``) at places x, y ``[...]``, in pixels of the frame."""
+"""Whether a surface covers positions x, y ``[...]``, in pixels of the frame: bool ``[...]``."""
 
 Rays = Callable[[int, Tensor, Tensor], tuple[Sequence[tuple[Tensor, Tensor]], Tensor]]
-"""The n-th ray of each place x, y ``[...]``, in pixels of the frame, back into the scene: where the sharp image shows
-what it meets of each plane, far to near (x, y ``[...]``), and the light it carries ``[...]``, 0 where it is stopped."""
+"""Traces the n-th ray of each position x, y ``[...]``, in pixels of the frame, back into the scene. Returns, for each
+plane from far to near, the position x, y ``[...]`` in the sharp image of the point that the ray meets, and the ray's
+light ``[...]``, 0 if it is blocked."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +59,8 @@ class Scene:
         depth: ``[1, 1, H, W]``, metres.
         camera: The setting of the lens.
         truth: ``[1, C, H, W]``, linear light.
-        margin_px: Width of the border that light from outside the frame reaches: the largest circle of confusion.
-        surfaces: What is known of further surfaces, as :func:`torchdof.reference.lens_views.lens_views` takes them.
+        margin_px: Width of the border reached by light from outside the frame: the largest circle of confusion.
+        surfaces: Known further surfaces, see :func:`torchdof.reference.lens_views.lens_views`.
     """
 
     name: str
@@ -84,11 +85,11 @@ class Scene:
 
 
 def read_scenes(folder: str | os.PathLike[str]) -> Iterator[Scene]:
-    """Every setting of every scene below a folder, by name.
+    """Every setting of every scene in a folder and its subfolders, sorted by name.
 
     Raises:
-        OSError: If the folder has no scene, or a file of one is missing.
-        ValueError: If a file is not as described; the message names it.
+        OSError: If the folder has no scene, or a file is missing.
+        ValueError: If a file is invalid; the message names it.
     """
     folder = Path(folder)
     metas = sorted(folder.rglob("meta.json"))
@@ -131,7 +132,7 @@ def _number(meta: Path, data: Any, field: str) -> float:
 
 
 def camera_of(focal_px: float, width: int, aperture_radius_m: float, focus_m: float) -> Camera:
-    """Camera of a rendered frame ``width`` pixels wide (or a part of one) whose image distance is ``focal_px`` pixels.
+    """The camera of a rendered frame (or part of one) of this width, with the image distance ``focal_px`` in pixels.
 
     Example:
         >>> camera = camera_of(1055.0, 768, aperture_radius_m=0.02, focus_m=2.0)
@@ -144,12 +145,12 @@ def camera_of(focal_px: float, width: int, aperture_radius_m: float, focus_m: fl
 
 @dataclasses.dataclass(frozen=True)
 class Plane:
-    """A plane that faces the camera and reaches beyond the frame.
+    """A plane parallel to the sensor that extends beyond the frame.
 
     Args:
-        depth_m: Its distance.
-        light: Its texture, seen from the middle of the lens.
-        shape: Where it is; None: everywhere.
+        depth_m: Its distance in metres.
+        light: Its texture, seen from the centre of the lens.
+        shape: The area it covers; None: all of it.
     """
 
     depth_m: float
@@ -164,20 +165,20 @@ def plane_scene(
     samples: int = 1024,
     name: str = "planes",
 ) -> Scene:
-    """Renders planes exactly, but for the number of samples: the truth for textures and shapes known everywhere.
+    """Renders planes: exact except for the number of samples, because textures and shapes are known everywhere.
 
-    A plane at circle of confusion ``c`` shows in a pixel at ``x``, from the point ``u`` of a round lens, what lies at
-    ``x - c u`` as seen from the lens's middle. Pixels are box-filtered.
+    A plane with circle of confusion ``c``, seen from the point ``u`` of a round lens, shows at pixel ``x`` what the
+    centre of the lens sees at ``x - c u``. Pixels are box-filtered.
 
     Args:
-        planes: In any order; the farthest must have no shape, so that it covers the frame.
+        planes: In any order. The farthest must not have a shape: it has to cover the frame.
         camera: The setting of the lens.
         size: Height and width in pixels.
-        samples: Points on lens and pixel for each pixel; the sharp image takes as many on the pixel alone.
+        samples: Points on lens and pixel, for each pixel; the sharp image uses as many on the pixel alone.
         name: Name of the scene.
 
     Returns:
-        The scene; its ``surfaces`` hold each whole plane, far to near, including what is hidden.
+        The scene; ``surfaces`` are all planes, far to near, including hidden parts.
 
     Raises:
         ValueError: If the farthest plane has a shape.
@@ -215,17 +216,18 @@ def plane_scene(
 def plane_views(
     planes: Sequence[Plane], rays: Rays, size: tuple[int, int], window: tuple[slice, slice], samples: int = 256
 ) -> Tensor:
-    """A part of what a lens makes of planes, ray by ray: the truth where the lens is not the same all over the frame.
+    """Renders a part of the frame ray by ray: the truth for a lens whose blur varies over the frame.
 
     Args:
-        planes: As :func:`plane_scene` takes them.
-        rays: Of the lens.
+        planes: As in :func:`plane_scene`.
+        rays: Rays of the lens.
         size: Height and width of the frame.
         window: Rows and columns of the part.
-        samples: Rays a pixel.
+        samples: Rays for each pixel.
 
     Returns:
-        ``[1, C, rows, columns]``, linear light: the mean of what rays see, so a white plane is white everywhere.
+        ``[1, C, rows, columns]``, linear light: the mean over the unblocked rays, so that a white plane is white
+        everywhere.
     """
     planes = sorted(planes, key=lambda plane: -plane.depth_m)
     axes = (torch.arange(n, dtype=torch.float64)[part] + 0.5 for n, part in zip(size, window, strict=True))
@@ -234,9 +236,9 @@ def plane_views(
 
 
 def _average(planes: Sequence[Plane], x: Tensor, y: Tensor, rays: Rays, samples: int) -> tuple[Tensor, list[Tensor]]:
-    """Mean light ``[C, H, W]`` of what is seen, and premultiplied light and cover of each plane ``[C + 1, H, W]``."""
+    """Mean light ``[C, H, W]`` of visible planes, premultiplied light and cover of each plane ``[C + 1, H, W]``."""
     index = torch.arange(samples, dtype=torch.float64)
-    # Additive recurrences keep place in the pixel and point of the lens apart.
+    # Additive recurrences, so that position in the pixel and point on the lens are independent.
     places = torch.stack([(index * a + 0.5) % 1.0 - 0.5 for a in (0.7548776662466927, 0.5698402909980532)], -1).tolist()
     total, carried, wholes = torch.zeros(()), torch.zeros(()), [torch.zeros(()) for _ in planes]
     for i, (px, py) in enumerate(places):
@@ -292,8 +294,8 @@ def strands(lines: Sequence[tuple[float, float, float, float]], widths_px: Seque
     """Straight strands with round ends: wires, hair, twigs.
 
     Args:
-        lines: x and y of the first and of the last point of each, in pixels of the frame.
-        widths_px: Their widths.
+        lines: x and y of the first and of the last point of each strand, in pixels of the frame.
+        widths_px: Widths in pixels.
 
     Example:
         >>> y = torch.tensor([2.0, 2.3, 2.6])

@@ -86,7 +86,7 @@ def test_a_crop_in_the_manifest_keeps_the_scale_and_one_in_an_editor_is_refused(
     assert inside.width_px == 400 and inside.pairs[0].position_px == pytest.approx((0, 0), abs=1)
     assert fit_captures(inside, "disc").coc_px[0] == pytest.approx(-5.0, rel=0.01)
     manifest.write_text(f"crop = [300, 40, 150, 160]\n{text}")
-    with pytest.raises(FitError, match="leaves the picture of 400x240"):
+    with pytest.raises(FitError, match="extends beyond the picture of 400x240"):
         read_captures(folder)
     for path in folder.glob("*.png"):
         cropped = read_image(path).pixels[..., 130:280]

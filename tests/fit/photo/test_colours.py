@@ -44,7 +44,7 @@ def check(result, distances, tolerance):
 
 
 # the mean of discs of three sizes is no disc, and what it leaves looks like a tone curve's
-@pytest.mark.filterwarnings("ignore:what the fit leaves goes with the level:torchdof.fit.problems.FitWarning")
+@pytest.mark.filterwarnings("ignore:the fit.s residual depends on the level:torchdof.fit.problems.FitWarning")
 def test_lateral_and_longitudinal_colour_are_told_apart(simulator, tmp_path):
     result = fit_captures(captures(simulator), "disc")
     check(result, DISTANCES, 0.012)

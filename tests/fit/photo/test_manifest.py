@@ -56,7 +56,7 @@ def test_the_dark_frame_is_subtracted_and_the_transfer_is_what_the_manifest_says
 
 def test_encoded_pictures_whose_transfer_nobody_stated_are_never_taken_in_silence(folder):
     change(folder, 'transfer = "srgb"', "")
-    with pytest.warns(FitWarning, match="how 0500mm.png and 2 more are encoded") as caught:
+    with pytest.warns(FitWarning, match="the encoding of 0500mm.png and 2 more is not stated") as caught:
         (captures,) = read_captures(folder)
     said = caught[0].message
     assert said.kind == "not linear" and said.number == 3 and said.file.endswith("capture.toml")

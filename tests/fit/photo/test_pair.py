@@ -164,10 +164,10 @@ WARNED = [
     (TONE, G3, 0, {}, {"not linear"}, "a tone curve", None),
     ({**TONE, "bayer": True, "size": 91}, G3, 1, {}, None, "linear|tone curve", None),  # behind a soft edge
     # 4 % of the radius; compression hides what the curve does to the noise. A Gaussian takes half of the curve up
-    ({"tone": 0.2, **JPEG, "bayer": True}, D6, 2, HELD, {"not linear"}, "goes with the level, as under", None),
-    ({"tone": 0.2, **JPEG}, G3, 1, HELD, {"not linear"}, "goes with the level, as under", None),
-    ({"tone": 0.2, **JPEG}, R34, 101, {}, {"not linear"}, "were the dot as large as expected", None),
-    ({"tone": 0.2, **JPEG}, G3, 101, {}, {"not linear"}, "were the dot as large as expected", None),
+    ({"tone": 0.2, **JPEG, "bayer": True}, D6, 2, HELD, {"not linear"}, "depends on the level, as with", None),
+    ({"tone": 0.2, **JPEG}, G3, 1, HELD, {"not linear"}, "depends on the level, as with", None),
+    ({"tone": 0.2, **JPEG}, R34, 101, {}, {"not linear"}, "at the expected size of the dot", None),
+    ({"tone": 0.2, **JPEG}, G3, 101, {}, {"not linear"}, "at the expected size of the dot", None),
     ({"size": 61}, ("gaussian", {"sigma": 9.5}), 0, {}, {"window"}, "outside the window of 61x61 px", None),
     ({"magnification": 1.15}, ("gaussian", {"sigma": 2.0}), 0, {}, {"magnification"}, "1.15. times the size", 1.15),
     ({"snr_db": 60}, D6, 0, {"family": "gaussian"}, None, "Family 'gaussian' may be too simple", None),
@@ -247,7 +247,7 @@ def test_round_blur_is_never_said_to_be_uneven_and_a_cat_s_eye_is(simulator):
     eye = simulator.through(simulator.shape("cat's eye", 8.0), simulator.Simulator(size=71, dot_radius=10.0))
     fit, said = simulator.heard(lambda: fit_pair(*eye, "disc"))
     (uneven,) = (w for w in said if w.kind == "asymmetry")
-    assert fit.asymmetry > 0.03 and uneven.number == fit.asymmetry and "family 'disc' has not" in str(uneven)
+    assert fit.asymmetry > 0.03 and uneven.number == fit.asymmetry and "family 'disc' cannot" in str(uneven)
 
 
 NOISE = np.random.default_rng(0).normal(size=(101, 101))
@@ -264,7 +264,7 @@ REFUSED = [  # arguments of the wrong kind: test_arguments.py
     (lambda s, b: {"sharp": np.hstack([s, s]), "blurred": np.hstack([b, b])}, "several dots", "2 dots where one"),
     (lambda s, b: {"sharp": s[:, 45:], "blurred": b[:, 45:]}, "window", "touches the picture's edge"),
     # a metre read as centimetres
-    ({"magnification": 0.008, "family": "radial"}, "distance", "0.096 px here, and nothing of it be seen; is the dist"),
+    ({"magnification": 0.008, "family": "radial"}, "distance", "0.096 px here, which is too small to see; is the dist"),
     (lambda s, b: {"blurred": np.minimum(b, 0.5)}, "saturated", "% of the blurred dot's pixels are clipped"),
 ]
 

@@ -1,16 +1,22 @@
-// Light beyond the frame's border. The formulas are told in render/border.py.
+// Estimates the light beyond the frame's border, as described in render/border.py.
 #include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 
-constexpr int WIDTH = 4;  // the mean reaches so many times as far to each side as the place lies beyond the border
+constexpr int WIDTH = 4;  // half width of the mean along the border, times the distance beyond it; larger is smoother
 constexpr int BINS = 16;  // number of bins; a larger one separates more surfaces
-constexpr double STEP = 0.5;  // largest difference of neighbours on one surface, on the blur axis; twice that is a whole step
+// difference between neighbours on the blur axis above which they start to count as different surfaces; fully at twice it
+constexpr double STEP = 0.5;
 
-// A difference on the blur axis that is a step from one surface to another; 0 for that of a slope.
+// The part of a difference on the blur axis that is a step between surfaces; 0 for a slope.
 static double step_of(double difference) { return difference * std::clamp(std::fabs(difference) / STEP - 1.0, 0.0, 1.0); }
 
+// Computes, for each side of the frame and each surface, means of the light along the border.
+//
+// 1. Place the border's pixels on an axis on which only steps between surfaces count, in BINS bins.
+// 2. Accumulate light and weight along the border for each bin and all farther ones, so that nearer surfaces are left out.
+// 3. Differences of these sums are the means over windows of doubling width, one for each level.
 Border border_of(const Job &job, int farthest) {
   const Surfaces &s = job.surfaces;
   Border border;
@@ -35,10 +41,10 @@ Border border_of(const Job &job, int farthest) {
     const int length = border.length(side), C = job.channels, sums = C + 1;
     const auto row_of = [&](int at) { return upright ? at : side == Border::TOP ? 0 : job.height - 1; };
     const auto column_of = [&](int at) { return !upright ? at : side == Border::LEFT ? 0 : job.width - 1; };
-    std::vector<double> until((size_t)(length + 1) * BINS * sums);  // of each bin, sums over earlier pixels: weighted light, weight
-    std::vector<int> bin(length);                                   // each pixel's, which shares it with the next one,
-    std::vector<double> part(length);                               // by this part
-    std::vector<double> image_x(length), surface(length);           // places on the blur axis; their steps, added up
+    std::vector<double> until((size_t)(length + 1) * BINS * sums);  // prefix sums of each bin: weighted light, weight
+    std::vector<int> bin(length);                                   // lower of each pixel's two bins
+    std::vector<double> part(length);                               // weight of the upper one
+    std::vector<double> image_x(length), surface(length);           // positions on the blur axis; accumulated steps
     std::vector<const float *> light(C);
     const float *coc, *weight;
     for (int i = 0; i < s.count; i++) {
@@ -55,7 +61,7 @@ Border border_of(const Job &job, int farthest) {
         std::copy(after - BINS * sums, after, after);
         const bool there = s.row(i, y, x, light.data(), coc, weight);
         const double w = !there ? 0.0 : weight ? *weight : 1.0;
-        float share = 1.0f;  // of its light that is no highlight's
+        float share = 1.0f;  // part of its light below the highlight threshold
         if (there && !job.threshold.empty()) {
           float brightest = *light[0];
           for (int c = 1; c < C; c++) brightest = std::max(brightest, *light[c]);
@@ -74,7 +80,7 @@ Border border_of(const Job &job, int farthest) {
           to[C] += its_weight;
         }
       }
-      for (size_t at = 1; at <= (size_t)length; at++)  // and of all farther bins
+      for (size_t at = 1; at <= (size_t)length; at++)  // add the sums of all farther bins
         for (int n = (BINS - 1) * sums - 1; n >= 0; n--) until[at * BINS * sums + n] += until[at * BINS * sums + n + sums];
       for (int level = 0; level < border.levels_; level++) {
         const int half = (int)std::min<int64_t>((int64_t)WIDTH << level, length);

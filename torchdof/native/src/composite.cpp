@@ -1,97 +1,102 @@
-// Composite: soft layers, far to near, each spread with its kernel and laid over what is behind it. The formulas are
-// told in render/composite.py. Layers of full resolution are laid tile by tile, all of them while the tile is in the
-// cache; coarser ones before that, each run of them on a canvas of its resolution.
+// Composites the layers from far to near, as described in render/composite.py. With m a layer's share of each pixel and
+// M the share at or behind the layer (its normalizer), K its kernel and I its light:
+//
+//   colour = K * (m I) / K * M,   coverage = K * m / K * M,   picture = colour + (1 - coverage) picture
+//
+// Runs of layers of a coarser resolution are composited first, each on a canvas of its own resolution. Then each tile
+// composites its full-resolution layers and these canvases while it is in the cache.
 #include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float LEAST = 1e-6f;    // share of spread weight below which nothing is known
-constexpr float KNOWN = 2e-3f;    // and from which on a layer is known in full
-constexpr float COVERED = 1e-6f;  // so little is left uncovered by rounding alone
+constexpr float LEAST = 1e-6f;    // blurred weight below which the light of a pixel is unknown
+constexpr float KNOWN = 2e-3f;    // blurred weight at which a layer's colour is fully known; below, 1 / weight is damped
+constexpr float COVERED = 1e-6f;  // uncovered part that is rounding error alone
 constexpr int BEHIND_STEP = 4;    // pixels between samples of the light behind all surfaces
 constexpr int TILE_PIXELS = TILE * TILE;
-constexpr int PART = 16;  // pixels a side of what is known to be empty in a coarser canvas
+constexpr int PART = 16;  // side in pixels of the parts of a coarse canvas that are skipped if empty
 
-constexpr float EVEN = 1e-12f;  // square of what a weight of 1 may lack
+constexpr float EVEN_SQUARED = 1e-12f;  // square of the difference from 1 up to which a normalizer counts as 1
 
-// Layers of one resolution that are composited before others. Under occlusion these are neighbours and, if it is a coarser
-// resolution, on one side of the focus; light that only accumulates does so in any order.
+// Consecutive layers of one resolution, composited together. Under occlusion a coarse run lies on one side of the
+// focus; without occlusion the order does not matter, and all layers of one resolution form one run.
 struct Run {
   int scale, first, last, half;
-  int tile_rows = 0, tile_columns = 0, rows = 0, columns = 0;  // of its canvas, one pixel more on each side
+  int tile_rows = 0, tile_columns = 0, rows = 0, columns = 0;  // of its canvas, which has a margin of one pixel
   Buffer<float> canvas;                                        // light and coverage
-  int part_columns = 0;                                        // of parts of PART x PART of its pixels
-  std::vector<uint8_t> used;                                   // parts with anything in them
+  int part_columns = 0;                                        // number of parts in a row of parts
+  std::vector<uint8_t> used;                                   // parts that are not empty
 };
 
-// Pieces of blocks in a window: where each lies in it, its node and values. Those of node i are sorted[start[i]] to
+// Pieces (sparse block means, see Downsampled) in a window. Those between node i and the next are sorted[start[i]] to
 // sorted[start[i + 1]].
 struct WindowPiece {
   const float *values;
   uint16_t row, column, node;
-  bool room_only;
+  bool normalizer_only;
 };
 struct WindowPieces {
   std::vector<WindowPiece> unsorted, sorted;
   std::vector<int> start;
 };
 
-// The part of a window that lies in one block of pixels: where its surfaces are, and what its terms were last.
+// The part of a window inside one block of pixels: pointers to its surfaces, and which of its terms are still valid.
 struct WindowBlock {
   struct Surface {
     const float *light, *weight;  // from the block's first row in the window; weight null: 1
     int light_pitch, weight_pitch;
-    size_t channel;  // from one channel to the next
+    size_t channel;  // distance between channels
   };
   int top, rows, column;  // in the window
   Surface surfaces[2];
   int count;
   const uint64_t *layers;  // that occur in it
-  bool clear;              // no layer's light or share stands in the terms
-  int room;                // 0 or 1 where that is all that stands in this term, KEPT if it holds until a layer occurs, else -1
-  uint32_t open[BLOCK], uneven[BLOCK];  // of the room that is kept: marks of each row
-  static constexpr int KEPT = 2;
+  bool clear;              // light and share of its terms are 0
+  // State of its normalizer term: out of date, constant, or KEPT, valid until a layer occurs in the block.
+  enum Normalizer { STALE, ZERO, ONE, KEPT } normalizer;
+  uint32_t partial[BLOCK], varying[BLOCK];  // column marks of each row, stored with a KEPT normalizer
 };
 
-// A layer's kernels as the field leaves them, in a block of its pixels.
-struct Cut {
+// A layer's kernels after masking by the lens's field, for one block of the layer's pixels.
+struct MaskedKernels {
   const Layer *layer = nullptr;
   int row = 0, column = 0;
-  std::vector<Kernel> kernels;  // of each colour
+  std::vector<Kernel> kernels;  // one for each colour
 };
 
-// Planes of a window, `pitch` values a row.
+// Buffers of a thread. Planes of a window have `pitch` values a row.
 struct Scratch {
   std::vector<float> memory;
   std::vector<float *> light, coc, weight;  // of each surface (light: [surfaces, channels])
-  std::vector<float *> term;    // what a layer spreads: light, share, room
+  std::vector<float *> term;    // of one layer: light, share, normalizer
   std::vector<float *> canvas;  // light and coverage of a tile
-  float *traced;                // light of rays in a tile
-  std::vector<float *> mine;    // a row of each surface's share
-  float *rest;                  // what lies wholly behind a coarse layer
-  std::vector<uint32_t> occupied, open, uneven, every;  // rows of what a layer spreads, a bit for so many columns as mark tells
-  std::vector<Cut> cuts = std::vector<Cut>(TILE / Turned::COLUMNS);
+  float *traced;                // light of highlights in a tile
+  std::vector<float *> surface_share;  // a row of each surface's share
+  float *farther;  // weight of surfaces that lie wholly behind a coarse layer
+  std::vector<uint32_t> occupied, partial, varying, every;  // column marks (see `mark`) of each row
+  std::vector<MaskedKernels> masked_kernels = std::vector<MaskedKernels>(TILE / FieldMask::COLUMNS);
   std::vector<const float *> pointers;
   std::vector<uint64_t> layers, block_layers;
   std::vector<WindowBlock> blocks;
   WindowPieces pieces;
 };
 
-// What a row of terms has, by its columns' marks: something; something behind the layer; something before it.
+// Column marks of a row: where the layer has a share (some), where its normalizer exceeds the share (partial: coverage
+// is below 1), and where the normalizer differs from 1 (varying).
 struct Occupied {
-  uint32_t some = 0, open = 0, uneven = 0;
-  void add(int x, float share, float room, bool over) {
+  uint32_t some = 0, partial = 0, varying = 0;
+  void add(int x, float share, float normalizer, bool over) {
     const uint32_t bit = mark(x);
     if (share > 0) some |= bit;
-    if (over && room != share) open |= bit;  // of a hair there is less room than share
-    if (over && (room - 1.0f) * (room - 1.0f) > EVEN) uneven |= bit;
+    if (over && normalizer != share) partial |= bit;  // may also be smaller where a surface's share is below HIDING_SHARE
+    if (over && (normalizer - 1.0f) * (normalizer - 1.0f) > EVEN_SQUARED) varying |= bit;
   }
   void put(Scratch &b, int y) const {
     b.occupied[y] = some;
-    b.open[y] = open;
-    b.uneven[y] = uneven;
+    b.partial[y] = partial;
+    b.varying[y] = varying;
   }
 };
 
@@ -131,7 +136,7 @@ class Composite {
     fine_.assign(index_.words, 0);
     for (int k = 0; k < N_; k++)
       if (layers_[k].scale == 1) fine_[k / 64] |= 1ull << k % 64;
-    int farthest = 0;  // beyond the frame
+    int farthest = 0;  // pixels beyond the frame that any layer reads
     for (const Layer &l : layers_) farthest = std::max(farthest, l.scale * (l.half + 2) + 2 * BLOCK);
     border_ = border_of(job_, farthest);
     std::vector<std::pair<int, int>> coarse;  // run and tile
@@ -172,11 +177,11 @@ class Composite {
       for (int i = 0; i < count * C_; i++) b.light.push_back(take(plane));
       for (int i = 0; i < count; i++) b.coc.push_back(take(plane)), b.weight.push_back(take(plane));
       for (int i = 0; i < C_ + 2; i++) b.term.push_back(take(plane));
-      b.rest = take(plane);
+      b.farther = take(plane);
       b.traced = take((size_t)C_ * TILE_PIXELS);
       for (int i = 0; i < C_ + E_; i++) b.canvas.push_back(take(TILE_PIXELS));
-      for (int i = 0; i < count + 2; i++) b.mine.push_back(take(pitch_));
-      for (auto *rows : {&b.occupied, &b.open, &b.uneven}) rows->resize(window_);
+      for (int i = 0; i < count + 2; i++) b.surface_share.push_back(take(pitch_));
+      for (auto *rows : {&b.occupied, &b.partial, &b.varying}) rows->resize(window_);
       b.every.assign(window_, ~0u);
       b.pointers.resize(C_);
       b.layers.resize(index_.words);
@@ -184,7 +189,10 @@ class Composite {
     return *scratches_[worker];
   }
 
-  // For each pixel of each surface the node before it, and for each cell the layers in it.
+  // Finds the node before each pixel of each surface, and the layers that occur in each cell of CELL x CELL pixels.
+  //
+  // A block of one surface that lies between two neighbouring nodes is filled at once. Elsewhere each cell compares the
+  // places of its pixels with the nodes between its smallest and its largest place.
   void index() {
     index_.words = (N_ + 63) / 64;
     index_.rows = ceil_div(H_, CELL);
@@ -216,7 +224,7 @@ class Composite {
       const float *coc, *weight;
       for (int bx = 0; bx < s_.block_columns; bx++) {
         const int block = by * s_.block_columns + bx, y_end = std::min(H_, (by + 1) * BLOCK), x_end = std::min(W_, (bx + 1) * BLOCK);
-        if (!s_.whole() && !s_.has_block(block)) {  // one surface; mostly between the same two nodes
+        if (!s_.full_planes() && !s_.has_block(block)) {  // one surface, usually between two neighbouring nodes
           const float low = index_.place(job_.block_low[block]), high = index_.place(job_.block_high[block]);
           const int k = node_before(low);
           if (k == node_before(high)) {
@@ -239,7 +247,7 @@ class Composite {
             float own_cocs[CELL * CELL], own_weights[CELL * CELL];
             bool single = true;
             for (int i = 0; i < s_.count; i++) {
-              // places, and those of what weighs something; a row that the frame cuts off goes on with its last pixel
+              // places: of all pixels; shown: of pixels with weight. A row cut off by the frame repeats its last pixel.
               float places[CELL * CELL], shown[CELL * CELL], cut_coc[CELL], cut_weight[CELL];
               vec lows = all(NEVER), highs = all(-NEVER), least_weight = all(1.0f), most_weight = {}, farther_weight = {};
               bool there = true;
@@ -285,7 +293,7 @@ class Composite {
                 }
                 for (int x = 0; x < n; x++) intervals[(size_t)y * W_ + x] = (uint16_t)nodes[x];
               }
-              for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // a layer occurs between the nodes beside its own
+              for (int k = first; k <= std::min(last + 1, N_ - 1); k++) {  // layer k occurs between nodes k - 1 and k + 1
                 const vec before = all(k == first ? -NEVER : layers_[k - 1].at), after = all(k > last || k == N_ - 1 ? NEVER : layers_[k + 1].at);
                 ivec found = {};
                 for (int j = 0; j < rows * CELL; j += LANES) {
@@ -301,7 +309,7 @@ class Composite {
     });
   }
 
-  // Layers in cells, and whether these show the first surface alone.
+  // Collects the layers of a range of cells; returns whether these show the first surface alone.
   bool around(int r0, int r1, int c0, int c1, uint64_t *bits) const {
     r0 = std::clamp(r0, 0, index_.rows - 1), r1 = std::clamp(r1, 0, index_.rows - 1);
     c0 = std::clamp(c0, 0, index_.columns - 1), c1 = std::clamp(c1, 0, index_.columns - 1);
@@ -317,12 +325,12 @@ class Composite {
   }
   static bool has(const uint64_t *bits, int k) { return bits[k / 64] >> k % 64 & 1; }
 
-  // A coarse run in one of its tiles.
+  // Composites one tile of a coarse run.
   void coarse_tile(Run &run, int which, Scratch &b) {
     const int s = run.scale, tile_y = which / run.tile_columns * TILE, tile_x = which % run.tile_columns * TILE;
     const int rows = std::min(TILE, run.rows - tile_y), columns = std::min(TILE, run.columns - tile_x);
     const int half = run.half, height = rows + 2 * half, width = columns + 2 * half;
-    const int top = tile_y - 1 - half, left = tile_x - 1 - half;  // the first block of the window
+    const int top = tile_y - 1 - half, left = tile_x - 1 - half;  // first block of the window
     around(floor_div(top * s, CELL), floor_div((top + height) * s - 1, CELL), floor_div(left * s, CELL),
            floor_div((left + width) * s - 1, CELL), b.layers.data());
     bool any = false;
@@ -346,7 +354,7 @@ class Composite {
       else
         block_means(k, s, top + spare, left + spare, rows + 2 * l.half, columns + 2 * l.half, (size_t)spare * pitch_ + spare, b);
       if (!d) find_occupied(b, spare, rows + 2 * l.half, spare, columns + 2 * l.half);
-      lay(b, l, rows, columns, spare, spare, tile_y - 1, tile_x - 1);
+      composite_layer(b, l, rows, columns, spare, spare, tile_y - 1, tile_x - 1);
     }
     for (int c = 0; c < C_ + E_; c++)
       for (int y = 0; y < rows; y++)
@@ -367,25 +375,25 @@ class Composite {
     return nullptr;
   }
 
-  // Pieces in a window that a run spreads, sorted by node; the weight of those behind the run.
+  // Sorts the pieces of a window by node, and sums the weight of those behind the run.
   void find_pieces(const Run &run, const Downsampled &d, int top, int left, int height, int width, Scratch &b) {
     const int per_band = BLOCK / d.scale, L = run.last - run.first + 2, stride = d.stride();
     WindowPieces &p = b.pieces;
     p.unsorted.clear();
     p.start.assign(L + 1, 0);
     if (over_)
-      for (int y = 0; y < height; y++) memset(b.rest + (size_t)y * pitch_, 0, width * sizeof(float));
+      for (int y = 0; y < height; y++) memset(b.farther + (size_t)y * pitch_, 0, width * sizeof(float));
     for (int y = 0; y < height; y++) {
       const int row = top + y, band = floor_div(row, per_band);
       const Pieces &pieces = d.pieces[band - d.first_band];
       const int *start = &pieces.start[row - band * per_band], *column = pieces.column.data();
       const int end = (int)(std::lower_bound(column + start[0], column + start[1], left + width) - column);
       for (int i = (int)(std::lower_bound(column + start[0], column + start[1], left) - column); i < end; i++) {
-        const int node = (pieces.node[i] & ~Pieces::ROOM_ONLY) - run.first + 1, x = column[i] - left;
+        const int node = (pieces.node[i] & ~Pieces::NORMALIZER_ONLY) - run.first + 1, x = column[i] - left;
         const float *values = &pieces.values[(size_t)i * stride];
-        if (node >= L) b.rest[(size_t)y * pitch_ + x] += values[0];
+        if (node >= L) b.farther[(size_t)y * pitch_ + x] += values[0];
         if (node < 0 || node >= L) continue;
-        p.unsorted.push_back({values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::ROOM_ONLY) != 0});
+        p.unsorted.push_back({values, (uint16_t)y, (uint16_t)x, (uint16_t)node, (pieces.node[i] & Pieces::NORMALIZER_ONLY) != 0});
         p.start[node + 1]++;
       }
     }
@@ -395,15 +403,15 @@ class Composite {
     for (const WindowPiece &piece : p.unsorted) p.sorted[next[piece.node]++] = piece;
   }
 
-  // What layer k spreads of a window; what lies behind it is added to the rest.
+  // The terms of layer k in a window. Adds the weight between node k and the next to `farther`.
   void downsampled_terms(const Run &run, const Downsampled &d, int k, int top, int left, int height, int width, int spare, Scratch &b) {
     const int C = C_;
     const vec at = all((float)k), before = all((float)(k - 1));
     for (int y = spare; y < height - spare; y++) {
       const size_t to = (size_t)y * pitch_;
       const float *node = d.row(0, top + y) + left, *one = d.row(1, top + y) + left, *two = d.row(2, top + y) + left;
-      float *share = b.term[C] + to, *room = b.term[C + 1] + to;
-      uint32_t occupied = 0, open = 0, uneven = 0;
+      float *share = b.term[C] + to, *normalizer = b.term[C + 1] + to;
+      uint32_t occupied = 0, partial = 0, varying = 0;
       for (int x0 = 0; x0 < width; x0 += MARKED) {
         vec some = {}, more = {}, other = {};
         for (int x = x0; x < x0 + MARKED; x += LANES) {
@@ -414,19 +422,19 @@ class Composite {
           store(share + x, its_share);
           some = most(some, its_share);
           if (!over_) continue;
-          const vec its_room = (n >= at ? w : ramp) + load<vec>(b.rest + to + x), lacking = its_room - all(1.0f);
-          store(room + x, its_room);
-          more = most(more, its_room - its_share);
-          other = most(other, lacking * lacking - all(EVEN));
+          const vec its_normalizer = (n >= at ? w : ramp) + load<vec>(b.farther + to + x), from_one = its_normalizer - all(1.0f);
+          store(normalizer + x, its_normalizer);
+          more = most(more, its_normalizer - its_share);
+          other = most(other, from_one * from_one - all(EVEN_SQUARED));
         }
         const uint32_t bit = mark(x0);
         occupied |= any_positive(some) ? bit : 0;
-        open |= any_positive(more) ? bit : 0;
-        uneven |= any_positive(other) ? bit : 0;
+        partial |= any_positive(more) ? bit : 0;
+        varying |= any_positive(other) ? bit : 0;
       }
       b.occupied[y] = occupied;
-      b.open[y] = open;
-      b.uneven[y] = uneven;
+      b.partial[y] = partial;
+      b.varying[y] = varying;
       for (int c = 0; c < C; c++) {
         const float *light = d.row(3 + c, top + y) + left, *far = d.row(3 + C + c, top + y) + left;
         float *term = b.term[c] + to;
@@ -452,7 +460,8 @@ class Composite {
     }
   }
 
-  // Adds the pieces behind a node to what the layer there spreads and to the rest, or those behind the node before it.
+  // Adds the pieces between a node and the next to the terms of the layer at that node (BEHIND), or of the layer at the
+  // next node.
   template <int CHANNELS, bool BEHIND>
   void add_pieces(int node, Scratch &b) const {
     const int C = CHANNELS ? CHANNELS : C_;
@@ -464,41 +473,41 @@ class Composite {
       auto part = [&](int v) { return BEHIND ? one[v] - two[v] : two[v]; };
       const uint32_t bit = mark(piece.column);
       b.occupied[piece.row] |= bit;
-      b.open[piece.row] |= bit;
-      b.uneven[piece.row] |= bit;
-      if (!piece.room_only) {
+      b.partial[piece.row] |= bit;
+      b.varying[piece.row] |= bit;
+      if (!piece.normalizer_only) {
         b.term[C][at] += part(0);
         for (int c = 0; c < C; c++) b.term[c][at] += part(1 + c);
       }
       if (!over_) continue;
       b.term[C + 1][at] += BEHIND ? one[0] : two[0];
-      if (BEHIND) b.rest[at] += one[0];
+      if (BEHIND) b.farther[at] += one[0];
     }
   }
 
-  // The same of surfaces that cover each other: means of what the layer spreads at each pixel.
+  // The same for surfaces that cover each other: computes the terms of each row of pixels and averages over s x s.
   void block_means(int k, int s, int top, int left, int height, int width, size_t shift, Scratch &b) {
     const float each = 1.0f / (s * s);
     const int n = width * s;
     std::vector<float> memory((size_t)(s_.count * (C_ + 2) + C_ + 2 + s_.count + 2) * (n + LANES));
     float *m = memory.data();
     auto take = [&] { return (m += n + LANES) - (n + LANES); };  // vectors may read beyond the end
-    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 2), mine(s_.count + 2);
-    for (auto *v : {&light, &coc, &weight, &term, &mine})
+    std::vector<float *> light(s_.count * C_), coc(s_.count), weight(s_.count), term(C_ + 2), surface_share(s_.count + 2);
+    for (auto *v : {&light, &coc, &weight, &term, &surface_share})
       for (float *&row : *v) row = take();
     for (int by = 0; by < height; by++) {
       const size_t to = shift + (size_t)by * pitch_;
       for (int c = 0; c < C_ + 2; c++) memset(b.term[c] + to, 0, width * sizeof(float));
       for (int y = 0; y < s; y++) {
         read_row((top + by) * s + y, left * s, n, false, light.data(), coc.data(), weight.data(), b);
-        row_terms(layers_[k], n, light.data(), coc.data(), weight.data(), mine.data(), term.data());
+        row_terms(layers_[k], n, light.data(), coc.data(), weight.data(), surface_share.data(), term.data());
         for (int x = 0; x < n; x++)
           for (int c = 0; c < C_ + 2; c++) b.term[c][to + x / s] += term[c][x] * each;
       }
     }
   }
 
-  // A row of all surfaces, continued beyond the frame: light [surfaces, channels], place on the blur axis and weight.
+  // Reads a row of all surfaces, extended beyond the frame: light [surfaces, channels], place on the blur axis, weight.
   void read_row(int y, int x0, int n, bool single, float *const *light, float *const *coc, float *const *weight, Scratch &b) {
     const int at_y = std::clamp(y, 0, H_ - 1), first = std::clamp(x0, 0, W_ - 1), last = std::clamp(x0 + n - 1, 0, W_ - 1);
     const int before = std::max(0, std::min(n, -x0)), after = std::max(0, std::min(n, x0 + n - W_));
@@ -506,7 +515,7 @@ class Composite {
       const float *from_coc, *from_weight;
       for (int x = first; x <= last;) {
         int end = last + 1;
-        if (!s_.whole()) {  // as far as the image says all, or block by block
+        if (!s_.full_planes()) {  // a run of blocks stored in the image alone, or a single block
           const int blocks = at_y / BLOCK * s_.block_columns;
           const bool own = s_.has_block(blocks + x / BLOCK);
           end = (x / BLOCK + 1) * BLOCK;
@@ -514,7 +523,7 @@ class Composite {
           end = std::min(end, last + 1);
         }
         const int count = end - x;
-        // a window beside the frame sees its nearest pixel
+        // a window wholly beside the frame reads the nearest pixel
         const int to = x0 > W_ - 1 ? 0 : x0 + n <= 0 ? n - 1 : std::max(x - x0, 0);
         const bool there = s_.row(i, at_y, x, b.pointers.data(), from_coc, from_weight);
         auto copy = [&](float *row, const float *from) {
@@ -533,66 +542,68 @@ class Composite {
           copy(weight[i], from_weight);
         x = end;
       }
-      auto go_on = [&](float *row) {
+      auto extend = [&](float *row) {
         std::fill(row, row + before, row[std::min(before, n - 1)]);
         std::fill(row + n - after, row + n, row[std::max(n - after, 1) - 1]);
       };
       for (int c = 0; c < C_; c++) {
         float *row = light[i * C_ + c];
-        go_on(row);
+        extend(row);
         for (int x = 0; x < before; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
         for (int x = n - after; x < n; x++) row[x] = border_.light(i, c, y, x0 + x, row[x]);
         if (y != at_y && before + after < n) border_.continue_row(i, c, y, x0 + before, n - before - after, row + before);
       }
-      go_on(coc[i]);
-      go_on(weight[i]);
+      extend(coc[i]);
+      extend(weight[i]);
       for (int x = 0; x < n; x += LANES) store(coc[i] + x, index_.place(load<vec>(coc[i] + x)));
     }
   }
 
-  // What a layer spreads of a row of surfaces that cover each other: light, share, and the share at or behind it, its room.
+  // Terms of a layer in a row of n pixels of surfaces that cover each other, near to far. h: a surface's share at or
+  // behind the layer; g: its share at the layer. Each surface in turn takes its part of what nearer surfaces at the
+  // layer left. The normalizer is the share that surfaces in front of the layer leave visible, where any surface behind
+  // them is known.
   void row_terms(const Layer &l, int n, const float *const *light, const float *const *place, const float *const *weight,
-                 float *const *mine, float *const *term) const {
-    float *share = term[C_], *room = term[C_ + 1];
-    // a pixel is there for the layer as far as what is at or behind it is known, but for what that has in front
-    float *left = mine[s_.count], *unknown = mine[s_.count + 1];
-    for (int i = 0; i < n; i++) room[i] = left[i] = unknown[i] = 1.0f;
+                 float *const *surface_share, float *const *term) const {
+    float *share = term[C_], *normalizer = term[C_ + 1];
+    float *left = surface_share[s_.count], *unknown = surface_share[s_.count + 1];
+    for (int i = 0; i < n; i++) normalizer[i] = left[i] = unknown[i] = 1.0f;
     for (int j = 0; j < s_.count; j++) {
       const float *p = place[j], *w = weight[j];
-      float *m = mine[j];
+      float *m = surface_share[j];
       for (int i = 0; i < n; i++) {
         const float cover = w[i], h = at_or_behind(l, p[i], over_), g = h - behind(l, p[i], over_);
-        const float here = cover * eased(std::min(h / HAIR, 1.0f)), there = 1.0f - here * (1.0f - h);
+        const float here = cover * eased(std::min(h / HIDING_SHARE, 1.0f)), there = 1.0f - here * (1.0f - h);
         const float stops = cover * g / std::max(there, LEAST);
         m[i] = left[i] * stops;
         left[i] *= 1.0f - stops;
-        room[i] *= there;
+        normalizer[i] *= there;
         unknown[i] *= 1.0f - here;
       }
     }
     for (int i = 0; i < n; i++) share[i] = 0;
     for (int j = 0; j < s_.count; j++)
-      for (int i = 0; i < n; i++) share[i] += mine[j][i] *= room[i];
-    for (int i = 0; i < n; i++) room[i] *= 1.0f - unknown[i];
+      for (int i = 0; i < n; i++) share[i] += surface_share[j][i] *= normalizer[i];
+    for (int i = 0; i < n; i++) normalizer[i] *= 1.0f - unknown[i];
     for (int c = 0; c < C_; c++)
       for (int i = 0; i < n; i += LANES) {
-        vec sum = load<vec>(light[c] + i) * load<vec>(mine[0] + i);
-        for (int j = 1; j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + i) * load<vec>(mine[j] + i);
+        vec sum = load<vec>(light[c] + i) * load<vec>(surface_share[0] + i);
+        for (int j = 1; j < s_.count; j++) sum += load<vec>(light[j * C_ + c] + i) * load<vec>(surface_share[j] + i);
         store(term[c] + i, sum);
       }
   }
 
-  // Where a layer's terms have something: of the rows of a window from `top` on, columns from `left` on.
+  // Marks the columns in which a layer's terms are used, in rows from `top` and columns from `left` of a window.
   void find_occupied(Scratch &b, int top, int rows, int left, int columns) const {
     for (int y = top; y < top + rows; y++) {
-      const float *share = b.term[C_] + (size_t)y * pitch_, *room = b.term[C_ + 1] + (size_t)y * pitch_;
+      const float *share = b.term[C_] + (size_t)y * pitch_, *normalizer = b.term[C_ + 1] + (size_t)y * pitch_;
       Occupied row;
-      for (int x = left; x < left + columns; x++) row.add(x, share[x], room[x], over_);
+      for (int x = left; x < left + columns; x++) row.add(x, share[x], normalizer[x], over_);
       row.put(b, y);
     }
   }
 
-  // The parts of a window that lie in blocks of pixels. What touches the frame's border is copied, and continued beyond.
+  // Splits a window into blocks. Blocks that touch the frame's border are copied and extended beyond it.
   void find_blocks(int top, int rows, int left, int columns, Scratch &b) {
     b.blocks.clear();
     const size_t plane = (size_t)window_ * pitch_, area = s_.area();
@@ -612,7 +623,7 @@ class Composite {
       w.rows = std::min(y0 + BLOCK - top, rows) - w.top;
       w.column = x0 - left;
       w.clear = false;
-      w.room = -1;
+      w.normalizer = WindowBlock::STALE;
       const int first_row = top + w.top;
       for (int j = 0; j < w.count && inside; j++) {
         WindowBlock::Surface &of = w.surfaces[j];
@@ -624,7 +635,7 @@ class Composite {
         of.light_pitch = in_block ? BLOCK : W_;
         of.weight_pitch = BLOCK;
         if (single) of.weight = nullptr;
-        if (!over_ && !has_fine(layers)) continue;  // nobody asks for its places
+        if (!over_ && !has_fine(layers)) continue;  // no layer needs the places
         for (int y = w.top; y < w.top + w.rows; y++, from += j ? BLOCK : W_)
           for (int x = 0; x < BLOCK; x += LANES) store(b.coc[j] + (size_t)y * pitch_ + w.column + x, index_.place(load<vec>(from + x)));
       }
@@ -644,19 +655,19 @@ class Composite {
     }
   }
 
-  // Whether layers of full resolution are among some.
+  // Whether any layer of a set has full resolution.
   bool has_fine(const uint64_t *layers) const {
     for (int i = 0; i < index_.words; i++)
       if (layers[i] & fine_[i]) return true;
     return false;
   }
 
-  // What layer k spreads of a window, rows from `first` on and columns from `from` on. Nothing is written again that
-  // stands there from the layer before.
+  // The terms of layer k in rows from `first` and columns from `from` of a window. Terms still valid from the previous
+  // layer are not written again.
   void window_terms(int k, int first, int rows, int from, int columns, Scratch &b) {
     std::fill(&b.occupied[first], &b.occupied[first] + rows, 0u);
-    std::fill(&b.open[first], &b.open[first] + rows, 0u);
-    std::fill(&b.uneven[first], &b.uneven[first] + rows, 0u);
+    std::fill(&b.partial[first], &b.partial[first] + rows, 0u);
+    std::fill(&b.varying[first], &b.varying[first] + rows, 0u);
     for (WindowBlock &w : b.blocks) {
       bool before = false, behind = false;
       for (int i = 0; i < index_.words; i++) {
@@ -668,7 +679,7 @@ class Composite {
       if (y0 >= y1 || x0 >= x1) continue;
       if (has(w.layers, k)) {
         w.clear = false;
-        w.room = -1;
+        w.normalizer = WindowBlock::STALE;
         if (C_ == 3)
           w.count == 1 ? block_terms<3, 1>(layers_[k], w, y0, y1, x0, x1, b) : block_terms<3, 2>(layers_[k], w, y0, y1, x0, x1, b);
         else
@@ -682,16 +693,17 @@ class Composite {
       if (!over_) continue;
       const uint32_t bits = marks(w.column, w.column + BLOCK - 1);
       if ((before && behind) || (behind && (w.count > 1 || w.surfaces[0].weight))) {
-        if (w.room != WindowBlock::KEPT) block_room(layers_[k], w, b);
-        w.room = WindowBlock::KEPT;
+        if (w.normalizer != WindowBlock::KEPT) block_normalizer(layers_[k], w, b);
+        w.normalizer = WindowBlock::KEPT;
         for (int y = y0; y < y1; y++) {
-          b.open[y] |= w.open[y - w.top];
-          b.uneven[y] |= w.uneven[y - w.top];
+          b.partial[y] |= w.partial[y - w.top];
+          b.varying[y] |= w.varying[y - w.top];
         }
       } else {
-        if (w.room != (int)behind) fill(b.term[C_ + 1], w, behind ? 1.0f : 0.0f);
-        w.room = behind;
-        for (int y = y0; y < y1; y++) (behind ? b.open : b.uneven)[y] |= bits;
+        const WindowBlock::Normalizer constant = behind ? WindowBlock::ONE : WindowBlock::ZERO;
+        if (w.normalizer != constant) fill(b.term[C_ + 1], w, behind ? 1.0f : 0.0f);
+        w.normalizer = constant;
+        for (int y = y0; y < y1; y++) (behind ? b.partial : b.varying)[y] |= bits;
       }
     }
   }
@@ -703,77 +715,77 @@ class Composite {
     }
   }
 
-  // Columns of a block from x0 up to x1, rows from y0 up to y1 of its window.
+  // The terms of layer l in columns x0 to x1 of a block and rows y0 to y1 of the window.
   template <int CHANNELS, int COUNT>
   void block_terms(const Layer &l, const WindowBlock &w, int y0, int y1, int x0, int x1, Scratch &b) {
     const int C = CHANNELS ? CHANNELS : C_;
     for (int y = y0; y < y1; y++) {
       const size_t row = y - w.top, at = (size_t)y * pitch_ + w.column;
       for (int x = x0; x < x1; x += LANES) {
-        vec mine[COUNT], share = {}, room = {}, p[COUNT], h[COUNT], weight[COUNT];
+        vec surface_share[COUNT], share = {}, normalizer = {}, p[COUNT], h[COUNT], weight[COUNT];
         for (int j = 0; j < COUNT; j++) {
           const WindowBlock::Surface &of = w.surfaces[j];
           p[j] = load<vec>(b.coc[j] + at + x);
           h[j] = at_or_behind(l, p[j], over_);
           weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
         }
-        if (COUNT == 2) add_going_on(p, h, weight);
+        if (COUNT == 2) add_continuation(p, h, weight);
         for (int j = 0; j < COUNT; j++) {
-          mine[j] = (h[j] - behind(l, p[j], over_)) * weight[j];
-          share += mine[j];
-          room += h[j] * weight[j];
+          surface_share[j] = (h[j] - behind(l, p[j], over_)) * weight[j];
+          share += surface_share[j];
+          normalizer += h[j] * weight[j];
         }
         const bool some = any_positive(share);
         bool has_light[COUNT];
-        for (int j = 0; j < COUNT; j++) has_light[j] = COUNT == 1 ? some : any_positive(mine[j]);
+        for (int j = 0; j < COUNT; j++) has_light[j] = COUNT == 1 ? some : any_positive(surface_share[j]);
         const uint32_t bit = mark(w.column + x);
         store(b.term[C] + at + x, share);
         for (int c = 0; c < C; c++) {
           vec sum = {};
           for (int j = 0; j < COUNT; j++)
-            if (has_light[j]) sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * mine[j];
+            if (has_light[j]) sum += load<vec>(w.surfaces[j].light + c * w.surfaces[j].channel + row * w.surfaces[j].light_pitch + x) * surface_share[j];
           store(b.term[c] + at + x, sum);
         }
         b.occupied[y] |= some ? bit : 0;
-        if (over_) put_room(room, share, bit, b.term[C + 1] + at + x, b.open[y], b.uneven[y]);
+        if (over_) put_normalizer(normalizer, share, bit, b.term[C + 1] + at + x, b.partial[y], b.varying[y]);
       }
     }
   }
 
-  // The same of a whole block in which the layer does not occur: its room alone.
-  void block_room(const Layer &l, WindowBlock &w, Scratch &b) {
+  // The normalizer of a whole block in which the layer does not occur.
+  void block_normalizer(const Layer &l, WindowBlock &w, Scratch &b) {
     for (int row = 0; row < w.rows; row++) {
       const size_t at = (size_t)(w.top + row) * pitch_ + w.column;
-      w.open[row] = w.uneven[row] = 0;
+      w.partial[row] = w.varying[row] = 0;
       for (int x = 0; x < BLOCK; x += LANES) {
-        vec room = {}, p[2], h[2], weight[2];
+        vec normalizer = {}, p[2], h[2], weight[2];
         for (int j = 0; j < w.count; j++) {
           const WindowBlock::Surface &of = w.surfaces[j];
           p[j] = load<vec>(b.coc[j] + at + x);
           h[j] = at_or_behind(l, p[j], over_);
           weight[j] = of.weight ? load<vec>(of.weight + row * of.weight_pitch + x) : all(1.0f);
         }
-        if (w.count == 2) add_going_on(p, h, weight);
-        for (int j = 0; j < w.count; j++) room += h[j] * weight[j];
-        put_room(room, vec{}, mark(w.column + x), b.term[C_ + 1] + at + x, w.open[row], w.uneven[row]);
+        if (w.count == 2) add_continuation(p, h, weight);
+        for (int j = 0; j < w.count; j++) normalizer += h[j] * weight[j];
+        put_normalizer(normalizer, vec{}, mark(w.column + x), b.term[C_ + 1] + at + x, w.partial[row], w.varying[row]);
       }
     }
   }
 
-  // Puts a layer's room into its term, and tells of it beside its share.
-  static void put_room(vec room, vec share, uint32_t bit, float *term, uint32_t &open, uint32_t &uneven) {
-    const vec lacking = room - all(1.0f);
-    store(term, room);
-    open |= any_positive(room - share) ? bit : 0;
-    uneven |= any_positive(lacking * lacking - all(EVEN)) ? bit : 0;
+  // Stores a layer's normalizer and marks where it exceeds the share and where it differs from 1.
+  static void put_normalizer(vec normalizer, vec share, uint32_t bit, float *term, uint32_t &partial, uint32_t &varying) {
+    const vec from_one = normalizer - all(1.0f);
+    store(term, normalizer);
+    partial |= any_positive(normalizer - share) ? bit : 0;
+    varying |= any_positive(from_one * from_one - all(EVEN_SQUARED)) ? bit : 0;
   }
 
-  // To the weights of two surfaces, given their places and what they have at or behind a layer.
-  static void add_going_on(const vec *place, const vec *h, vec *weight) {
+  // Adds the continuation of the farther surface behind the nearer one to the weights of two surfaces.
+  static void add_continuation(const vec *place, const vec *h, vec *weight) {
     const auto other_is_nearer = place[1] < place[0];
-    const vec going = going_on(other_is_nearer ? weight[0] : weight[1]);
-    if (!any_positive(going)) return;
-    const vec more = where_it_shows(going, other_is_nearer ? h[1] : h[0]);
+    const vec extra = continuation(other_is_nearer ? weight[0] : weight[1]);
+    if (!any_positive(extra)) return;
+    const vec more = visible_continuation(extra, other_is_nearer ? h[1] : h[0]);
     weight[0] += other_is_nearer ? more : vec{};
     weight[1] += other_is_nearer ? vec{} : more;
   }
@@ -783,39 +795,38 @@ class Composite {
     return bit <= 0 ? 0 : bit >= 64 ? ~0ull : (1ull << bit) - 1;
   }
 
-  // A layer's kernels at a strip, whose row and column are counted in its pixels from the frame's corner: those of its block,
-  // kept for the next strip of it.
+  // A layer's kernels at a position in pixels of the layer. All strips of one block share them, so they are cached.
   const Kernel *kernels_at(Scratch &b, const Layer &l, int row, int column) const {
     if (!l.shares) return l.kernels.data();
     const torchdof_scene &scene = job_.scene;
-    const int before = l.scale > 1;  // a canvas of coarser resolution begins one pixel before the frame
-    const int block_row = (row + before) / Turned::ROWS, block_column = (column + before) / Turned::COLUMNS;
-    Cut &cut = b.cuts[block_column % (int)b.cuts.size()];
-    if (cut.layer == &l && cut.row == block_row && cut.column == block_column) return cut.kernels.data();
-    cut.layer = &l;
-    cut.row = block_row;
-    cut.column = block_column;
-    cut.kernels.resize(E_);
+    const int before = l.scale > 1;  // the canvas of a coarser resolution begins one pixel outside the frame
+    const int block_row = (row + before) / FieldMask::ROWS, block_column = (column + before) / FieldMask::COLUMNS;
+    MaskedKernels &masked = b.masked_kernels[block_column % (int)b.masked_kernels.size()];
+    if (masked.layer == &l && masked.row == block_row && masked.column == block_column) return masked.kernels.data();
+    masked.layer = &l;
+    masked.row = block_row;
+    masked.column = block_column;
+    masked.kernels.resize(E_);
     const float per = per_half_diagonal(scene);
-    const float y = (((block_row + 0.5f) * Turned::ROWS - before) * l.scale - 0.5f * H_) * per;
-    const float x = (((block_column + 0.5f) * Turned::COLUMNS - before) * l.scale - 0.5f * W_) * per;
-    for (int e = 0; e < E_; e++) cut_kernel(l, e, Turned(scene, *l.shares, nullptr, 0.0f, e, y, x), cut.kernels[e]);
-    return cut.kernels.data();
+    const float y = (((block_row + 0.5f) * FieldMask::ROWS - before) * l.scale - 0.5f * H_) * per;
+    const float x = (((block_column + 0.5f) * FieldMask::COLUMNS - before) * l.scale - 0.5f * W_) * per;
+    for (int e = 0; e < E_; e++) mask_kernel(l, e, FieldMask(scene, *l.shares, nullptr, 0.0f, e, y, x), masked.kernels[e]);
+    return masked.kernels.data();
   }
 
-  // Spreads the terms of a layer, which begin at a row and a column of the window, and lays them on the tile's canvas,
-  // whose corner lies so many of the layer's pixels from the frame's.
-  void lay(Scratch &b, const Layer &l, int rows, int columns, int first, int from, int top, int left) {
+  // Blurs the terms of a layer and composites them onto the tile's canvas. first, from: where the terms begin in the
+  // window. top, left: position of the canvas in pixels of the layer.
+  void composite_layer(Scratch &b, const Layer &l, int rows, int columns, int first, int from, int top, int left) {
     for (int y = rows; y < ceil_div(rows, STRIP_ROWS) * STRIP_ROWS; y++) {
       const int row = first + y + 2 * l.half;
-      b.occupied[row] = b.open[row] = b.uneven[row] = 0;
+      b.occupied[row] = b.partial[row] = b.varying[row] = 0;
     }
     for (int y = 0; y < rows; y += STRIP_ROWS) {
-      uint32_t occupied = 0, open = 0, uneven = 0;  // what reaches these rows
+      uint32_t occupied = 0, partial = 0, varying = 0;  // marks of all rows within the kernel's reach
       for (int i = first + y; i < first + y + STRIP_ROWS + 2 * l.half; i++) {
         occupied |= b.occupied[i];
-        open |= b.open[i];
-        uneven |= b.uneven[i];
+        partial |= b.partial[i];
+        varying |= b.varying[i];
       }
       if (!occupied) continue;
       for (int x = 0; x < columns; x += STRIP_COLUMNS) {
@@ -824,14 +835,14 @@ class Composite {
         const size_t at = (size_t)(first + y) * pitch_ + from + x;
         const Kernel *kernels = kernels_at(b, l, top + y, left + x);
         if (over_)
-          lay_strip(b, kernels, at, first + y, within, open & within, uneven & within, y * TILE + x);
+          composite_strip(b, kernels, at, first + y, within, partial & within, varying & within, y * TILE + x);
         else
           add_strip(b, kernels, at, first + y, within, y * TILE + x);
       }
     }
   }
 
-  // One term of a layer, spread to a strip of the tile. Kernels of half 0 have one tap.
+  // Blurs one term of a layer into a strip. Kernels of half 0 have one tap.
   void spread(const Scratch &b, int term, size_t from, const uint32_t *rows, uint32_t within, const Kernel &kernel, float *to) const {
     convolve_strip(b.term[term] + from, pitch_, rows, within, kernel, to);
   }
@@ -856,26 +867,26 @@ class Composite {
     }
   }
 
-  void lay_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, bool open, bool uneven, int at) {
-    float share[STRIP], room[STRIP], gain[STRIP], left[STRIP], light[STRIP];
+  void composite_strip(Scratch &b, const Kernel *kernels, size_t from, int y, uint32_t within, bool partial, bool varying, int at) {
+    float share[STRIP], normalizer[STRIP], gain[STRIP], left[STRIP], light[STRIP];
     for (int e = 0; e < E_; e++) {
       const Kernel &kernel = kernels[e];
-      if (uneven)
-        spread(b, C_ + 1, from, b.every.data(), ~0u, kernel, room);
+      if (varying)
+        spread(b, C_ + 1, from, b.every.data(), ~0u, kernel, normalizer);
       else
-        std::fill(room, room + STRIP, kernel.sum);
-      if (open)
+        std::fill(normalizer, normalizer + STRIP, kernel.sum);
+      if (partial)
         spread(b, C_, from, &b.occupied[y], within, kernel, share);
       else
-        memcpy(share, room, sizeof(room));
-      // colour = light / room, coverage = share / room
+        memcpy(share, normalizer, sizeof(normalizer));
+      // colour = light / normalizer, coverage = share / normalizer
       float *const canvas = b.canvas[C_ + e] + at;
       for (int i = 0; i < STRIP; i += LANES) {
-        const vec all_room = load<vec>(room + i), its_share = load<vec>(share + i), lacking = most(all(KNOWN) - all_room, vec{});
-        const vec known = all_room + lacking * lacking * (0.5f / KNOWN), per_room = all(1.0f) / known, cover = its_share * per_room;
-        // a whole layer leaves nothing of what is behind it, however bright that is
+        const vec all_normalizer = load<vec>(normalizer + i), its_share = load<vec>(share + i), missing = most(all(KNOWN) - all_normalizer, vec{});
+        const vec known = all_normalizer + missing * missing * (0.5f / KNOWN), per_normalizer = all(1.0f) / known, cover = its_share * per_normalizer;
+        // a layer that covers a pixel fully removes all light behind it, however bright
         const vec its_left = its_share < known ? most(all(1.0f) - cover, vec{}) : vec{};
-        store(gain + i, per_room);
+        store(gain + i, per_normalizer);
         store(left + i, its_left);
         float *to = canvas + i / STRIP_COLUMNS * TILE + i % STRIP_COLUMNS;
         store(to, cover + its_left * load<vec>(to));
@@ -890,7 +901,7 @@ class Composite {
     }
   }
 
-  // A coarser canvas, interpolated, over the tile's canvas.
+  // Composites a coarser canvas, interpolated, onto the tile's canvas.
   void join_finer(const Run &run, int y0, int x0, Scratch &b) {
     const int s = run.scale;
     const int r1 = std::min((y0 + TILE) / s + 1, run.rows - 1) / PART, c1 = std::min((x0 + TILE) / s + 1, run.columns - 1) / PART;
@@ -900,7 +911,7 @@ class Composite {
     if (!any) return;
     const int channels = C_ + E_, count = TILE / s + 1, first = x0 / s, pitch = TILE + 32;
     std::vector<float> memory((size_t)2 * channels * pitch);
-    float *upper = memory.data(), *lower = upper + channels * pitch;  // rows of the canvas, as wide as the tile's
+    float *upper = memory.data(), *lower = upper + channels * pitch;  // two rows, widened to the tile's resolution
     bool upper_covers = false, lower_covers = false;
     float ramp[16];
     for (int i = 0; i < 16; i++) ramp[i] = (i % s + 0.5f) / s;
@@ -943,13 +954,13 @@ class Composite {
         known = row;
       }
       if (!upper_covers && !lower_covers) continue;
-      // between two samples the first value lies half a sample behind
+      // widened row: the first value lies half a coarse pixel before the tile
       auto value_at = [&](int c, int x) {
         const vec a = load<vec>(upper + (size_t)c * pitch + s / 2 + x), b = load<vec>(lower + (size_t)c * pitch + s / 2 + x);
         return a + down * (b - a);
       };
       for (int c = 0; c < channels; c++) {
-        // coverage comes last, for what is left is told by its own
+        // light, then coverage; each keeps 1 - (coverage of this run) of the tile's value
         const int e = c < C_ ? E_ == 1 ? 0 : c : c - C_;
         float *canvas = b.canvas[c] + y * TILE;
         for (int x = 0; x < TILE; x += LANES) {
@@ -961,6 +972,11 @@ class Composite {
     }
   }
 
+  // Renders one tile of the picture.
+  //
+  // 1. List the full-resolution layers whose blur reaches the tile, and read the window that they need.
+  // 2. From far to near, composite these layers and the coarser canvases onto the tile's canvas.
+  // 3. Finish: light behind all layers, highlights.
   void tile(int tile_row, int tile_column, Scratch &b) {
     const int y0 = tile_row * TILE, x0 = tile_column * TILE, rows = std::min(TILE, H_ - y0), columns = std::min(TILE, W_ - x0);
     for (float *canvas : b.canvas) memset(canvas, 0, TILE_PIXELS * sizeof(float));
@@ -993,13 +1009,13 @@ class Composite {
           stack_terms(l, first, reach_rows, from, reach_columns, b);
         else
           window_terms(reaching[next], first, reach_rows, from, reach_columns, b);
-        lay(b, l, rows, columns, first, from, y0, x0);
+        composite_layer(b, l, rows, columns, first, from, y0, x0);
       }
     }
     finish(tile_row * ceil_div(W_, TILE) + tile_column, y0, x0, rows, columns, b);
   }
 
-  // All of a window, for surfaces that cover each other.
+  // Reads all surfaces of a window; for surfaces that cover each other.
   void read_window(int top, int rows, int left, int columns, Scratch &b) {
     std::vector<float *> light(b.light), coc(b.coc), weight(b.weight);
     for (int y = 0; y < rows; y++) {
@@ -1020,7 +1036,7 @@ class Composite {
         weight[i] = b.weight[i] + at;
       }
       for (int c = 0; c < C_ + 2; c++) term[c] = b.term[c] + at;
-      row_terms(l, columns, light.data(), coc.data(), weight.data(), b.mine.data(), term.data());
+      row_terms(l, columns, light.data(), coc.data(), weight.data(), b.surface_share.data(), term.data());
     }
     find_occupied(b, first, rows, from, columns);
   }
@@ -1029,7 +1045,7 @@ class Composite {
     return around(y0 / CELL - reach, (y0 + TILE) / CELL - 1 + reach, x0 / CELL - reach, (x0 + TILE) / CELL - 1 + reach, b.layers.data());
   }
 
-  // The tile's canvas over what lies behind all layers, with the light of rays, to the picture.
+  // Composites the tile onto the light behind all layers, adds the light of highlights and writes the picture.
   void finish(int which, int y0, int x0, int rows, int columns, Scratch &b) {
     const int C = C_, E = E_;
     float *const traced = b.traced;  // [channels, TILE, TILE]
@@ -1041,7 +1057,7 @@ class Composite {
     const bool normalize = over_ ? job_.behind.empty() : (bool)job_.scene.normalize;
     if (has_rays && !over_)
       for (int i = 0; i < C * TILE_PIXELS; i++) b.canvas[0][i] += traced[i];
-    if (over_ && !normalize) lay_over_behind(y0, x0, rows, columns, b);
+    if (over_ && !normalize) composite_over_behind(y0, x0, rows, columns, b);
     for (int c = 0; c < C; c++) {
       const float *cover = b.canvas[C + (E > 1 ? c : 0)], *canvas = b.canvas[c];
       const float *added = has_rays && over_ ? traced + (size_t)c * TILE_PIXELS : nullptr;
@@ -1065,13 +1081,14 @@ class Composite {
     }
   }
 
-  void lay_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
+  void composite_over_behind(int y0, int x0, int rows, int columns, Scratch &b) {
     vec least_cover = all(1.0f);
     for (int e = 0; e < E_; e++)
       for (int i = 0; i < TILE_PIXELS; i += LANES) least_cover = least(least_cover, load<vec>(b.canvas[C_ + e] + i));
     if (!any_of(least_cover < all(1.0f - COVERED))) return;
     const int h = job_.behind_height, w = job_.behind_width;
-    // where the tile's columns lie: the samples beside each, from the first of its vector on, and how far between them
+    // for each vector of columns: index of its first sample, samples left and right of each pixel, fraction between
+    // them
     int first[TILE / LANES];
     ivec left[TILE / LANES], right[TILE / LANES];
     vec across[TILE / LANES];
@@ -1084,7 +1101,8 @@ class Composite {
       across[v][lane] = at_x - before;
     }
     for (int y = 0; y < rows; y++) {
-      const float at_y = (y0 + y - 0.5f * (H_ - 1)) / BEHIND_STEP + 0.5f * (h - 1);  // both have one centre
+      // image and samples have the same centre
+      const float at_y = (y0 + y - 0.5f * (H_ - 1)) / BEHIND_STEP + 0.5f * (h - 1);
       const int top = std::min((int)at_y, h - 1), bottom = std::min(top + 1, h - 1);
       const float down = at_y - top;
       for (int c = 0; c < C_; c++) {
@@ -1093,22 +1111,22 @@ class Composite {
         const float *upper = &job_.behind[((size_t)c * h + top) * w], *lower = &job_.behind[((size_t)c * h + bottom) * w];
         for (int v = 0; v * LANES < columns; v++) {
           const vec uncovered = all(1.0f) - load<vec>(cover + v * LANES);
-          const auto open = uncovered > all(COVERED);
-          if (!any_of(open)) continue;
+          const auto is_uncovered = uncovered > all(COVERED);
+          if (!any_of(is_uncovered)) continue;
           auto between = [&](const float *row) {
             const vec before = pick(row + first[v], left[v]);
             return before + across[v] * (pick(row + first[v], right[v]) - before);
           };
           const vec above = between(upper), light = above + down * (between(lower) - above), old = load<vec>(canvas + v * LANES);
-          store(canvas + v * LANES, open ? old + uncovered * light : old);
+          store(canvas + v * LANES, is_uncovered ? old + uncovered * light : old);
         }
       }
     }
   }
 
-  // For each tile the rays that land in it, in their order.
+  // Lists the rays that reach each tile, in order.
   void sort_rays() {
-    if (over_) visibility_ = look_at(job_, ray_kernels_);
+    if (over_) visibility_ = find_visibility(job_, ray_kernels_);
     gains_ = gains_of(job_, ray_kernels_);
     const int tile_rows = ceil_div(H_, TILE), tile_columns = ceil_div(W_, TILE);
     ray_start_.assign(tile_rows * tile_columns + 1, 0);
@@ -1137,11 +1155,11 @@ class Composite {
   int H_, W_, C_, E_, N_;
   bool over_;
   std::vector<Run> runs_;
-  std::vector<uint64_t> fine_;  // layers of full resolution, a bit each
+  std::vector<uint64_t> fine_;  // full-resolution layers, a bit each
   int window_, pitch_;
   std::vector<std::unique_ptr<Scratch>> scratches_;
   LayerIndex index_;
-  std::vector<std::unique_ptr<Downsampled>> downsampled_;  // of each scale of the runs
+  std::vector<std::unique_ptr<Downsampled>> downsampled_;  // one for each coarse scale
   Border border_;
   Visibility visibility_;
   std::vector<float> gains_;

@@ -7,10 +7,10 @@ namespace {
 
 constexpr int ROWS = STRIP_ROWS;
 constexpr int VECTORS = STRIP_COLUMNS / LANES;
-constexpr int SHORT = 10;  // half width up to which one sum in float32 is exact enough
+constexpr int SHORT = 10;  // half width up to which a single float32 sum is accurate enough
 
-// Taps of a kernel for input row i and ROWS output rows: taps[(i + ROWS - 1) + d * stride - o] is for output row o and
-// columns d apart; rows above and below the kernel are 0. Without symmetry d counts from the left end.
+// Layout of taps: taps[(i + ROWS - 1) + d * stride - o] applies to input row i, output row o and column offset d; rows
+// above and below the kernel are 0. d starts at 0 for symmetric kernels, else at -half.
 inline int stride_of(int half) { return 2 * half + 1 + 2 * (ROWS - 1); }
 
 template <bool SYMMETRIC, bool LONG>
@@ -48,7 +48,7 @@ void rows_of(const float *in, int pitch, const uint32_t *rows, uint32_t columns,
   }
 }
 
-// Finds the columns in which input rows need taps.
+// Finds for each input row the range of columns with nonzero taps.
 void find_rows(Kernel &kernel) {
   const int half = kernel.half, side = 2 * half + 1, none = half + 1;
   std::vector<int> low(side, none), high(side, -none);
@@ -82,7 +82,7 @@ Kernel make_kernel(const float *values, int half, bool one_sided) {
   const int first = k.symmetric ? 0 : -half;
   k.taps.assign((size_t)(half - first + 1) * stride, 0.0f);
   for (int y = 0; y < side; y++)
-    for (int d = first; d <= half; d++)  // light comes from where it is scattered to, turned by half
+    for (int d = first; d <= half; d++)  // convolution: the kernel is rotated by half a turn
       k.taps[(size_t)(d - first) * stride + y + ROWS - 1] = values[(side - 1 - y) * side + half - d];
   find_rows(k);
   return k;
@@ -102,41 +102,41 @@ bool ends_dark(const torchdof_shares &shares, int distances) {
   return true;
 }
 
-void cut_kernel(const Layer &layer, int colour, const Turned &turned, Kernel &cut) {
+void mask_kernel(const Layer &layer, int colour, const FieldMask &mask, Kernel &masked) {
   const Kernel &whole = layer.kernels[colour];
   const int half = whole.half, side = 2 * half + 1, stride = stride_of(half);
-  cut.half = half;
-  cut.symmetric = false;
-  cut.sum = whole.sum;
-  cut.taps.assign(whole.taps.size(), 0.0f);
+  masked.half = half;
+  masked.symmetric = false;
+  masked.sum = whole.sum;
+  masked.taps.assign(whole.taps.size(), 0.0f);
   vec left = {};
   for (int d = -half; d <= half; d++) {
     const size_t column = (size_t)(d + half) * stride + ROWS - 1;
     const float *from = whole.taps.data() + column;
-    float *to = cut.taps.data() + column;
+    float *to = masked.taps.data() + column;
     float low = -half, high = half;
-    if (layer.spots) turned.rows_of((float)-d, low, high);
+    if (layer.spots) mask.rows_of((float)-d, low, high);
     const int start = (int)std::ceil(clamp(half - high, 0.0f, (float)side)), end = (int)std::floor(clamp(half - low, -1.0f, (float)(side - 1))) + 1;
     for (int y = start; y < end; y += LANES) {
       const int n = std::min(LANES, end - y);
       vec taps = {};
       memcpy(&taps, from + y, n * sizeof(float));
-      taps *= turned.shares((float)(half - y), (float)-d);
+      taps *= mask.shares((float)(half - y), (float)-d);
       left += taps;
       memcpy(to + y, &taps, n * sizeof(float));
     }
   }
   float light = 0;
   for (int i = 0; i < LANES; i++) light += left[i];
-  if (!(light > Turned::LEAST * whole.sum)) {
-    cut.taps = whole.taps;
-    cut.first = whole.first;
-    cut.last = whole.last;
+  if (!(light > FieldMask::LEAST * whole.sum)) {
+    masked.taps = whole.taps;
+    masked.first = whole.first;
+    masked.last = whole.last;
     return;
   }
   const float gain = whole.sum / light;
-  for (float &tap : cut.taps) tap *= gain;
-  find_rows(cut);
+  for (float &tap : masked.taps) tap *= gain;
+  find_rows(masked);
 }
 
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out) {

@@ -1,38 +1,40 @@
-// Disocclusion: what a blurred foreground hides, filled in from the farthest surfaces around. The formulas are told in
-// render/disocclusion.py.
+// Disocclusion: fills the surfaces hidden behind a blurred foreground with light and depth of the farthest surfaces
+// around, as described in render/disocclusion.py.
 #include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float BEHIND_PX = 1.0f;  // a hidden surface lies about so much farther, in coc
-constexpr float FALL = 0.35f;      // weight of a level of the pyramid against the finer one before
-constexpr int CELL_LEVEL = 3;      // of the pyramid, in whose pixels it is told which may hide something
-constexpr int FINE_LEVELS = 2;     // that each pixel looks at; the coarser ones are looked at from cells of STEP pixels
+constexpr float BEHIND_PX = 1.0f;  // difference in coc at which a surface counts as another one behind
+constexpr float FALL = 0.35f;      // weight of a level relative to the next finer one; larger takes light from farther away
+constexpr int CELL_LEVEL = 3;      // level in whose pixels it is decided where a surface may be hidden
+constexpr int FINE_LEVELS = 2;     // levels read by each pixel; coarser ones are read once for each cell of STEP pixels
 constexpr int STEP = 1 << FINE_LEVELS;
-constexpr float SURE = 0.1f;      // weight of what a level shows from which on it has a whole vote
-constexpr float CERTAIN = 0.01f;  // votes from which on a hidden sample has all of its weight, or a farther one counts alone
-constexpr float LEAST_SEEN = 1e-4f;  // weight of what lies behind up to which nothing is seen
-constexpr float MIXED = 0.05f;  // least share of a second surface that the pyramid takes
+constexpr float SURE = 0.1f;      // weight of a level's sample at which its vote is full
+// votes at which a hidden sample has its full weight, and at which a farther one replaces the nearer
+constexpr float CERTAIN = 0.01f;
+constexpr float LEAST_SEEN = 1e-4f;  // weight of a sample up to which it counts as empty
+constexpr float MIXED = 0.05f;  // smallest share of a second surface used in the pyramid
 
-// Farthest surfaces, at every step-th pixel: light of each channel, coc, weight, and what fills the stride.
+// One level of a pyramid of the farthest surfaces. A sample has `stride` values: light of each channel, coc, weight,
+// padding.
 struct Level {
   int height, width, step, stride, channels;
-  float vote;  // weight against other levels; 0: it is in the weights
-  float least_px;  // blur from which on a pixel looks so far, and wholly from twice of it
+  float vote;  // weight relative to other levels; 0: weights already contain it
+  float least_px;  // blur above which a pixel reads this level; in full from twice this blur
   Buffer<float> values;
-  float centre_y, centre_x;  // of the image, in its pixels; the map has the same centre
+  float centre_y, centre_x;  // centre of the image, in its pixels; the level has the same centre
   float place_y(float y) const { return (y - centre_y) / step + 0.5f * (height - 1); }
   float place_x(float x) const { return (x - centre_x) / step + 0.5f * (width - 1); }
   float *at(int y, int x) const { return values.data() + ((size_t)y * width + x) * stride; }
   float coc(int y, int x) const { return at(y, x)[channels]; }
 };
 
-// How surely a surface that is so much farther, in coc, is another one.
+// How certainly a surface that is farther by this difference in coc is another one, 0 to 1.
 inline float is_behind(float distance_px) { return clamp01(distance_px - (BEHIND_PX - 0.5f)); }
 
-// Of four children the mean of those that are farthest.
+// Mean of the farthest of four children.
 void farthest(const float *const *child, int channels, int stride, float *out) {
   float most = child[0][channels];
   for (int i = 1; i < 4; i++) most = std::max(most, child[i][channels]);
@@ -51,8 +53,8 @@ void farthest(const float *const *child, int channels, int stride, float *out) {
 typedef float f8 __attribute__((vector_size(32)));
 constexpr int F8 = 8;
 
-// Of two vectors beside each other the values at even places and those at odd ones; lane i of them is the one at even_place(i).
-#if defined(__AVX2__)  // across the halves of a vector it would take twice as long
+// Even and odd elements of two adjacent vectors. Lane i holds element even_place(i) of them.
+#if defined(__AVX2__)  // within the halves of a vector; across them takes twice as long
 inline vec evens(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0x88); }
 inline vec odds(vec a, vec b) { return __builtin_ia32_shufps256(a, b, 0xdd); }
 constexpr int even_place(int lane) { return lane % 2 + lane / 4 * 2 + lane % 4 / 2 * 4; }
@@ -62,7 +64,7 @@ inline vec odds(vec a, vec b) { return vec{a[1], a[3], b[1], b[3]}; }
 constexpr int even_place(int lane) { return lane; }
 #endif
 
-// A place along an axis of a level: the sample before it, and how far it is from there to the next.
+// A position between two samples along an axis: index of the first, and fraction of the way to the next.
 struct Place {
   int before;
   float part;
@@ -74,7 +76,7 @@ inline Place place_in(float at, int size) {
   return {before, at - before};
 }
 
-// The four samples of a level around a place.
+// The four samples of a level around a position.
 struct Corners {
   const float *of[4];
   Corners(const Level &level, int row, int column) {
@@ -82,14 +84,14 @@ struct Corners {
     const size_t below = level.height > 1 ? (size_t)level.width * level.stride : 0, beside = level.width > 1 ? level.stride : 0;
     of[0] = first, of[1] = first + beside, of[2] = first + below, of[3] = first + below + beside;
   }
-  // Whether one of them lies behind a place of that coc.
+  // Whether one of them may lie behind coc `here`.
   bool behind(float here, int channels) const {
     return std::max(std::max(of[0][channels], of[1][channels]), std::max(of[2][channels], of[3][channels])) - here > BEHIND_PX - 0.5f;
   }
 };
 
-// Mean of the four samples of a level around a place, of those only that lie behind it; returns their weight, and writes
-// nothing where that is 0.
+// Bilinear mean of those of the four samples that lie behind coc `here`. Returns their weight; `seen` is only written
+// if it exceeds LEAST_SEEN.
 template <int VECTORS>
 float behind(const Level &level, Place row, Place column, float here, f8 *seen) {
   const int count = VECTORS ? VECTORS : level.stride / F8, C = level.channels;
@@ -107,7 +109,7 @@ float behind(const Level &level, Place row, Place column, float here, f8 *seen) 
   return total;
 }
 
-// What one level shows behind a place, and how much it counts: nothing where `any` is 0.
+// A level's sample behind a pixel: its weight (any; 0 if empty) and how much the pixel's blur uses the level (looked).
 struct Seen {
   float looked, any;
   f8 *sample;
@@ -118,8 +120,8 @@ struct Seen {
   }
 };
 
-// What levels show together: light, coc; returns the sum of their votes. With farthest, of two surfaces only the farther
-// one counts.
+// Combines the samples of several levels: light and coc; returns the sum of their votes. With `farthest`, only the
+// farther of two surfaces counts.
 template <int VECTORS>
 float mix(const Level *const *levels, const Seen *seen, int n, bool farthest, float *out) {
   const int count = VECTORS ? VECTORS : levels[0]->stride / F8, C = levels[0]->channels;
@@ -150,8 +152,12 @@ class Filling {
  public:
   Filling(Job &job) : job_(job), s_(job.surfaces), C_(job.channels), stride_((job.channels + 2 + F8 - 1) / F8 * F8) {}
 
+  // 1. Build the pyramid; each level keeps the farthest of the finer level's surfaces.
+  // 2. Find the cells near which a farther surface exists.
+  // 3. Combine the levels behind cells of STEP pixels: the light behind all surfaces.
+  // 4. Give each pixel of the cells found a second surface: the combined samples behind it.
   void run() {
-    const int levels = job_.levels, step = 2 << levels;  // half a cell to each side, and whole pairs on every level
+    const int levels = job_.levels, step = 2 << levels;  // padding of half a cell on each side; even sizes on every level
     area_height_ = ceil_div(job_.height + STEP, step) * step;
     area_width_ = ceil_div(job_.width + STEP, step) * step;
     coarsest_ = std::min(levels, CELL_LEVEL);
@@ -175,13 +181,13 @@ class Filling {
     blur_.resize(near_.size());
     found_.resize(near_.size());
     fine_.resize(near_.size());
-    tell_cells();
+    measure_cells();
     job_.parallel(ceil_div(pyramid_[0].height, BLOCK / 2), [&](int band, int) { finest(band); });
     for (int i = 1; i < levels; i++) {
       const int bands = ceil_div(pyramid_[i].height, 8);
       if (i == 1)
         job_.parallel(bands, [&](int band, int) { coarser(i, band); });
-      else  // too little to wait for each other
+      else  // too little work for threads
         for (int band = 0; band < bands; band++) coarser(i, band);
     }
     job_.parallel(cell_rows_, [&](int row, int) { find_cells(row); });
@@ -194,30 +200,30 @@ class Filling {
     level.centre_x = 0.5f * (job_.width - 1);
   }
 
-  // The first pixel that the first sample of a map covers, half of it where the image's size is odd.
+  // First pixel covered by the first sample of a level; covered by half if the image's size is odd.
   static int first_pixel(int size, int samples, int step) { return floor_half((size - 1) - step * (samples - 1) - step + 1); }
   static int floor_half(int a) { return a >= 0 ? a / 2 : -((1 - a) / 2); }
 
   // Nearest coc and largest blur of each cell.
-  void tell_cells() {
+  void measure_cells() {
     for (int row = 0; row < cell_rows_; row++)
       for (int column = 0; column < cell_columns_; column++) {
         const size_t cell = (size_t)row * cell_columns_ + column, block = (size_t)(row * cell_ / BLOCK) * s_.block_columns + column * cell_ / BLOCK;
         const float low = job_.block_low[block], high = job_.block_high[block];
-        near_[cell] = low;  // none too far: it only tells where to look
+        near_[cell] = low;  // may be too near: only used to skip cells
         blur_[cell] = std::max(std::fabs(low), std::fabs(high));
       }
   }
 
-  // First level of the pyramid: a band of its rows.
+  // A band of rows of the first level.
   void finest(int band) {
     const int H = job_.height, W = job_.width, planes = C_ + 2;
     const Level &level = pyramid_[0];
     const int top = first_pixel(H, level.height, 2), left = first_pixel(W, level.width, 2);
-    const int across = 2 * ceil_div(level.width, LANES) * LANES + BLOCK;  // rows are read in whole vectors, and blocks written
+    const int across = 2 * ceil_div(level.width, LANES) * LANES + BLOCK;  // whole vectors are read, whole blocks written
     const size_t line = (size_t)planes * across;
-    // planes of its rows, continued to both sides, from pixel `left` on: first the image's, then those of blocks, each as it
-    // lies in memory
+    // planes of the band's rows, extended to both sides and starting at pixel `left`: first copied from the image, then
+    // replaced where there are blocks
     const int first = band * BLOCK / 2, end = std::min(level.height, (band + 1) * BLOCK / 2);
     const int y0 = std::clamp(top + 2 * first, 0, H - 1), y1 = std::clamp(top + 2 * end - 1 + H % 2, 0, H - 1);
     const Buffer<float> memory((y1 + 1 - y0) * line);
@@ -249,8 +255,8 @@ class Filling {
     }
   }
 
-  // Of n pixels of a row, in planes of light, coc and weight that lie `pitch` apart: what the pyramid takes in place of the image,
-  // where there are two surfaces the farther one.
+  // Replaces n pixels of a row, in planes of light, coc and weight `pitch` values apart, by the surfaces of the blocks:
+  // the farther of two surfaces, with highlights clipped to their threshold.
   void pixels(int y, int x0, int n, bool bright, float least_limit, float *out, size_t pitch) const {
     const int C = C_, which = y / BLOCK * s_.block_columns + x0 / BLOCK, first = y % BLOCK * BLOCK;
     if (s_.has_block(which)) {
@@ -260,7 +266,7 @@ class Filling {
         const vec its = load<vec>(b.coc + first + x), mine = load<vec>(coc + x), share = load<vec>(b.weight + first + x);
         const auto mixed = (share > all(MIXED)) & (its > mine);
         store(coc + x, mixed ? its : mine);
-        store(weight + x, mixed ? share : load<vec>(b.seen + first + x));
+        store(weight + x, mixed ? share : load<vec>(b.own_weight + first + x));
         for (int c = 0; c < C; c++)
           store(out + c * pitch + x, mixed ? load<vec>(b.other + c * BLOCK_PIXELS + first + x) : load<vec>(b.own + c * BLOCK_PIXELS + first + x));
       }
@@ -274,14 +280,14 @@ class Filling {
       if (!any_of(peaks > all(least_limit))) continue;
       for (int i = x; i < std::min(x + LANES, n); i++) {
         const float peak = peaks[i - x], limit = peak > least_limit ? threshold_at(job_, y, x0 + i) : peak;
-        if (peak > limit)  // what is hidden beside a highlight is none
+        if (peak > limit)  // a hidden surface next to a highlight is not one
           for (int c = 0; c < C; c++) out[c * pitch + i] *= limit / peak;
       }
     }
   }
 
-  // Of the pixels of rows that are one in the first level, the mean of those that are farthest: of two, or, where the
-  // image's size is odd, of two halves and the one between.
+  // Means of the farthest pixels of 2 x 2, in the first level. Where the image's size is odd: of 3, the outer two with
+  // half weight.
   template <int COLUMNS>
   void farthest_of_rows(const float *const *rows, size_t across, float *out) const {
     const int C = C_, rows_count = 2 + job_.height % 2, count = rows_count * COLUMNS, width = pyramid_[0].width;
@@ -315,7 +321,7 @@ class Filling {
         total += counts[j];
       }
       const vec each = all(1.0f) / most(total, all(1e-9f));
-      for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // what fills the stride
+      for (int i = 0; i < n; i++) store(out + (i + 1) * stride_ - F8, f8{});  // padding
       for (int k = 0; k <= C; k++) {
         read(k);
         vec sum = {};
@@ -336,7 +342,7 @@ class Filling {
       }
   }
 
-  // Cells for which a level that their pixels look at shows something farther; and a fine level.
+  // Marks cells near which a level used by their pixels has a farther surface; fine_: one of the fine levels has.
   void find_cells(int row) {
     for (int column = 0; column < cell_columns_; column++) {
       const size_t cell = (size_t)row * cell_columns_ + column;
@@ -344,7 +350,7 @@ class Filling {
       for (int i = 0; i < job_.levels; i++) {
         const Level &l = pyramid_[i];
         if (blur_[cell] <= l.least_px || (found_[cell] && i >= FINE_LEVELS)) break;
-        // what its pixels look at, and the centres of samples that they share with other cells
+        // range of the samples read by the cell's pixels, including those shared with other cells
         const int y0 = (int)l.place_y(row * cell_) - 1, y1 = (int)l.place_y(row * cell_ + cell_ - 1) + 2;
         const int x0 = (int)l.place_x(column * cell_) - 1, x1 = (int)l.place_x(column * cell_ + cell_ - 1) + 2;
         float most = -NEVER;
@@ -364,7 +370,7 @@ class Filling {
     return !s_.has_block(which) || s_.block(which).weight[y % BLOCK * BLOCK + x % BLOCK] < HIDDEN_WEIGHT;
   }
 
-  // Where pixels `first`, `first + step`, ... lie in a level.
+  // Positions of pixels first, first + step, ... in a level.
   static std::vector<Place> places(float first, int step, int count, int size, float (Level::*place)(float) const, const Level &level) {
     std::vector<Place> at(count);
     for (int i = 0; i < count; i++) at[i] = place_in((level.*place)(first + (float)i * step), size);
@@ -378,8 +384,8 @@ class Filling {
     const int first_y = first_pixel(H, rows, STEP), first_x = first_pixel(W, columns, STEP);
     job_.behind_height = rows;
     job_.behind_width = columns;
-    job_.behind.resize((size_t)C * rows * columns + 8);  // eight are read from any of them on
-    Level together;  // what coarse levels show behind cells of STEP pixels
+    job_.behind.resize((size_t)C * rows * columns + 8);  // padding: eight values are read from any position
+    Level together;  // coarse levels combined, behind cells of STEP pixels
     together.height = rows;
     together.width = columns;
     together.step = STEP;
@@ -392,14 +398,14 @@ class Filling {
       together.values = Buffer<float>((size_t)rows * columns * stride_);
     }
     std::vector<const Level *> every;
-    std::vector<std::vector<Place>> ys, xs;  // of the cells in each level
+    std::vector<std::vector<Place>> ys, xs;  // positions of the cells in each level
     for (const Level &l : pyramid_) {
       every.push_back(&l);
       ys.push_back(places(0.5f * (H - 1) - 0.5f * (rows - 1) * STEP, STEP, rows, l.height, &Level::place_y, l));
       xs.push_back(places(0.5f * (W - 1) - 0.5f * (columns - 1) * STEP, STEP, columns, l.width, &Level::place_x, l));
     }
     const Level &base = pyramid_[std::min(levels, FINE_LEVELS) - 1];
-    std::vector<float> mean(C, 0.0f);  // of cells that hold light, for those that hold none
+    std::vector<float> mean(C, 0.0f);  // mean light, for cells without valid pixels
     if (s_.valid) {
       std::vector<double> sums(C + 1, 0.0);
       for (int row = 0; row < rows; row++)
@@ -445,7 +451,7 @@ class Filling {
         for (int c = 0; c < C; c++) job_.behind[(size_t)c * rows * columns + at] = shown[c];
       }
     });
-    const int fine = std::min(levels, FINE_LEVELS), looks = fine + (coarse > 0);  // what pixels look at
+    const int fine = std::min(levels, FINE_LEVELS), looks = fine + (coarse > 0);  // levels that pixels read
     const Level *look[FINE_LEVELS + 1];
     for (int i = 0; i < looks; i++) look[i] = i < fine ? &pyramid_[i] : &together;
     for (int i = 0; i < looks; i++) {
@@ -453,7 +459,7 @@ class Filling {
       xs[i] = places(0, 1, W, look[i]->width, &Level::place_x, *look[i]);
     }
     job_.parallel(s_.block_rows, [&](int by, int) {
-      Looks to{look, looks, ys.data(), xs.data()};
+      CellLevels to{look, looks, ys.data(), xs.data()};
       for (int y = by * BLOCK; y < std::min(H, (by + 1) * BLOCK); y += CELL)
         for (int x = 0; x < W; x += CELL) {
           bool found = false, finely = false;
@@ -468,20 +474,20 @@ class Filling {
     });
   }
 
-  // What the pixels of a cell look at: levels, and where the image's rows and columns lie in each.
-  struct Looks {
+  // The levels that the pixels of a cell read, and the positions of rows and columns in each.
+  struct CellLevels {
     const Level *const *levels;
     int count;
     const std::vector<Place> *ys, *xs;
     int first = 0;
-    // of each level, rows around the cell: for each of its columns the sample before it and the next one
+    // for each level and row around the cell: samples before and after each of the cell's columns
     std::vector<vec> samples;
-    std::vector<float> lines;  // the same as the level has them
+    std::vector<float> lines;  // the same in the level's order
   };
 
-  // Gives the pixels of a cell what the levels show behind them. It is what `behind` and `mix` tell, of LANES pixels at once.
+  // Fills the second surfaces of a cell: `behind` and `mix` for LANES pixels at once.
   template <int CHANNELS>
-  void fill_cell(int y0, int x0, Looks &to) {
+  void fill_cell(int y0, int x0, CellLevels &to) {
     constexpr int VECTORS = CELL / LANES, ROWS = CELL / 2 + 2;
     const int C = CHANNELS ? CHANNELS : C_, planes = C + 2, W = job_.width, which = y0 / BLOCK * s_.block_columns + x0 / BLOCK;
     const int rows = std::min(CELL, job_.height - y0), columns = std::min(CELL, W - x0);
@@ -555,7 +561,7 @@ class Filling {
         }
         wanted &= total > vec{};
         if (!any_of(wanted)) continue;
-        // together with a surface that is hardly mixed in: the more of that, the less of what is hidden
+        // blend with a second surface that matting gave a small weight: its weight reduces that of the hidden one
         const Block b = s_.make_block(which);
         const size_t at = within + v * LANES;
         const vec mixed = load<vec>(b.weight + at), hidden = least(total * (1.0f / CERTAIN), all(1.0f)) * (all(HIDDEN_WEIGHT) - mixed);
@@ -578,8 +584,8 @@ class Filling {
   const int C_, stride_;
   int area_height_, area_width_, coarsest_, cell_, cell_rows_, cell_columns_;
   std::vector<Level> pyramid_;
-  std::vector<float> near_, blur_;     // of each cell the nearest coc and the largest blur
-  std::vector<uint8_t> found_, fine_;  // of each cell whether something lies behind, and is shown by a fine level
+  std::vector<float> near_, blur_;     // of each cell
+  std::vector<uint8_t> found_, fine_;  // of each cell: a farther surface exists; a fine level has it
 };
 
 }  // namespace

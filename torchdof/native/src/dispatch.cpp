@@ -1,4 +1,4 @@
-// The C interface, and which instructions it uses.
+// The C interface, and the choice of the instruction set.
 #include <atomic>
 #include <cstring>
 #include <memory>

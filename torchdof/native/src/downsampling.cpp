@@ -1,13 +1,15 @@
-// Downsampling: means of the surfaces over blocks of pixels, once for all layers of a resolution. Pixels that lie between
-// the same two nodes are added up together, with and without how far between them each lies: layers before and behind
-// take their part of both.
+// Downsampling: means of the surfaces over blocks of s x s pixels, computed once for all layers of scale s.
+//
+// A layer's share of a pixel depends linearly on the pixel's position t between two nodes (0 at the first, 1 at the
+// second). The means of weight w and light, and of w t and light t, over the pixels between each two nodes are
+// therefore enough: the layer at the first node takes mean(w) - mean(w t), the one at the second takes mean(w t).
 #include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-// Of a block of pixels: what lies between each two nodes.
+// Sums over a block's pixels, one set of values for each interval between nodes.
 struct Gathered {
   int count = 0;
   std::vector<int> nodes;
@@ -40,7 +42,7 @@ class Downsampling {
     for (const Layer &l : job.layers) ramps_.push_back({l.at, l.per_after});
   }
 
-  // Rows of blocks of BLOCK pixels.
+  // Computes all blocks of a band of BLOCK rows of pixels.
   void band(int band) {
     const int s = to_.scale, first = band * (BLOCK / s), columns = job_.width / s;
     Pieces &pieces = to_.pieces[band - to_.first_band];
@@ -51,7 +53,7 @@ class Downsampling {
       const uint8_t *near = &to_.near[(size_t)std::clamp(band, 0, s_.block_rows - 1) * s_.block_columns];
       int column = -to_.margin;
       while (column < to_.columns + to_.margin) {
-        // as far as the next block of the image, or around the frame
+        // up to the next block of the image, or in the margin
         const int block_of = std::clamp(floor_div(column * s, BLOCK), 0, s_.block_columns - 1);
         int end = block_of + 1 == s_.block_columns ? to_.columns + to_.margin : (block_of + 1) * BLOCK / s;
         if (row >= 0 && row * s < job_.height && block_of + 2 < s_.block_columns)
@@ -76,9 +78,9 @@ class Downsampling {
   }
 
  private:
-  static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;  // nodes of blocks that hold nothing, and of what is of no account
+  static constexpr float NOWHERE = -2.0f, FARTHEST = 1e6f;  // node of empty blocks, and of blocks that no layer here uses
 
-  // Blocks of one row within a cell, or one that is larger; returns how many.
+  // Computes up to `count` blocks in one cell (or one larger block) of a row; returns how many.
   int blocks(int row, int column, int count, Pieces &pieces) {
     const int s = to_.scale, y0 = row * s, x0 = column * s;
     const size_t cell = (size_t)(y0 / CELL) * index_.columns + x0 / CELL;
@@ -100,7 +102,7 @@ class Downsampling {
     return count;
   }
 
-  // Blocks beside each other that fill a cell's width, where it shows one surface alone, between two nodes.
+  // Block means of a cell whose pixels show one surface between the same two nodes.
   template <int S>
   void cell_means(int row, int column, int k) {
     constexpr int PARTS = CELL / LANES, COUNT = CELL / S;
@@ -136,7 +138,7 @@ class Downsampling {
     }
   }
 
-  // Blocks beside each other that fill a cell's width, or one that is wider: interval by interval, a row of pixels at once.
+  // Block means of a cell, one interval at a time, whole vectors of pixels.
   template <int S>
   void cell_sums(int row, int column, Pieces &pieces) {
     constexpr int WIDTH = S > CELL ? S : CELL, COUNT = WIDTH / S;
@@ -156,14 +158,14 @@ class Downsampling {
           store(coc_[there] + i, load<vec>(coc + x));
         }
     }
-    const bool two = there == 2 && mixed(y0, x0) && share_out(S * WIDTH);
+    const bool two = there == 2 && mixed(y0, x0) && continue_farther(S * WIDTH);
     const size_t light_step = s_.has_block(y0 / BLOCK * s_.block_columns + x0 / BLOCK) ? BLOCK : s_.width;
     cell_nodes_.clear();
     for (int i = 0; i < there; i++)
       two ? sum_intervals<S, true>(i, light_step, before_[i], after_[i]) : sum_intervals<S, false>(i, light_step, weight_[i], weight_[i]);
-    for (int i = 0; two && i < (int)lacking_.size(); i++) {
-      const Lacking &of = lacking_[i];
-      float *sums = &cell_sums_[cell_sums_of(to_.stands_for[of.node] | Pieces::ROOM_ONLY, COUNT)] + of.pixel % WIDTH / S;
+    for (int i = 0; two && i < (int)corrections_.size(); i++) {
+      const NormalizerCorrection &of = corrections_[i];
+      float *sums = &cell_sums_[cell_sums_of(to_.stands_for[of.node] | Pieces::NORMALIZER_ONLY, COUNT)] + of.pixel % WIDTH / S;
       sums[0] += of.up_to * each_;
       sums[(C_ + 1) * COUNT] += of.next * each_;
     }
@@ -172,9 +174,9 @@ class Downsampling {
       const float *values_of_first = nullptr;
       for (size_t i = 0; i < cell_nodes_.size(); i++) {
         const float *values = &cell_sums_[i * stride_ * COUNT] + j;
-        const bool room_only = cell_nodes_[i] & Pieces::ROOM_ONLY;
-        if (*values == 0 && !(room_only && values[(C_ + 1) * COUNT] != 0)) continue;
-        if (values_of_first || room_only)
+        const bool normalizer_only = cell_nodes_[i] & Pieces::NORMALIZER_ONLY;
+        if (*values == 0 && !(normalizer_only && values[(C_ + 1) * COUNT] != 0)) continue;
+        if (values_of_first || normalizer_only)
           add_piece(pieces, column + j, cell_nodes_[i], values, COUNT, 1.0f);
         else
           first = (float)cell_nodes_[i], values_of_first = values;
@@ -183,7 +185,8 @@ class Downsampling {
     }
   }
 
-  // Sums of a surface's pixels, whose weights are told in the layer before each and, where they are MIXED, in the one behind it.
+  // Sums the pixels of a surface. before, after: their weights in the layers before and after each pixel; equal unless
+  // MIXED.
   template <int S, bool MIXED>
   void sum_intervals(int surface, size_t light_step, const float *before, const float *after) {
     constexpr int WIDTH = S > CELL ? S : CELL, PARTS = WIDTH / LANES, COUNT = WIDTH / S, DONE = -1;
@@ -242,7 +245,7 @@ class Downsampling {
     }
   }
 
-  // Where the sums of a node begin, [stride, count].
+  // Index of a node's sums [stride, count]; adds them if they are missing.
   size_t cell_sums_of(int node, int count) {
     const size_t size = (size_t)stride_ * count, i = std::find(cell_nodes_.begin(), cell_nodes_.end(), node) - cell_nodes_.begin();
     if (i == cell_nodes_.size()) {
@@ -253,7 +256,7 @@ class Downsampling {
     return i * size;
   }
 
-  // Values of a piece, so far apart, times a factor: among the pieces, or in the planes.
+  // Stores values, `step` apart, times a factor: as a piece, or in the planes.
   void add_piece(Pieces &pieces, int column, int node, const float *values, int step, float factor) {
     pieces.column.push_back(column);
     pieces.node.push_back(node);
@@ -271,7 +274,7 @@ class Downsampling {
     }
   }
 
-  // Any block. The first of what it holds stands in the planes, unless part of the block lies beyond the frame.
+  // One block, pixel by pixel. Its first contribution goes into the planes unless the block crosses the frame.
   void block(int row, int column, bool inside, Pieces &pieces) {
     gathered_.count = 0;
     gather(row, column);
@@ -280,7 +283,7 @@ class Downsampling {
     for (int i = inside ? 1 : 0; i < gathered_.count; i++) add_piece(pieces, column, gathered_.nodes[i], values + (size_t)i * stride_, 1, each_);
   }
 
-  // Whether a block, continued beyond the frame, lies in cells with mixed pixels.
+  // Whether a block, clamped to the frame, touches cells with mixed pixels.
   bool mixed(int y0, int x0) const {
     auto cell = [&](int at, int size) { return std::clamp(at, 0, size - 1) / CELL; };
     const int H = job_.height, W = job_.width, end = to_.scale - 1;
@@ -290,7 +293,7 @@ class Downsampling {
     return false;
   }
 
-  // Pixels of a surface in a block, so many, row by row; the frame goes on with its last ones. False if none weighs anything.
+  // Reads `count` pixels of a surface in a block, clamped to the frame. False if all weights are 0.
   bool read_beyond(int surface, int y0, int x0, int count, int columns) {
     const int H = job_.height, W = job_.width;
     float any = 0;
@@ -306,7 +309,7 @@ class Downsampling {
     return any != 0;
   }
 
-  // How far between their two nodes pixels of a surface lie.
+  // Position of pixels of a surface between their two nodes, 0 to 1.
   vec far_between(int surface, int i) const {
     vec at, per;
     for (int lane = 0; lane < LANES; lane++) {
@@ -316,24 +319,24 @@ class Downsampling {
     return ramp((index_.place(load<vec>(coc_[surface] + i)) - at) * per, over_);
   }
 
-  // Weights of both surfaces of pixels, in the layer before each and in the one behind it. The farther one of a mixed pixel
-  // goes on behind the nearer: there it counts for more than its share, and what it thereby has too much of in the layers up
-  // to the nearer one is to be taken from their room. False if there is no such pixel.
-  bool share_out(int count) {
-    lacking_.clear();
+  // Weights of both surfaces of each pixel in the layers before and after it. The farther surface of a mixed pixel
+  // continues behind the nearer one and gets extra weight there. In the layers up to the nearer surface this extra
+  // weight is subtracted from the normalizer. False if no pixel needs it.
+  bool continue_farther(int count) {
+    corrections_.clear();
     bool any = false;
     for (int i = 0; i < count; i += LANES) {
       const vec weight[2] = {load<vec>(weight_[0] + i), load<vec>(weight_[1] + i)};
       const auto other_is_nearer = load<vec>(coc_[1] + i) < load<vec>(coc_[0] + i);
-      const vec share = other_is_nearer ? weight[0] : weight[1], going = going_on(share), whole = share + going;
+      const vec share = other_is_nearer ? weight[0] : weight[1], extra = continuation(share), whole = share + extra;
       for (int surface = 0; surface < 2; surface++) store(before_[surface] + i, weight[surface]), store(after_[surface] + i, weight[surface]);
-      if (!any_positive(going)) continue;
+      if (!any_positive(extra)) continue;
       any = true;
       const vec fars[2] = {far_between(0, i), far_between(1, i)};
       const vec of_near = other_is_nearer ? fars[1] : fars[0], of_far = other_is_nearer ? fars[0] : fars[1];
       const ivec interval[2] = {load<ivec>(interval_[0] + i), load<ivec>(interval_[1] + i)};
       const ivec k = other_is_nearer ? interval[1] : interval[0], n = other_is_nearer ? interval[0] : interval[1];
-      const vec next = share + where_it_shows(going, of_near);  // in layer k + 1
+      const vec next = share + visible_continuation(extra, of_near);  // in layer k + 1
       const vec first = n == k ? share : n == k + 1 ? next : whole, second = n == k ? next : whole;
       store(before_[0] + i, other_is_nearer ? first : weight[0]);
       store(after_[0] + i, other_is_nearer ? second : weight[0]);
@@ -341,10 +344,10 @@ class Downsampling {
       store(after_[1] + i, other_is_nearer ? weight[1] : second);
       for (int lane = 0; lane < LANES; lane++) {
         const int nearer = k[lane], farther = n[lane];
-        if (!(going[lane] > 0) || !to_.needed(nearer)) continue;
+        if (!(extra[lane] > 0) || !to_.needed(nearer)) continue;
         const float given = first[lane] + (to_.wanted[farther] ? of_far[lane] : 0.0f) * (second[lane] - first[lane]);
         const bool shows_next = to_.wanted[nearer] && farther > nearer;
-        lacking_.push_back({i + lane, nearer, share[lane] - given, shows_next ? next[lane] - given : 0.0f});
+        corrections_.push_back({i + lane, nearer, share[lane] - given, shows_next ? next[lane] - given : 0.0f});
       }
     }
     return any;
@@ -352,7 +355,7 @@ class Downsampling {
 
   void gather(int row, int column) {
     const int s = to_.scale, y0 = row * s, x0 = column * s, H = job_.height, W = job_.width;
-    // away from one side of the frame all is alike but the light: there a pixel stands for a line of them
+    // beside one edge of the frame coc and weight do not change away from it: one pixel represents a line of them
     const bool in_rows = y0 >= 0 && y0 + s <= H, in_columns = x0 >= 0 && x0 + s <= W;
     const bool above_or_below = in_columns && (y0 + s <= 0 || y0 >= H), beside = in_rows && (x0 + s <= 0 || x0 >= W);
     const int line = above_or_below || beside ? s : 1, count = s * s / line, columns = beside ? 1 : s;
@@ -361,10 +364,10 @@ class Downsampling {
       there[i] = read_beyond(i, y0, x0, count, columns);
       for (int j = 0; there[i] && j < count; j += LANES) store(far_[i] + j, far_between(i, j));
     }
-    const bool two = there[0] && there[1] && mixed(y0, x0) && share_out(count);
+    const bool two = there[0] && there[1] && mixed(y0, x0) && continue_farther(count);
     for (int i = 0; i < s_.count; i++)
       if (there[i]) sum_pixels(i, y0, x0, count, columns, two ? before_[i] : weight_[i], two ? after_[i] : weight_[i]);
-    // nothing is left of what weighs nothing
+    // remove contributions of weight 0
     for (int i = 0; i < gathered_.count;) {
       if (gathered_.values[(size_t)i * stride_] != 0) {
         i++;
@@ -375,15 +378,14 @@ class Downsampling {
       memcpy(&gathered_.values[(size_t)i * stride_], &gathered_.values[(size_t)gathered_.count * stride_], stride_ * sizeof(float));
     }
     if (!two) return;
-    for (const Lacking &of : lacking_) {
-      float *values = gathered_.between(to_.stands_for[of.node] | Pieces::ROOM_ONLY);
+    for (const NormalizerCorrection &of : corrections_) {
+      float *values = gathered_.between(to_.stands_for[of.node] | Pieces::NORMALIZER_ONLY);
       values[0] += line * of.up_to;
       values[C_ + 1] += line * of.next;
     }
   }
 
-  // Pixels of a block of one surface, one by one; where there are fewer than a block has, each stands for a line away from the
-  // frame.
+  // Sums the pixels of a surface in a block; beside the frame each pixel represents a line of them.
   void sum_pixels(int i, int y0, int x0, int count, int columns, const float *before, const float *after) {
     const int H = job_.height, W = job_.width, C = C_, line = to_.scale * to_.scale / count;
     int last = -1;
@@ -426,21 +428,21 @@ class Downsampling {
   Downsampled &to_;
   const int C_, stride_;
   const float each_;
-  struct Lacking {
-    int pixel, node;    // before its nearer surface
-    float up_to, next;  // room that is to be added in the layers up to it, and in the next one
+  struct NormalizerCorrection {
+    int pixel, node;    // index in the block; node before the pixel's nearer surface
+    float up_to, next;  // correction of the normalizer in the layers up to that node, and in the next one
   };
-  // of a block's pixels, of both surfaces; far: how far between their nodes; before, after: weight in the layers there
+  // For a block's pixels and both surfaces. far: position between the nodes; before, after: weight in these layers.
   float coc_[2][BLOCK_PIXELS], weight_[2][BLOCK_PIXELS], far_[2][BLOCK_PIXELS], before_[2][BLOCK_PIXELS], after_[2][BLOCK_PIXELS];
   int32_t interval_[2][BLOCK_PIXELS];
   struct Ramp {
     float at, per;
   };
   std::vector<Ramp> ramps_;  // beyond each layer
-  std::vector<Lacking> lacking_;
+  std::vector<NormalizerCorrection> corrections_;
   Gathered gathered_;
-  std::vector<int> cell_nodes_;    // in a row of blocks of a cell,
-  std::vector<float> cell_sums_;  // and values as those of pieces, [nodes, stride, blocks]
+  std::vector<int> cell_nodes_;    // nodes in a row of blocks,
+  std::vector<float> cell_sums_;  // and their values in the layout of pieces [nodes, stride, blocks]
   std::vector<const float *> light_, light_of_[2];
 };
 
@@ -452,22 +454,21 @@ Downsampled::Downsampled(const Job &job, int scale, int margin)
   planes = Buffer<float>(size * (3 + 2 * channels));
   first_band = -ceil_div(margin, per_band);
   pieces.resize(ceil_div(rows + margin, per_band) - first_band);
-  // what is neither spread by a layer of this resolution nor seen behind one is left out
+  // intervals that no layer of this scale blurs or composites over are left out
   const int layers = (int)job.layers.size();
   wanted.resize(layers), behind.resize(layers), stands_for.resize(layers);
   for (int k = 0, class_of = 0; k < layers; k++) {
     const bool here = job.layers[k].scale == scale, next = k + 1 < layers && job.layers[k + 1].scale == scale;
     wanted[k] = here || next;
     behind[k] = here || (k && behind[k - 1]);
-    if (wanted[k] || (k && wanted[k - 1])) class_of = k;  // those between two runs lie behind the same layers
+    if (wanted[k] || (k && wanted[k - 1])) class_of = k;  // all intervals between two runs lie behind the same layers
     stands_for[k] = (uint16_t)class_of;
   }
   if (!job.scene.occlusion) behind = wanted;
 }
 
 void Downsampled::take(const Job &job, const LayerIndex &index, const Border &border) {
-  // blocks of pixels that a layer of this resolution occupies; as far as its light reaches, and as far again for what
-  // lies behind there
+  // blocks within twice the reach of those in which a layer of this scale occurs: its blur, and what lies behind it
   const int cells = BLOCK / CELL, block_rows = job.surfaces.block_rows, block_columns = job.surfaces.block_columns;
   std::vector<uint64_t> layers(index.words, 0);
   for (int k = 0; k < (int)job.layers.size(); k++)
@@ -479,7 +480,7 @@ void Downsampled::take(const Job &job, const LayerIndex &index, const Border &bo
         if (index.cell((size_t)row * index.columns + column)[w] & layers[w]) occupied[(size_t)(row / cells) * block_columns + column / cells] = 1;
   const int reach = ceil_div(2 * margin * scale, BLOCK);
   auto widen = [](const uint8_t *from, uint8_t *to, int count, int step, int reach) {
-    for (int i = 0, last = -reach - 1; i < count + reach; i++) {  // last: of those occupied up to i
+    for (int i = 0, last = -reach - 1; i < count + reach; i++) {  // last: latest occupied index up to i
       if (i < count && from[(size_t)i * step]) last = i;
       if (i >= reach) to[(size_t)(i - reach) * step] = last >= i - 2 * reach && last >= 0;
     }

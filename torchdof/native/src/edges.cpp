@@ -1,7 +1,7 @@
-// Depth edges: what torchdof/depth/edges.py states, compiled. Names and constants are that file's.
+// Repairs the edges of a depth map: the compiled version of torchdof/render/edges.py, with the same constants.
 //
-// Work is done part by part of the frame, and in a part only as far as there may be edges. Each part is copied with what
-// is around it, which beyond the frame goes on as it is at the border, so that loops run in whole vectors.
+// The frame is processed in tiles of AREA x AREA pixels, and within a tile only where the map changes. Each tile is
+// copied with a margin, padded beyond the frame with the nearest border pixel, so that loops run in whole vectors.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -19,20 +19,22 @@ constexpr float ABRUPT = 0.3f, SHALLOW = 0.03f, TIE = 0.017f, TRUSTED = 0.05f, P
 constexpr float NOISES = 12.0f;
 constexpr int NOISE_SAMPLED = 1 << 13, SAMPLED = 12000, SAMPLE_BLOCK = 8, BLUR_REACH = 9, USUAL_REACH = REACH + 2, LAMP_REACH = 2, SIDE_REACH = 6, LOWEST_REACH = 12;
 constexpr int AREA = 96, FLAT_REACH = 8, ROWS_AHEAD = 8;
-// What a pixel shows depends on what is so far around it; without ramps, and with them.
+// A pixel's result depends on the pixels within this many of it: without ramps, and with ramps.
 constexpr int STEP_HALO = RINGS + REACH, HALO = RINGS + RAMP_REACH + FLAT_REACH + 3;
-constexpr float NONE = 1e30f, UNSAID = 100.0f;  // UNSAID: above all scores
+constexpr float NONE = 1e30f, NO_SCORE = 100.0f;  // NO_SCORE: marks pixels without a score; above all scores
 constexpr int NEIGHBOURS[8][2] = {{-1, -1}, {-1, 0}, {-1, 1}, {0, -1}, {0, 1}, {1, -1}, {1, 0}, {1, 1}};
 constexpr float LARGEST = 1e15f, BRIGHTEST = 1e30f, FINITE = 3.402823466e38f;
-// A window: its rows, in whole vectors as far as these go, and then the rest, four values a row.
+// Vectors of a window of SIDE x SIDE pixels: first WHOLE columns of each row, then the remaining 4 columns.
 constexpr int SIDE = 2 * REACH + 1, WHOLE = SIDE / LANES * LANES, ROWS_AT_ONCE = LANES / 4, WINDOW = SIDE * WHOLE / LANES + (SIDE + ROWS_AT_ONCE - 1) / ROWS_AT_ONCE;
 static_assert(SIDE - WHOLE <= 4 && WHOLE > REACH + 1);
 
-// Marks of a pixel. NEAR: it shows the near surface; GIVEN_NEAR: it has its depth. Above them how unsure a witness it is.
+// Bits of a pixel's mark. NEAR: it shows the near surface. GIVEN_NEAR: the map gives it the near surface's depth. Bits
+// from UNSURE up: index into SURE.
 constexpr uint8_t EDGE = 1, RAMP = 2, NEAR = 4, GIVEN_NEAR = 8, LISTED = 16, UNSURE = 32;
-constexpr float SURE[256 / UNSURE] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};  // its weight: far from steps, RINGS from one, ..., beside it; none
+// weight as a colour reference: far from steps, RINGS pixels from one, ..., beside one; none
+constexpr float SURE[256 / UNSURE] = {1.0f, 0.2f, 0.06f, 0.02f, 0.0f};
 
-// A part of the frame, and what is around it, even beyond the frame.
+// A rectangle in the coordinates of the frame; may reach beyond the frame.
 struct Part {
   int y0, x0, height, width;
 
@@ -42,14 +44,14 @@ struct Part {
   Part grown(int by) const { return {y0 - by, x0 - by, height + 2 * by, width + 2 * by}; }
 };
 
-// A pixel to look at.
+// A pixel whose surface is to be decided.
 struct Edge {
   int i;
   float near, far;  // of the two surfaces that meet there
   uint8_t kind;
 };
 
-// Memory of a thread for what it looks at, given back in reverse order: so it stays in the processor's cache.
+// A thread's stack of temporary buffers, reused so that they stay in the processor's cache.
 class Scratch {
  public:
   float *take(size_t size) {
@@ -68,7 +70,7 @@ class Scratch {
     if (blocks_[block_].used == 0 && block_ > 0) block_--;
   }
 
-  const Buffer<Edge> edges{AREA * AREA};  // of a part
+  const Buffer<Edge> edges{AREA * AREA};  // of a tile
 
   static thread_local Scratch *mine;
 
@@ -83,8 +85,7 @@ class Scratch {
 };
 thread_local Scratch *Scratch::mine = nullptr;
 
-// Values of a part, by their place in the frame, in the thread's scratch memory. Rows are longer than the part, by two
-// vectors that hold something.
+// A temporary plane, or several, addressed by frame coordinates. Rows are padded by up to two vectors that may be read.
 class Grid : public Part {
  public:
   explicit Grid(const Part &part, int planes = 1)
@@ -99,14 +100,14 @@ class Grid : public Part {
   void clear() const { std::fill(data_, data_ + size, 0.0f); }
 
   const int pitch;
-  const size_t size;  // of a plane
+  const size_t size;  // values in a plane
 
  private:
   const size_t taken_;
   float *const data_;
 };
 
-// A bit for each lane.
+// Packs the sign bit of each lane.
 inline int bits(ivec mask) {
 #if defined(__AVX2__)
   return __builtin_ia32_movmskps256((vec)mask);
@@ -124,7 +125,8 @@ inline vec square_root(vec v) {
   return load<vec>(lanes);
 }
 
-// Calls look(n, take) for each vector of a window; take(p, pitch) has its values in a grid where p is the window's first.
+// Calls look(n, take) for each vector n of a window; take(p, pitch) loads it from a grid, p being the window's first
+// value.
 template <typename Look>
 inline void each_of_window(const Look &look) {
   int n = 0;
@@ -142,7 +144,7 @@ inline void each_of_window(const Look &look) {
   if (SIDE % ROWS_AT_ONCE) look(n, [](const float *p, int pitch) { return load<vec>(p + (SIDE - 1) * pitch + WHOLE); });
 }
 
-// What a function of the square of the distance says, for each place of a window.
+// Samples a function of the squared distance from the centre at each pixel of a window.
 template <typename Of>
 std::vector<float> window(const Of &of) {
   std::vector<float> values(WINDOW * LANES, 0.0f);
@@ -152,16 +154,16 @@ std::vector<float> window(const Of &of) {
   return values;
 }
 
-// Calls body(y, x) for each vector of a part; the last of a row goes beyond it.
+// Calls body(y, x) for each vector of a part; the last vector of a row may extend beyond the part.
 template <typename Body>
 inline void each_vector(const Part &part, const Body &body) {
   for (int y = part.y0; y < part.bottom(); y++)
     for (int x = part.x0; x < part.right(); x += LANES) body(y, x);
 }
 
-// The largest of a square around each value of a part: of three runs of a third of its side, which overlap.
+// Maximum over a square of side 2 REACH_ + 1 around each value of a part: the maximum of three overlapping runs.
 template <int REACH_>
-void highest(const Grid &in, const Grid &out, const Grid &rows, const Part &part) {
+void max_filter(const Grid &in, const Grid &out, const Grid &rows, const Part &part) {
   constexpr int TAPS = 2 * REACH_ + 1, RUN = (TAPS + 2) / 3, LAST = TAPS - RUN, MIDDLE = LAST / 2;
   const auto run = [](const float *from, int stride) {
     vec high = load<vec>(from);
@@ -179,15 +181,15 @@ void highest(const Grid &in, const Grid &out, const Grid &rows, const Part &part
   each_vector(part, [&](int y, int x) { store(out.at(y, x), three(rows.at(y - REACH_, x), rows.pitch)); });
 }
 
-// Around one vector of values, the largest of 3 x 3.
-inline vec highest_beside(const float *from, int pitch) {
+// Maximum over 3 x 3 values around each value of a vector.
+inline vec max_3x3(const float *from, int pitch) {
   vec high = most(load<vec>(from), most(load<vec>(from - 1), load<vec>(from + 1)));
   for (const float *row : {from - pitch, from + pitch}) high = most(high, most(load<vec>(row), most(load<vec>(row - 1), load<vec>(row + 1))));
   return high;
 }
 
-// The same of each value of a part.
-void highest_beside(const Grid &in, const Grid &out, const Part &part) {
+// The same for each value of a part.
+void max_3x3(const Grid &in, const Grid &out, const Part &part) {
   for (int x = part.x0; x < part.right(); x += LANES) {
     const auto row = [&](int y) {
       const float *from = in.at(y, x);
@@ -203,7 +205,8 @@ void highest_beside(const Grid &in, const Grid &out, const Part &part) {
   }
 }
 
-// The sum of a square around each value of a part, times a factor: of runs of values that lie side by side.
+// Sum over a square of side 2 REACH_ + 1 around each value of a part, times a factor. Adds runs of 3 values if they
+// fit.
 template <int REACH_>
 void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float factor) {
   constexpr int TAPS = 2 * REACH_ + 1, RUN = TAPS % 3 ? 1 : 3, LAST = TAPS - RUN;
@@ -223,7 +226,7 @@ void sums(const Grid &in, const Grid &out, const Grid &rows, const Part &part, f
   each_vector(part, [&](int y, int x) { store(out.at(y, x), symmetric(rows.at(y - REACH_, x), rows.pitch, LAST + 1, RUN) * factor); });
 }
 
-// The largest value of the square of LOWEST_REACH around a place.
+// Maximum over the square of side 2 LOWEST_REACH + 1 around a pixel.
 inline float largest_around(const Grid &in, int y, int x) {
   vec high = all(-NONE);
   for (int v = y - LOWEST_REACH; v <= y + LOWEST_REACH; v++) {
@@ -234,31 +237,33 @@ inline float largest_around(const Grid &in, int y, int x) {
   return largest(high);
 }
 
+// Which surface a pixel shows. score: log-odds of the near surface. reliability: 0 to 1, how well colours separate the
+// two surfaces. near, far: nearness of the surfaces.
 struct Judgement {
-  float score, tells, near, far;
+  float score, reliability, near, far;
 };
 
 struct Around {
-  float alike[8][LANES];  // how much the colours around LANES pixels are their own
+  float alike[8][LANES];  // similarity of each pixel's colour to its 8 neighbours', 0 to 1
 };
 
-// Edges of a part that are looked at together, in the order of rows.
+// Edge pixels of a part, in row order.
 struct Group {
   Part part;
   std::vector<Edge> edges;
-  Part bounds = {};             // where they lie
-  Judgement *judged = nullptr;  // of each
-  Around *around = nullptr;     // of LANES of them each
+  Part bounds = {};             // bounding box of the edges
+  Judgement *judged = nullptr;  // one for each edge
+  Around *around = nullptr;     // one for every LANES edges
 };
 
-// Whether pixels are asked, by kind: those that the map gives the far surface, and those that it gives the near one.
-using Asked = std::array<bool, 2 * KINDS>;
+// Selects edge pixels by kind: first those to which the map gives the far surface, then those with the near one.
+using KindMask = std::array<bool, 2 * KINDS>;
 
-// What edges are, in sums.
-struct Found {
+// Sums over all edge pixels, from which the blur of a soft map is estimated.
+struct EdgeSums {
   double length = 0;    // of steps, in pixels
-  double climbed = 0;   // of it in the middle half of steps
-  double lost = 0;      // pixels that the map shows as near, less what it has of the near surface
+  double climbed = 0;   // part of the length in the middle half of steps
+  double lost = 0;      // near pixels in the map minus the near surface's coverage in pixels
   int64_t middles = 0;  // pixels in the middle half of steps
 };
 
@@ -267,22 +272,28 @@ class Repair {
   explicit Repair(const torchdof_map &map)
       : map_(map), sign_(map.of_coc ? -1.0f : 1.0f), height_(map.height), width_(map.width), channels_(map.channels), area_((size_t)map.height * map.width), scratch_(std::max(map.threads, 1)) {}
 
+  // 1. Find the edges of a sample of the frame and decide by colour which surface each pixel shows.
+  // 2. Calibrate: for each kind of edge pixel, the share that shows the near surface.
+  // 3. In automatic mode stop here if the map is exact or its edges are unrelated to the image's.
+  // 4. Find and decide the edges of the whole frame; move pixels that have the depth of the wrong surface.
+  // 5. In a soft map also restore the nearness of thin structures and small lamps that a blur has reduced.
   bool run() {
     allocate();
     noise_step_ = NOISES * noise();
     const int every = (int)std::ceil(std::sqrt((double)area_ / SAMPLED));
-    const bool spares = map_.automatic && every > 4;  // blocks of a sample are apart, and a look at them alone may do
+    const bool spares = map_.automatic && every > 4;  // the sample is a small part of the frame: find only its edges first
     const auto is_sampled = [&](int y, int x) { return (block_of(y, height_) + block_of(x, width_)) % every == 0; };
     std::vector<Group> groups, sampled;
-    Asked all_kinds;
+    KindMask all_kinds;
     all_kinds.fill(true);
     if (spares) {
       sampled = find_in(blocks(is_sampled), REACH, false, false, all_kinds);
     } else {
       sampled = groups = find_in(tiles(), 0, false, true, all_kinds);
     }
-    choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });  // what is around blocks may lie in others
-    allot(sampled);
+    // the margins contain others
+    choose_edges(sampled, [&](const Edge &edge) { return is_sampled(edge.i / width_, edge.i % width_); });
+    allocate_results(sampled);
     judge(sampled, false);
     decide(sampled, [](const Edge &, float) {});
     calibrate(sampled);
@@ -291,12 +302,12 @@ class Repair {
     parallel(height_, [&](int y) {
       memcpy(map_.out + (size_t)y * width_, map_.nearness + (size_t)y * width_, width_ * sizeof(float));
     });
-    const Asked doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;
+    const KindMask doubtful = map_.automatic ? doubtful_kinds(is_soft) : all_kinds;
     if (spares)
       groups = find_in(tiles(), 0, is_soft, is_soft, doubtful);
     else
       choose_edges(groups, [&](const Edge &edge) { return doubtful[side_of(edge)]; });
-    allot(groups);
+    allocate_results(groups);
     judge(groups, true);
     const float sigma = blur(), lost_px = choose(groups);
     if (is_soft) unmix(groups, sigma, lost_px);
@@ -316,15 +327,16 @@ class Repair {
 
   float step(size_t i) const { return std::max(map_.steps ? map_.steps[i] : map_.step, noise_step_); }
   float nearness(size_t i) const { return sign_ * map_.nearness[i]; }
-  // A pixel's kind, and above it whether the map gives it the near surface.
+  // Kind of an edge pixel, plus KINDS if the map gives it the near surface.
   int side_of(const Edge &edge) const { return edge.kind + (marks_[edge.i] & GIVEN_NEAR ? KINDS : 0); }
-  // Share of wrong pixels among those.
+  // Share of those pixels that the map gives the wrong surface.
   float wrong(int side) const { return side >= KINDS ? 1.0f - shares_[side - KINDS] : shares_[side]; }
   static float valid(float v) { return std::fabs(v) <= LARGEST ? v : 0.0f; }
   static vec valid(vec v) { return size_of(v) <= all(LARGEST) ? v : vec{}; }
   static float root(float light) { return (light <= FINITE) & (light > 0) ? std::sqrt(std::min(light, BRIGHTEST)) : 0.0f; }
 
-  // Standard deviation of the map's noise: from how the middle pixel of all bends its row, or its column if that is more.
+  // Standard deviation of the map's noise, from the median second difference along rows or columns, whichever is
+  // larger.
   float noise() const {
     const int every = (int)((2 * (int64_t)area_ + NOISE_SAMPLED - 1) / NOISE_SAMPLED);
     const auto middle_bend = [&](int lines, int size, int to_line, int stride) {
@@ -345,7 +357,7 @@ class Repair {
     return 0.6053f * std::max(middle_bend(height_, width_, width_, 1), middle_bend(width_, height_, 1, width_));
   }
 
-  // Whether a sample's steps are ramps, wide ones or such as are not close to one of their surfaces.
+  // Whether the sampled steps are ramps that are wide, or whose values are often far from both surfaces.
   bool is_on_ramps(const std::vector<Group> &sampled) const {
     double edges = 0, ramps = 0, mixed = 0, length = 0;
     for (const Group &group : sampled)
@@ -364,10 +376,11 @@ class Repair {
     return ramps > WIDE * length || mixed > MIXED * ramps;
   }
 
-  // Whether a place on a step is far from both of its surfaces.
+  // Whether a level on a step, 0 (far) to 1 (near), is in the middle half.
   static bool is_mixed(float level) { return std::fabs(level - 0.5f) < 0.25f; }
 
-  // Part of a step that a pixel climbs, by the places of its neighbours: summed, the length of the step in pixels.
+  // Gradient at a pixel as a fraction of the step `gap`, given the offsets of its neighbours. The sum over a step's
+  // pixels is its length in pixels.
   template <typename V>
   static V climb(const float *value, int left, int right, int above, int below, V gap) {
     V steepness{};
@@ -379,7 +392,7 @@ class Repair {
     return 0.25f * steepness / gap;
   }
 
-  // Whether more of a sample's pixels at steps are wrong than exact maps have.
+  // Whether more of the sampled step pixels are wrong than in an exact map.
   bool is_inexact(const std::vector<Group> &sampled) const {
     double found = 0, steps = 0;
     for (const Group &group : sampled)
@@ -391,7 +404,7 @@ class Repair {
     return found > EXACT * steps;
   }
 
-  // Parts of the frame, side by side.
+  // Tiles that cover the frame.
   std::vector<Group> tiles() const {
     std::vector<Group> parts;
     for (int y = 0; y < height_; y += AREA)
@@ -399,10 +412,10 @@ class Repair {
     return parts;
   }
 
-  // Which block a row or column lies in, counted from the nearest border: the same in a turned frame.
+  // Block index of a row or column, counted from the nearest border so that mirroring the frame keeps it.
   static int block_of(int at, int size) { return std::min(at, size - 1 - at) / SAMPLE_BLOCK; }
 
-  // The wanted ones of these blocks.
+  // The selected blocks of SAMPLE_BLOCK pixels.
   template <typename Wanted>
   std::vector<Group> blocks(const Wanted &wanted) const {
     struct Run {
@@ -424,14 +437,14 @@ class Repair {
     return parts;
   }
 
-  // What is asked of an exact map: steps of kinds that are often wrong, and ramps if it is soft.
-  Asked doubtful_kinds(bool is_soft) const {
-    Asked asked;
-    for (int side = 0; side < 2 * KINDS; side++) asked[side] = side % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(side) > DOUBTFUL;
-    return asked;
+  // The kinds of pixels to decide in automatic mode: steps of kinds that are often wrong, and ramps if the map is soft.
+  KindMask doubtful_kinds(bool is_soft) const {
+    KindMask selected;
+    for (int side = 0; side < 2 * KINDS; side++) selected[side] = side % KINDS / DIRECTIONS >= 2 * RINGS ? is_soft : wrong(side) > DOUBTFUL;
+    return selected;
   }
 
-  // Marks chosen edges, and forgets the others.
+  // Keeps the chosen edges and clears the mark of the others.
   template <typename Chosen>
   void choose_edges(std::vector<Group> &groups, const Chosen &chosen) {
     parallel((int)groups.size(), [&](int g) {
@@ -447,8 +460,8 @@ class Repair {
     });
   }
 
-  // Gives groups memory for what is told of their edges.
-  void allot(std::vector<Group> &groups) {
+  // Gives each group its part of the result buffers.
+  void allocate_results(std::vector<Group> &groups) {
     size_t count = 0;
     for (const Group &group : groups) count += group.edges.size();
     judged_ = Buffer<Judgement>(count);
@@ -463,7 +476,7 @@ class Repair {
     }
   }
 
-  // Calls body(k, edge, y, x) for each of a group.
+  // Calls body(k, edge, y, x) for each edge of a group.
   template <typename Body>
   void each_edge(const Group &group, const Body &body) const {
     int y = group.part.y0, row = y * width_;
@@ -473,7 +486,7 @@ class Repair {
     }
   }
 
-  // Where those of a group's edges lie that are chosen.
+  // Bounding box of a group's chosen edges.
   template <typename Chosen>
   Part bounds(const Group &group, const Chosen &chosen) const {
     int top = height_, left = width_, bottom = 0, right = 0;
@@ -498,21 +511,21 @@ class Repair {
     return {y0, x0, std::min(height_, part.bottom()) - y0, std::min(width_, part.right()) - x0};
   }
 
-  // Asks memory for values some rows below: a part's rows are too short for processors to see where they lead. Not inlined,
-  // GCC takes it for a function that does nothing.
+  // Prefetches values ROWS_AHEAD rows below: rows of a tile are too short for the hardware prefetcher. Always inlined,
+  // because GCC otherwise removes the call as having no effect.
   template <typename Value>
-  __attribute__((always_inline)) void ask_ahead(const Value *values, int y, int count) const {
+  __attribute__((always_inline)) void prefetch_below(const Value *values, int y, int count) const {
     const Value *soon = values + (ptrdiff_t)std::min(ROWS_AHEAD, std::max(0, height_ - 1 - std::max(y, 0))) * width_;
     for (int x = 0; x < count; x += 64 / (int)sizeof(Value)) __builtin_prefetch(soon + x);
   }
 
-  // Fills a grid's whole rows from a plane of the frame.
+  // Fills all rows of a grid from a plane of the frame, padding with the nearest border pixel.
   template <typename Value, typename Of>
   void fetch(const Value *plane, const Grid &grid, float *to, const Of &of) const {
     const int first = std::max(0, -grid.x0), last = std::min(grid.pitch, width_ - grid.x0);
     for (int y = grid.y0; y < grid.bottom(); y++, to += grid.pitch) {
       const Value *from = plane + (ptrdiff_t)std::min(std::max(y, 0), height_ - 1) * width_ + grid.x0;
-      ask_ahead(from + first, y, last - first);
+      prefetch_below(from + first, y, last - first);
       for (int x = first; x < last; x++) to[x] = of(from[x]);
       std::fill(to, to + first, to[first]);
       std::fill(to + last, to + grid.pitch, to[last - 1]);
@@ -523,8 +536,8 @@ class Repair {
     fetch(plane, grid, grid.at(grid.y0, grid.x0), of);
   }
 
-  // Values of a part that are beyond the frame become those at its border.
-  void go_on(const Grid &grid, const Part &part) const {
+  // Overwrites values of a part beyond the frame with the nearest value inside.
+  void clamp_to_frame(const Grid &grid, const Part &part) const {
     const Part inside = in_frame(part);
     for (int y = inside.y0; y < inside.bottom(); y++) {
       float *row = grid.at(y, 0);
@@ -536,17 +549,17 @@ class Repair {
         memcpy(grid.at(y, part.x0), grid.at(nearest, part.x0), part.width * sizeof(float));
   }
 
-  // Ramps and steps, and the two surfaces that meet there: edges of groups, and marks as far as a halo around them.
-  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps, bool measures, const Asked &asked) {
-    std::vector<Found> found(groups.size());
+  // Finds steps and ramps and their two surfaces: returns the groups' edges, and marks pixels up to `halo` around them.
+  std::vector<Group> find_in(std::vector<Group> groups, int halo, bool expects_ramps, bool measures, const KindMask &selected) {
+    std::vector<EdgeSums> found(groups.size());
     parallel((int)groups.size(), [&](int g) {
       Group &group = groups[g];
       const Edge *edges = Scratch::mine->edges.data();
-      group.edges.assign(edges, find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, asked, measures ? &found[g] : nullptr));
+      group.edges.assign(edges, find_in(group.part, in_frame(group.part.grown(halo)), expects_ramps, selected, measures ? &found[g] : nullptr));
       group.bounds = bounds(group, [](size_t) { return true; });
     });
     found_ = {};
-    for (const Found &here : found) {
+    for (const EdgeSums &here : found) {
       found_.length += here.length;
       found_.climbed += here.climbed;
       found_.lost += here.lost;
@@ -555,22 +568,22 @@ class Repair {
     return groups;
   }
 
-  // The end of those in a part.
-  const Edge *find_in(const Part &own, const Part &part, bool expects_ramps, const Asked &asked, Found *found) {
+  // The same for one part; returns the end of the edges found.
+  const Edge *find_in(const Part &own, const Part &part, bool expects_ramps, const KindMask &selected, EdgeSums *found) {
     for (int y = part.y0; y < part.bottom(); y++) {
       const size_t i = (size_t)y * width_ + part.x0;
       const float *values = map_.nearness + i;
       uint8_t *marks = marks_.data() + i;
-      ask_ahead(values, y, part.width);
+      prefetch_below(values, y, part.width);
       for (int x = 0; x < part.width; x++) marks[x] = std::fabs(values[x]) <= LARGEST ? 0 : (RINGS + 1) * UNSURE;
     }
     const Part busy = changing(part);
     if (busy.height <= 0 || busy.width <= 0) return Scratch::mine->edges.data();
-    const Edge *end = expects_ramps ? nullptr : find_in(own, busy, STEP_HALO, asked, found);
-    return end ? end : find_in(own, busy, HALO, asked, found);
+    const Edge *end = expects_ramps ? nullptr : find_in(own, busy, STEP_HALO, selected, found);
+    return end ? end : find_in(own, busy, HALO, selected, found);
   }
 
-  // Where there may be edges.
+  // Bounding box of the pixels where the map changes enough for an edge, grown by the halo.
   Part changing(const Part &part) const {
     const Part around = in_frame(part.grown(STEP_HALO));
     float least_step = step(0);
@@ -588,7 +601,7 @@ class Repair {
       const float *at = map_.nearness + (size_t)y * width_ + around.x0, *above = y > around.y0 ? at - width_ : at;
       for (int x = 0; x < around.width - 1; x++) {
         const float beside = std::fabs(at[x + 1] - at[x]), below = std::fabs(at[x] - above[x]);
-        const float known = beside > 0 ? beside : 0.0f;  // NaN is no change
+        const float known = beside > 0 ? beside : 0.0f;  // a change next to NaN counts as 0
         of_row[x] = below > known ? below : known;
       }
       of_row[around.width - 1] = std::fabs(at[around.width - 1] - above[around.width - 1]);
@@ -613,8 +626,13 @@ class Repair {
     return {y0, x0, std::min(part.bottom(), wide.bottom()) - y0, std::min(part.right(), wide.right()) - x0};
   }
 
-  // Null if the halo was not wide enough.
-  const Edge *find_in(const Part &own, const Part &inner, int halo, const Asked &asked, Found *found) {
+  // The same for the changing part; returns null if ramps require the larger halo.
+  //
+  // 1. Slopes that continue on both sides of a pixel are ramp candidates; end_ramps keeps the true ramps.
+  // 2. Near and far surface within 1, 2 and 3 pixels, by maximum filters.
+  // 3. A pixel belongs to the step at the smallest distance whose jump is abrupt.
+  // 4. Each edge pixel gets its kind: ring or level on the ramp, side, and direction of the near surface.
+  const Edge *find_in(const Part &own, const Part &inner, int halo, const KindMask &selected, EdgeSums *found) {
     const bool is_wide = halo == HALO;
     const Part whole = inner.grown(halo), beside = inner.grown(RINGS), ramps = inner.grown(is_wide ? RINGS + RAMP_REACH : RINGS);
     const Grid raw(whole), up(whole), down(whole), slope(whole), jump(whole), high(whole), low(whole), rows(whole), ramp(whole);
@@ -634,7 +652,7 @@ class Repair {
     };
     slopes(raw, slope, jump, is_wide ? ramps.grown(FLAT_REACH + 2) : beside);
     ramp.clear();
-    // ramps no farther away than this reach into the inner part
+    // ramps within RINGS pixels affect the inner part
     const auto any_beside = [&](const auto &is) {
       vec any{};
       each_vector(beside, [&](int y, int x) { any = is(y, x) ? all(1.0f) : any; });
@@ -643,8 +661,8 @@ class Repair {
     const auto is_steep = [&](int y, int x) { return load<vec>(slope.at(y, x)) > 0.1f * step_at(y, x); };
     const auto is_ramp = [&](int y, int x) { return load<vec>(ramp.at(y, x)) > vec{}; };
     if (any_beside(is_steep)) {
-      highest<REACH>(up, high, rows, ramps);
-      highest<REACH>(down, low, rows, ramps);
+      max_filter<REACH>(up, high, rows, ramps);
+      max_filter<REACH>(down, low, rows, ramps);
       each_vector(ramps, [&](int y, int x) {
         const vec span = load<vec>(high.at(y, x)) + load<vec>(low.at(y, x));
         const auto is_candidate = is_steep(y, x) & (load<vec>(slope.at(y, x)) > SHALLOW * span) & (span > step_at(y, x)) & (size_of(load<vec>(raw.at(y, x))) <= all(LARGEST));
@@ -662,16 +680,16 @@ class Repair {
         store(down.at(y, x), is_one ? far : load<vec>(down.at(y, x)));
       });
     }
-    // the surfaces at both sides of a step
+    // near and far surface within r + 1 pixels
     const Grid nears[RINGS] = {Grid(beside), Grid(beside), Grid(beside)}, fars[RINGS] = {Grid(beside), Grid(beside), Grid(beside)},
                jumps[RINGS] = {Grid(beside), Grid(beside), Grid(beside)};
     for (int r = 0; r < RINGS; r++) {
       const Part part = inner.grown(RINGS - 1 - r);
-      highest_beside(r ? nears[r - 1] : up, nears[r], part);
-      highest_beside(r ? fars[r - 1] : down, fars[r], part);
-      highest_beside(r ? jumps[r - 1] : jump, jumps[r], part);
+      max_3x3(r ? nears[r - 1] : up, nears[r], part);
+      max_3x3(r ? fars[r - 1] : down, fars[r], part);
+      max_3x3(r ? jumps[r - 1] : jump, jumps[r], part);
     }
-    const Part means = inner.grown(2);  // of 5 x 5, for what lies two pixels to each side
+    const Part means = inner.grown(2);  // over 5 x 5 pixels; their differences give the direction of the step
     each_vector(inner.grown(4), [&](int y, int x) {
       const vec v = load<vec>(raw.at(y, x));
       store(slope.at(y, x), size_of(v) <= all(FINITE) ? v : vec{});
@@ -687,7 +705,7 @@ class Repair {
         const vec s = step_at(y, x), v = load<vec>(raw.at(y, x)), is_ramp = load<vec>(ramp.at(y, x)), none = {}, one = all(1.0f);
         const auto is_valid = size_of(v) <= all(LARGEST);
         vec near = load<vec>(nears[RINGS - 1].at(y, x)), far = load<vec>(fars[RINGS - 1].at(y, x)), unsure = {};
-        if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is as large
+        if (!any_of((near + far > s) | (is_ramp > none))) {  // no step is large enough
           store(marks_of_row + k, is_valid ? none : all((float)UNSURE * (RINGS + 1)));
           continue;
         }
@@ -723,10 +741,10 @@ class Repair {
         store(sides, kind + convert(is_near * (float)KINDS));
         if (found) measure(*found, edges_here, level, is_near, climb(raw.at(y, x), -1, 1, -raw.pitch, raw.pitch, gap));
         for (; edges_here; edges_here &= edges_here - 1) {
-          const int n = __builtin_ctz(edges_here), is_asked = asked[sides[n]];
+          const int n = __builtin_ctz(edges_here), is_selected = selected[sides[n]];
           *edges = {(int)row + x + n, nearest[n], farthest[n], (uint8_t)kinds[n]};
-          marks_of_row[k + n] += (float)(LISTED * is_asked);
-          edges += is_asked;
+          marks_of_row[k + n] += (float)(LISTED * is_selected);
+          edges += is_selected;
         }
       }
       uint8_t *marks = marks_.data() + row + inner.x0;
@@ -735,8 +753,8 @@ class Repair {
     return edges;
   }
 
-  // Adds what the chosen ones of some pixels at edges tell of edges.
-  static void measure(Found &found, int chosen, vec level, vec is_near, vec climbed) {
+  // Adds selected edge pixels to the statistics.
+  static void measure(EdgeSums &found, int chosen, vec level, vec is_near, vec climbed) {
     for (; chosen; chosen &= chosen - 1) {
       const int n = __builtin_ctz(chosen);
       const bool is_middle = is_mixed(level[n]);
@@ -747,7 +765,7 @@ class Repair {
     }
   }
 
-  // Steepness where it goes on from one side to the other, and by how much the change on one side exceeds it.
+  // slope: the gradient where it has the same sign on both sides, else 0. jump: how much the steeper side exceeds it.
   void slopes(const Grid &raw, const Grid &slope, const Grid &jump, const Part &part) const {
     const auto known = [](vec change) { return size_of(change) <= all(FINITE) ? change : vec{}; };
     each_vector(part, [&](int y, int x) {
@@ -762,14 +780,15 @@ class Repair {
     });
   }
 
-  // The surfaces at both ends of ramps, near in `high` and far, negative, in `low`. A ramp ends, a slope goes on.
+  // Nearness at both ends of each ramp: near in `high`, far in `low`, negated. Clears the ramp mark on slopes, which do
+  // not flatten within FLAT_REACH pixels.
   void end_ramps(const Grid &up, const Grid &down, const Grid &slope, const Grid &high, const Grid &low, const Grid &rows, const Grid &ramp,
                  const Part &ramps) const {
     const Part around = ramps.grown(FLAT_REACH), inside = in_frame(ramps);
-    go_on(slope, around.grown(2));
+    clamp_to_frame(slope, around.grown(2));
     sums<2>(slope, high, rows, around, -1.0f / 25.0f);
-    go_on(high, around);
-    highest<FLAT_REACH>(high, low, rows, ramps);
+    clamp_to_frame(high, around);
+    max_filter<FLAT_REACH>(high, low, rows, ramps);
     struct Piece {
       int y, x;
       vec near, far;
@@ -801,8 +820,8 @@ class Repair {
       for (Piece &b : pieces) {
         const vec near = load<vec>(high.at(b.y, b.x)), far = load<vec>(low.at(b.y, b.x));
         const auto is_ramp = load<vec>(ramp.at(b.y, b.x)) > vec{};
-        b.near = is_ramp ? highest_beside(high.at(b.y, b.x), high.pitch) : near;
-        b.far = is_ramp ? highest_beside(low.at(b.y, b.x), low.pitch) : far;
+        b.near = is_ramp ? max_3x3(high.at(b.y, b.x), high.pitch) : near;
+        b.far = is_ramp ? max_3x3(low.at(b.y, b.x), low.pitch) : far;
         changed = (b.near > near) | (b.far > far) ? all(1.0f) : changed;
       }
       for (const Piece &b : pieces) {
@@ -812,9 +831,10 @@ class Repair {
     }
   }
 
-  // Which of two surfaces pixels show, by their colour; and how near these are, if that is wanted.
+  // For each edge: the score of its surfaces by colour and, if wanted, their nearness.
   void judge(std::vector<Group> &groups, bool wants_surfaces) const {
-    const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });  // none is its own witness
+    // not its own reference
+    const std::vector<float> falloff = window([](float square) { return square > 0 ? std::exp(-square / 12.5f) : 0.0f; });
     parallel((int)groups.size(), [&](int g) {
       if (groups[g].edges.empty()) return;
       switch (channels_) {
@@ -827,6 +847,9 @@ class Repair {
   }
 
   // C: channels, or 0 for any number.
+  //
+  // The reference colours of a surface are those of the window's pixels whose nearness is within a quarter of the gap.
+  // A surface's likelihood is the mean of (1 + d / spread)^-2 over them, d being the squared colour difference.
   template <int C>
   void judge(Group &group, const float *falloff, bool wants_surfaces) const {
     const int channels = C ? C : channels_, count = 4 + 2 * channels;
@@ -841,7 +864,8 @@ class Repair {
       vec lanes;
     };
     std::vector<Lanes> many(C ? 0 : count);
-    std::vector<float> numbers(C ? 0 : count + 3 + channels), of_lanes((count + channels) * LANES);  // of LANES pixels: totals, own colours
+    // of LANES pixels: totals, own colours
+    std::vector<float> numbers(C ? 0 : count + 3 + channels), of_lanes((count + channels) * LANES);
     struct Window {
       vec weights[2][WINDOW], values[WINDOW], apart[WINDOW];
     } windows[LANES];
@@ -854,7 +878,8 @@ class Repair {
       const vec most_off = all(0.25f * std::max(near - far, 1e-12f));
       vec few[C ? 4 + 2 * C : 1];
       float few_sums[C ? 4 + 2 * C + 3 : 1], few_own[C ? C : 1];
-      vec *sums = C ? few : &many[0].lanes;  // of weights, of what colours are apart, and of colours: of both surfaces each
+      // of both surfaces: weights, squared colour differences, colour differences of each channel
+      vec *sums = C ? few : &many[0].lanes;
       float *totals = C ? few_sums : numbers.data(), *own = C ? few_own : numbers.data() + count + 3;
       for (int n = 0; n < count; n++) sums[n] = none;
       const float *given_at = given.at(y - REACH, x - REACH), *witness_at = witness.at(y - REACH, x - REACH), *colour_at = colour.at(y - REACH, x - REACH);
@@ -895,15 +920,15 @@ class Repair {
       vec spread = 2.25e-4f * noise + 1e-12f;
       for (int side = 0; side < 2; side++) spread += 0.5f * most(of(2 + side) * per_total[side] - from_mean[side], none);
       const vec per_light = 1.0f / (0.0225f * square + 1e-12f), per_spread = 1.0f / (0.3f * spread);
-      const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours tell
-      const vec tells = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
+      const auto is_known = (of(0) > 1e-3f) & (of(1) > 1e-3f);  // else the neighbours decide
+      const vec reliability = is_known ? most(contrast / (contrast + 0.5f * spread) - 0.1f, none) / 0.9f : one;
       float likely[2][LANES], surfaces[2][LANES], *around = group.around[k / LANES].alike[0];
       for (int l = 0; l <= lane; l++) {
         const Window &window = windows[l];
         const Edge &edge = group.edges[k - lane + l];
         const float *apart_at = (const float *)window.apart + REACH * WHOLE + REACH;
         for (int n = 0; n < 8; n++) around[n * LANES + l] = apart_at[NEIGHBOURS[n][0] * WHOLE + NEIGHBOURS[n][1]];
-        vec parts[6] = {};  // of likelihood, and of weights and nearness: of both surfaces each
+        vec parts[6] = {};  // of both surfaces: likelihood, weights, weighted nearness
         for (int n = 0; n < WINDOW; n++) {
           const vec t = 1.0f + window.apart[n] * per_spread[l], alike = 1.0f / (t * t);
           for (int side = 0; side < 2; side++) {
@@ -931,47 +956,48 @@ class Repair {
       for (int l = 0; l <= lane; l++) {
         const Edge &edge = group.edges[k - lane + l];
         score_[edge.i] = is_known[l] ? clamp(std::log(odds[l]), -8.0f, 8.0f) : 0.0f;
-        group.judged[k - lane + l] = {0.0f, tells[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
+        group.judged[k - lane + l] = {0.0f, reliability[l], is_known[l] ? surfaces[0][l] : edge.near, is_known[l] ? surfaces[1][l] : edge.far};
       }
     });
   }
 
-  // Neighbours of like colour decide together: calls body(edge, evidence) for each of all groups' edges that has its score.
+  // Averages the scores of neighbours of similar colour, then calls body(edge, evidence) for each edge. evidence: 0 to
+  // 1.
   template <typename Body>
   void decide(const std::vector<Group> &groups, const Body &body) const {
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
       if (group.edges.empty()) return;
-      const Grid said(group.bounds.grown(1));
-      take_listed(score_.data(), said, UNSAID);
-      float beside[9][LANES];  // scores around LANES pixels, and their own
+      const Grid scores(group.bounds.grown(1));
+      take_listed(score_.data(), scores, NO_SCORE);
+      float beside[9][LANES];  // scores of the 8 neighbours of LANES pixels, and their own
       each_edge(group, [&](size_t k, const Edge &, int y, int x) {
         const int lane = (int)(k % LANES);
-        const float *own = said.at(y, x);
-        for (int n = 0; n < 8; n++) beside[n][lane] = own[NEIGHBOURS[n][0] * said.pitch + NEIGHBOURS[n][1]];
+        const float *own = scores.at(y, x);
+        for (int n = 0; n < 8; n++) beside[n][lane] = own[NEIGHBOURS[n][0] * scores.pitch + NEIGHBOURS[n][1]];
         beside[8][lane] = *own;
         if (lane < LANES - 1 && k + 1 < group.edges.size()) return;
         const float *around = group.around[k / LANES].alike[0];
         const vec none = {};
         vec total = all(1.0f), score = load<vec>(beside[8]), strongest = size_of(score);
         for (int n = 0; n < 8; n++) {
-          const vec other = load<vec>(beside[n]), alike = other < UNSAID ? load<vec>(around + n * LANES) : none;
+          const vec other = load<vec>(beside[n]), alike = other < NO_SCORE ? load<vec>(around + n * LANES) : none;
           total += alike;
           score += alike * other;
-          strongest = most(strongest, other < UNSAID ? size_of(other) : none);
+          strongest = most(strongest, other < NO_SCORE ? size_of(other) : none);
         }
         score /= total;
         for (int l = 0; l <= lane; l++) {
           const size_t at = k - lane + l;
-          const float tells = group.judged[at].tells;
-          group.judged[at].score = clamp(SHARPNESS * tells * score[l], -6.0f, 6.0f);
-          body(group.edges[at], clamp01(2.0f * tells * strongest[l] - 1.0f));
+          const float reliability = group.judged[at].reliability;
+          group.judged[at].score = clamp(SHARPNESS * reliability * score[l], -6.0f, 6.0f);
+          body(group.edges[at], clamp01(2.0f * reliability * strongest[l] - 1.0f));
         }
       });
     });
   }
 
-  // Values of listed pixels of a plane; another one elsewhere.
+  // Copies a plane where pixels are listed, a constant elsewhere.
   void take_listed(const float *plane, const Grid &grid, float elsewhere) const {
     const Part inside = in_frame(grid);
     for (int y = inside.y0; y < inside.bottom(); y++) {
@@ -980,10 +1006,10 @@ class Repair {
       const uint8_t *marks = marks_.data() + (size_t)y * width_;
       for (int x = inside.x0; x < inside.right(); x++) row[x] = marks[x] & LISTED ? from[x] : elsewhere;
     }
-    go_on(grid, grid);
+    clamp_to_frame(grid, grid);
   }
 
-  // Whether what colours say agrees with the map where that is hardly in doubt.
+  // Whether colours agree with the map at pixels where the map is most likely right.
   bool is_related(const std::vector<Group> &groups) const {
     double total = 0, agreed = 0;
     for (const Group &group : groups)
@@ -998,28 +1024,29 @@ class Repair {
     return (agreed + 0.5f * PRIOR_COUNT) / (total + PRIOR_COUNT) > RELATED;
   }
 
-  // Share of pixels that show the near surface, by kind.
+  // Share of pixels that show the near surface, by kind: a maximum-likelihood fit (EM) to the scores, with PRIOR_COUNT
+  // pixels assumed at the share that an almost exact map has.
   void calibrate(const std::vector<Group> &groups) {
     std::vector<float> assumed(PLACES), start(PLACES);
     for (int p = 0; p < PLACES; p++) {
       assumed[p] = p < RINGS ? TRUSTED : p < 2 * RINGS ? 1.0f - TRUSTED : (p - 2 * RINGS + 0.5f) / LEVELS;
       start[p] = p < 2 * RINGS ? 0.5f : assumed[p];
     }
-    std::vector<Witnesses> heard(KINDS);
+    std::vector<Observations> observations(KINDS);
     for (const Group &group : groups)
       for (size_t k = 0; k < group.edges.size(); k++) {
         const float score = group.judged[k].score;
-        Witnesses &witnesses = heard[group.edges[k].kind];
-        witnesses.weights.push_back(std::min(0.5f * std::fabs(score), 1.0f));
-        witnesses.odds.push_back(std::exp(-score));
+        Observations &observed = observations[group.edges[k].kind];
+        observed.weights.push_back(std::min(0.5f * std::fabs(score), 1.0f));
+        observed.odds.push_back(std::exp(-score));
       }
-    for (Witnesses &witnesses : heard)
-      for (std::vector<float> *values : {&witnesses.weights, &witnesses.odds}) values->resize((values->size() + LANES - 1) / LANES * LANES);
-    const std::vector<float> together = fit(heard, DIRECTIONS, start, assumed);
+    for (Observations &observed : observations)
+      for (std::vector<float> *values : {&observed.weights, &observed.odds}) values->resize((values->size() + LANES - 1) / LANES * LANES);
+    const std::vector<float> together = fit(observations, DIRECTIONS, start, assumed);
     std::vector<float> each(KINDS);
     for (int k = 0; k < KINDS; k++) each[k] = together[k / DIRECTIONS];
-    shares_ = fit(heard, 1, std::vector<float>(KINDS, 0.5f), each);
-    // where the pixels beside a step are right those farther away are too
+    shares_ = fit(observations, 1, std::vector<float>(KINDS, 0.5f), each);
+    // a pixel farther from the step is not more often wrong than one nearer to it
     for (int r = 1; r < RINGS; r++)
       for (int d = 0; d < DIRECTIONS; d++) {
         float *far = &shares_[r * DIRECTIONS + d], *near = &shares_[(RINGS + r) * DIRECTIONS + d];
@@ -1028,18 +1055,18 @@ class Repair {
       }
   }
 
-  // What pixels of a kind said of which of two surfaces they show; the rest of the last vector says nothing.
-  struct Witnesses {
+  // Scores of the pixels of one kind: weight, and odds of the far surface. Padded to whole vectors with weight 0.
+  struct Observations {
     std::vector<float> weights, odds;
   };
 
-  static std::vector<float> fit(const std::vector<Witnesses> &heard, int together, std::vector<float> share, const std::vector<float> &assumed) {
+  static std::vector<float> fit(const std::vector<Observations> &observations, int together, std::vector<float> share, const std::vector<float> &assumed) {
     const auto sum_of = [&](size_t first, const auto &part) {
       double totals[LANES] = {}, total = 0;
       for (size_t kind = first; kind < first + together; kind++)
-        for (size_t n = 0; n < heard[kind].weights.size(); n += LANES) {
+        for (size_t n = 0; n < observations[kind].weights.size(); n += LANES) {
           float parts[LANES];
-          store(parts, part(load<vec>(&heard[kind].weights[n]), load<vec>(&heard[kind].odds[n])));
+          store(parts, part(load<vec>(&observations[kind].weights[n]), load<vec>(&observations[kind].odds[n])));
           for (int i = 0; i < LANES; i++) totals[i] += parts[i];
         }
       for (const double each : totals) total += each;
@@ -1056,20 +1083,20 @@ class Repair {
     return share;
   }
 
-  // Standard deviation of the blur that made ramps of steps.
+  // Standard deviation, in pixels, of the blur that turned steps into ramps.
   float blur() const {
     const double width = CLIMBED * found_.middles / std::max(found_.climbed, 1e-12);
     return clamp((float)std::sqrt(std::max(width * width - PIXEL, 0.0)), 0.2f, 3.0f);
   }
 
-  // Marks the pixels that show the near surface; returns how many pixels of it at each edge the map has as far ones.
+  // Decides which surface pixels show. Returns the width, in pixels, by which the map's near surfaces are too thin.
   float choose(const std::vector<Group> &groups) {
     const float lean = map_.automatic ? LEAN : 0.0f;
     float prior[KINDS];
     for (int k = 0; k < KINDS; k++) prior[k] = std::log(shares_[k] / (1.0f - shares_[k]));
     std::vector<int64_t> lost(groups.size(), 0);
     decide(groups, [&](const Edge &edge, float evidence) { evidence_[edge.i] = evidence; });
-    parallel((int)groups.size(), [&](int g) { // only now: to decide, each group reads the marks beside it
+    parallel((int)groups.size(), [&](int g) {  // only after all decisions, which read the marks of neighbouring groups
       for (size_t k = 0; k < groups[g].edges.size(); k++) {
         const Edge &edge = groups[g].edges[k];
         const float score = groups[g].judged[k].score;
@@ -1084,20 +1111,20 @@ class Repair {
     return (float)(total / std::max(found_.length, 1e-12));
   }
 
-  // How far thin structures can have lost nearness, 0 to 1: none where the map's surfaces are too large.
-  static float is_lost(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
+  // How much nearness thin structures may have lost, 0 to 1: 0 where the map's near surfaces are too wide.
+  static float loss_factor(float lost_px) { return clamp01(2.4f + 2.5f * lost_px); }
 
-  // Gives pixels the depth of the surface that they show; on ramps as far as there is evidence.
+  // Moves pixels to the nearness of the surface that they show; on ramps in proportion to the evidence.
   void move(const std::vector<Group> &groups, bool is_soft) const {
     parallel((int)groups.size(), [&](int g) {
       const Group &group = groups[g];
       if (group.edges.empty()) return;
-      // from the ends of a wide ramp only one of the surfaces is in sight: what is three pixels away tells
+      // near the end of a wide ramp only one surface is in reach: use the strongest evidence within three pixels
       const Part around = group.bounds.grown(3);
       const Grid evidence(around), strongest(group.bounds), rows(around);
-      if (is_soft || !map_.automatic) {  // else no ramp is asked
+      if (is_soft || !map_.automatic) {  // else no ramps are selected
         take_listed(evidence_.data(), evidence, 0.0f);
-        highest<3>(evidence, strongest, rows, group.bounds);
+        max_filter<3>(evidence, strongest, rows, group.bounds);
       }
       each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
         const uint8_t marks = marks_[edge.i];
@@ -1114,7 +1141,7 @@ class Repair {
     float least, difference, fit;
   };
 
-  // Weights of a window, which sum to 1.
+  // Gaussian weights of a window; they sum to 1.
   static std::vector<float> even_window() {
     std::vector<float> weights = window([](float square) { return std::exp(-square / 18.0f); });
     float total = 0;
@@ -1123,12 +1150,13 @@ class Repair {
     return weights;
   }
 
-  // Nearness around a pixel as a + b blurred, which must explain what the shape does not that is not blurred.
+  // Fits nearness around a pixel as least + difference * blurred by weighted least squares. fit: 0 to 1, high where the
+  // blurred shape explains the nearness much better than the unblurred one.
   static Line regress(const Grid &given, const Grid &shape, const Grid &blurred, const float *weights, int y, int x) {
     const float own = *given.at(y, x), *given_at = given.at(y - REACH, x - REACH);
     const float *covers[2] = {blurred.at(y - REACH, x - REACH), shape.at(y - REACH, x - REACH)};
     const int pitches[2] = {blurred.pitch, shape.pitch};
-    vec of_y[2] = {}, of_covers[2][3] = {};  // sums of y, y y; and of x, x x, x y
+    vec of_y[2] = {}, of_covers[2][3] = {};  // weighted sums of y, y y; and of x, x x, x y for both shapes
     each_of_window([&](int n, const auto &take) {
       const vec weight = load<vec>(weights + n * LANES), none = {}, cy = take(given_at, given.pitch) - own, wy = weight * cy;
       of_y[0] += wy;
@@ -1152,7 +1180,7 @@ class Repair {
     return {mean_y - b * mean_x[0] + own, b, of_x[0] > 0.004f ? clamp01((explained[0] - 0.5f) / 0.3f) * better : 0.0f};
   }
 
-  // The surfaces at a soft map's edges where one is thin: as near and far as its blurred shape explains best.
+  // In a soft map's thin structures: replaces the nearness of the surfaces by the fit of the blurred shape.
   void unmix(const std::vector<Group> &groups, float sigma, float lost_px) const {
     const std::vector<float> weights = even_window();
     parallel((int)groups.size(), [&](int g) {
@@ -1170,8 +1198,8 @@ class Repair {
     fetch(map_.nearness, up, [this](float v) { return sign_ * valid(v); });
     fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
     for (size_t i = 0; i < up.size; i++) down.at(whole.y0, whole.x0)[i] = -up.at(whole.y0, whole.x0)[i];
-    highest<SIDE_REACH>(up, high, rows, labelled);
-    highest<SIDE_REACH>(down, low, rows, labelled);
+    max_filter<SIDE_REACH>(up, high, rows, labelled);
+    max_filter<SIDE_REACH>(down, low, rows, labelled);
     each_vector(labelled, [&](int y, int x) {
       const auto is_near = 2.0f * load<vec>(up.at(y, x)) > load<vec>(high.at(y, x)) - load<vec>(low.at(y, x));
       store(high.at(y, x), is_near ? all(1.0f) : vec{});
@@ -1182,12 +1210,12 @@ class Repair {
       float *label = high.at(y, 0);
       for (int x = inside.x0; x < inside.right(); x++) label[x] = marks[x] & EDGE ? (marks[x] & NEAR ? 1.0f : 0.0f) : label[x];
     }
-    go_on(high, labelled);
+    clamp_to_frame(high, labelled);
     gaussian(high, blurred, rows, around, sigma);
     each_edge(group, [&](size_t k, const Edge &edge, int y, int x) {
       if (!is_thin[k]) return;
       Line line = regress(given, high, blurred, weights, y, x);
-      line.fit *= is_lost(marks_[edge.i] & NEAR ? lost_px : -lost_px);
+      line.fit *= loss_factor(marks_[edge.i] & NEAR ? lost_px : -lost_px);
       float &near = group.judged[k].near, &far = group.judged[k].far;
       const float gap = near - far;
       if (marks_[edge.i] & NEAR)
@@ -1197,13 +1225,13 @@ class Repair {
     });
   }
 
-  // Which of a group's pixels belong to a surface that no 5 x 5 pixels near them show whole.
+  // For each edge pixel: 1 if its surface is thin, that is, no 5 x 5 square nearby lies wholly in it.
   std::vector<uint8_t> thin(const Group &group) const {
     const Part around = group.bounds.grown(4);
     const int pitch = around.width;
     const size_t size = (size_t)around.height * pitch;
     std::vector<uint8_t> memory(2 * size + 4 * pitch, 3);
-    uint8_t *shape = memory.data(), *rows = shape + size + 2 * pitch;  // a bit for each surface: near, far
+    uint8_t *shape = memory.data(), *rows = shape + size + 2 * pitch;  // bit 1: near surface, bit 2: far surface
     const Part inside = in_frame(around);
     for (int y = inside.y0; y < inside.bottom(); y++) {
       const uint8_t *marks = marks_.data() + (size_t)y * width_;
@@ -1223,7 +1251,7 @@ class Repair {
         const uint8_t *p = rows + y * pitch + x;
         shape[y * pitch + x] = p[-2 * pitch] & p[-pitch] & p[0] & p[pitch] & p[2 * pitch];
       }
-    for (int y = around.y0; y < around.bottom(); y++) {  // beyond the frame there is none
+    for (int y = around.y0; y < around.bottom(); y++) {  // outside the frame belongs to no surface
       uint8_t *row = shape + (y - around.y0) * pitch;
       if (y < 0 || y >= height_) memset(row, 0, pitch);
       memset(row, 0, inside.x0 - around.x0);
@@ -1243,7 +1271,7 @@ class Repair {
     return found;
   }
 
-  // Lamps of a few pixels, whose nearness a soft map spreads around them.
+  // Restores the nearness of lamps a few pixels wide, which a soft map has spread around them.
   void lift_lamps(float sigma, float lost_px) const {
     const std::vector<float> weights = even_window();
     const std::vector<Group> all_parts = tiles();
@@ -1263,15 +1291,15 @@ class Repair {
       const Part around = bounds(group, [](size_t) { return true; }).grown(REACH), covered = around.grown(reach), whole = covered.grown(USUAL_REACH);
       const Grid bright(whole), usual(whole), rows(whole), peak(covered), blurred(around), given(around);
       brightest(bright, usual, rows, covered);
-      highest<2>(bright, peak, rows, covered);
+      max_filter<2>(bright, peak, rows, covered);
       each_vector(covered, [&](int y, int x) {
         const vec own = load<vec>(bright.at(y, x));
         store(usual.at(y, x), own > 2.0f * load<vec>(usual.at(y, x)) ? own / most(load<vec>(peak.at(y, x)), all(1e-30f)) : vec{});
       });
-      go_on(usual, covered);
+      clamp_to_frame(usual, covered);
       gaussian(usual, blurred, rows, around, sigma);
       fetch(map_.nearness, given, [this](float v) { return sign_ * valid(v); });
-      const Grid lamps(part.grown(LAMP_REACH), 3);  // weights, and by these nearness and how well it fits
+      const Grid lamps(part.grown(LAMP_REACH), 3);  // planes: weight, weight * nearness, weight * fit
       std::fill(lamps.at(lamps.y0, lamps.x0), lamps.at(lamps.y0, lamps.x0) + 3 * lamps.size, 0.0f);
       each_edge(group, [&](size_t, const Edge &, int y, int x) {
         const Line line = regress(given, usual, blurred, weights.data(), y, x);
@@ -1281,7 +1309,7 @@ class Repair {
         lamp[lamps.size] = weight * (line.least + std::max(line.difference, 0.0f));
         lamp[2 * lamps.size] = weight * line.fit;
       });
-      // the pixels of a lamp are one surface
+      // all pixels of a lamp get one nearness
       each_edge(group, [&](size_t, const Edge &lamp, int y, int x) {
         if (!inner.has(y, x)) return;
         float sums[3] = {0, 0, 0};
@@ -1290,12 +1318,12 @@ class Repair {
             for (int n = 0; n < 3; n++) sums[n] += lamps.at(std::min(std::max(v, 0), height_ - 1), std::min(std::max(u, 0), width_ - 1))[n * lamps.size];
         const float per_weight = 1.0f / std::max(sums[0], 1e-9f);
         const float repaired = sign_ * map_.out[lamp.i];
-        map_.out[lamp.i] = sign_ * (repaired + sums[2] * per_weight * is_lost(lost_px) * std::max(sums[1] * per_weight - repaired, 0.0f));
+        map_.out[lamp.i] = sign_ * (repaired + sums[2] * per_weight * loss_factor(lost_px) * std::max(sums[1] * per_weight - repaired, 0.0f));
       });
     });
   }
 
-  // The brightest channel of a grid's pixels, and in a part of it what is usual around.
+  // bright: the brightest channel of each pixel; usual: in a part, the square of the mean of its root around the pixel.
   void brightest(const Grid &bright, const Grid &usual, const Grid &rows, const Part &part) const {
     const Grid light{Part(bright)};
     const int first = std::max(0, -bright.x0), last = std::min(bright.pitch, width_ - bright.x0);
@@ -1314,7 +1342,7 @@ class Repair {
     each_vector(part, [&](int y, int x) { store(usual.at(y, x), load<vec>(usual.at(y, x)) * load<vec>(usual.at(y, x))); });
   }
 
-  // The pixels of lamps in a part; up: its nearness, and that of what is REACH around.
+  // The pixels of lamps in a part; up: nearness of the part and of REACH pixels around it.
   std::vector<Edge> lamps_of(const Part &part, const Grid &up) const {
     const Part whole = part.grown(USUAL_REACH);
     const Grid bright(whole), usual(part), rows(whole);
@@ -1326,9 +1354,9 @@ class Repair {
     const Part &around = up;
     const Grid down(around), high(part), low(part), peak(part);
     fetch(map_.nearness, down, [this](float v) { return -sign_ * valid(v); });
-    highest<REACH>(up, high, rows, part);
-    highest<REACH>(down, low, rows, part);
-    highest<2>(bright, peak, rows, part);
+    max_filter<REACH>(up, high, rows, part);
+    max_filter<REACH>(down, low, rows, part);
+    max_filter<2>(bright, peak, rows, part);
     for (int y = part.y0; y < part.bottom(); y++)
       for (int x = part.x0; x < part.right(); x++) {
         const size_t i = (size_t)y * width_ + x;
@@ -1339,10 +1367,10 @@ class Repair {
     return found;
   }
 
-  // How far a blur reaches: no farther than float32 can tell.
+  // Radius of the blur in pixels; beyond 6 sigma a Gaussian is below float32 precision.
   static int blur_reach(float sigma) { return std::min(BLUR_REACH, (int)std::ceil(6.0f * sigma)); }
 
-  // A part of a grid under a Gaussian; beyond the frame it goes on as it is at its border.
+  // Gaussian blur of a part; values beyond the frame are replaced by the nearest value inside.
   void gaussian(const Grid &in, const Grid &out, const Grid &rows, const Part &part, float sigma) const {
     const int reach = blur_reach(sigma);
     float kernel[BLUR_REACH + 1], total = 0;
@@ -1361,21 +1389,21 @@ class Repair {
       for (int d = 1; d <= reach; d++) spread += kernel[d] * (load<vec>(from - d * rows.pitch) + load<vec>(from + d * rows.pitch));
       store(out.at(y, x), spread);
     });
-    go_on(out, part);
+    clamp_to_frame(out, part);
   }
 
   const torchdof_map &map_;
-  const float sign_;  // of nearness in the map
+  const float sign_;  // -1 for a map of coc, where larger is farther
   const int height_, width_, channels_;
   const size_t area_;
-  float noise_step_ = 0.0f;  // of a map's noise
+  float noise_step_ = 0.0f;  // least step that stands out of the map's noise
   Buffer<float> score_, evidence_;
   Buffer<uint8_t> marks_;
-  Buffer<Judgement> judged_;  // of the pixels listed last
+  Buffer<Judgement> judged_;  // of the edges given memory last
   Buffer<Around> around_;
-  mutable std::vector<Scratch> scratch_;  // of threads
+  mutable std::vector<Scratch> scratch_;  // one for each thread
   std::vector<float> shares_;
-  Found found_;
+  EdgeSums found_;
 };
 
 }  // namespace

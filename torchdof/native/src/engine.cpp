@@ -1,4 +1,4 @@
-// A job from its scene to the picture.
+// Prepares a scene: cleaned copies, second surfaces, highlights.
 #include "engine.h"
 
 #include "variants.h"
@@ -29,7 +29,7 @@ Job::Job(const torchdof_scene &scene)
   }
 }
 
-// Least and largest value of each block of a band, whose rows are read one after the other, as they lie in memory.
+// Smallest and largest value of each block of a band. Rows are read in memory order.
 static void ends_of(const float *values, int width, int rows, float *low, float *high) {
   const int blocks = ceil_div(width, BLOCK);
   std::vector<float> lows((size_t)blocks * LANES, INFINITY), highs(lows.size(), -INFINITY);
@@ -54,7 +54,7 @@ static void ends_of(const float *values, int width, int rows, float *low, float 
   }
 }
 
-// What is given, without what is not finite, and within reach of the layers.
+// Takes the inputs; replaces values that are not finite, and clamps coc to the range of the layers.
 void Job::take_scene() {
   surfaces.height = height;
   surfaces.width = width;
@@ -130,7 +130,7 @@ void Job::take_scene() {
     light_least[i % channels] = std::min(light_least[i % channels], leasts[i]);
     light_most[i % channels] = std::max(light_most[i % channels], mosts[i]);
   }
-  constexpr float BRIGHTEST = 268435456.0f;  // 2 to the 28th: powers of light are summed
+  constexpr float BRIGHTEST = 268435456.0f;  // 2^28: powers of light are summed
   for (int c = 0; c < channels; c++)
     if (scene.kind != TORCHDOF_STACK && std::max(light_most[c], -light_least[c]) > BRIGHTEST) throw TooBright();
   if (std::count(beyond.begin(), beyond.end(), 1)) {
@@ -188,13 +188,13 @@ void Job::begin() {
   if (scene.kind == TORCHDOF_STACK) return;
   const bool several = layers.size() > 1 || scene.shares, background = scene.kind == TORCHDOF_BACKGROUND;
   const float reach = std::max(std::fabs(coc_at(layers.front().node)), std::fabs(coc_at(layers.back().node)));
-  // without occlusion highlights matter where coarse layers would soften them
+  // without occlusion, highlights need rays only where coarse layers would blur their outlines
   const bool limited = several && (scene.occlusion || (scene.highlights && scene.crisp_px < reach));
   if (limited || scene.occlusion || scene.normalize) find_threshold();
   if (background) {
     surfaces.count = 2;
     split_mixed();
-    put_before_background();
+    add_background();
   } else if (limited && scene.occlusion) {
     surfaces.count = 2;
     split_mixed();

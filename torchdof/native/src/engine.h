@@ -1,4 +1,5 @@
-// What the parts of the engine share. Each is compiled once for every set of instructions, in a namespace of its own.
+// Declarations shared by the engine's files. Each is compiled once for every instruction set, in a namespace of its
+// own.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -36,7 +37,7 @@ inline void store(T *p, V v) {
   *(unaligned *)p = v;
 }
 inline vec all(float v) { return v - vec{}; }
-// The larger and the smaller of two; b where one of them is no number.
+// The larger and the smaller of two values; b if a is NaN.
 template <typename V>
 inline V most(V a, V b) {
   return a > b ? a : b;
@@ -45,7 +46,7 @@ template <typename V>
 inline V least(V a, V b) {
   return a < b ? a : b;
 }
-#if defined(__AVX2__)  // compilers do not always see that these are one instruction
+#if defined(__AVX2__)  // compilers do not always find the single instruction
 template <>
 inline vec most(vec a, vec b) {
   return __builtin_ia32_maxps256(a, b);
@@ -77,7 +78,7 @@ inline float sum(vec v) {
   const quad total = quad_of(v);
   return (total[0] + total[1]) + (total[2] + total[3]);
 }
-// The sum of each of many vectors; goes up to three numbers beyond them.
+// Sums each of `count` vectors; writes up to three values beyond them.
 inline void sum(const vec *v, int count, float *out) {
   for (int i = 0; i < count; i += 4) {
     const quad none = {}, a = quad_of(v[i]), b = i + 1 < count ? quad_of(v[i + 1]) : none, c = i + 2 < count ? quad_of(v[i + 2]) : none, d = i + 3 < count ? quad_of(v[i + 3]) : none;
@@ -85,7 +86,7 @@ inline void sum(const vec *v, int count, float *out) {
     store(out + i, quad{ab[0], ab[1], cd[0], cd[1]} + quad{ab[2], ab[3], cd[2], cd[3]});
   }
 }
-// Of eight values those of the lanes' indices.
+// Looks up LANES of eight values by index.
 inline vec pick(const float *values, ivec index) {
 #if defined(__AVX2__)
   return (vec)__builtin_ia32_permvarsf256(load<vec>(values), index);
@@ -110,7 +111,7 @@ inline float clamp01(float v) { return clamp(v, 0.0f, 1.0f); }
 inline int ceil_div(int a, int b) { return (a + b - 1) / b; }
 inline int floor_div(int a, int b) { return a >= 0 ? a / b : -((-a + b - 1) / b); }
 
-// Memory that starts as it is found.
+// Uninitialized memory.
 template <typename T>
 class Buffer {
  public:
@@ -126,41 +127,41 @@ class Buffer {
   std::unique_ptr<T, Give> data_;
 };
 
-constexpr int BLOCK = 16;  // pixels a side in which second surfaces are kept
+constexpr int BLOCK = 16;  // side in pixels of the blocks in which second surfaces are stored
 constexpr int BLOCK_PIXELS = BLOCK * BLOCK;
-constexpr int CELL = 8;              // pixels a side in which layers and nearest surfaces are told apart
-constexpr int TILE = 64;             // pixels a side that are composited together
-constexpr float NEVER = 1e9f;        // a coc that no pixel has
-constexpr float HIDDEN_WEIGHT = 0.003f;  // of a hidden surface against 1 of a visible one
+constexpr int CELL = 8;              // side in pixels of the cells for which layers and occluders are listed
+constexpr int TILE = 64;             // side in pixels of the tiles that are composited at once
+constexpr float NEVER = 1e9f;        // larger than any coc
+constexpr float HIDDEN_WEIGHT = 0.003f;  // weight of a filled hidden surface, against 1 for a visible one
 
-// The surfaces of BLOCK x BLOCK pixels in which there are two, or one that differs from the image.
+// The surfaces of BLOCK x BLOCK pixels where a second one exists or the first differs from the image.
 struct Block {
-  float *own;     // [channels, BLOCK_PIXELS]
-  float *other;   // the same of the second surface
+  float *own;     // light of the first surface [channels, BLOCK_PIXELS]
+  float *other;   // light of the second surface
   float *coc;     // of the second surface
   float *weight;  // of the second surface
-  float *seen;    // weight of the first
+  float *own_weight;  // of the first surface
 };
 
-constexpr float TINY = 1.17549435e-38f;  // the least that light is divided by
-// Largest light of a pixel's channels, which lie a step apart.
+constexpr float TINY = 1.17549435e-38f;  // lower limit where light is the divisor
+// Largest channel of a pixel's light; the channels lie `step` values apart.
 inline float peak_of(const float *light, size_t step, int channels) {
   float peak = *light;
   for (int c = 1; c < channels; c++) peak = std::max(peak, light[c * step]);
   return peak;
 }
 
-// Surfaces of a scene: an image with a few second surfaces, or any number of whole ones.
+// The surfaces of a scene: either an image with a second surface in some blocks, or any number of full planes.
 class Surfaces {
  public:
   int height, width, channels, count;
-  bool independent = false;  // they cover their pixels whatever the others do; else their weights are shares
+  bool independent = false;  // surfaces hide each other by their own coverage; otherwise their weights sum to 1
   const float *light = nullptr, *coc = nullptr, *valid = nullptr;  // of the image
-  std::vector<const float *> lights, cocs, weights;                // of whole surfaces
+  std::vector<const float *> lights, cocs, weights;                // of full planes
   int block_rows, block_columns;
-  std::vector<float *> blocks;  // null where the image says all
+  std::vector<float *> blocks;  // null where the image has only one surface
 
-  bool whole() const { return !lights.empty(); }
+  bool full_planes() const { return !lights.empty(); }
   size_t area() const { return (size_t)height * width; }
   bool has_block(int i) const { return blocks[i]; }
   Block block(int i) const {
@@ -168,18 +169,18 @@ class Surfaces {
     return {p, p + channels * BLOCK_PIXELS, p + 2 * channels * BLOCK_PIXELS, p + (2 * channels + 1) * BLOCK_PIXELS,
             p + (2 * channels + 2) * BLOCK_PIXELS};
   }
-  // Asks for rows of a block, which lie apart, before they are needed. Not inlined, GCC takes it for one that does nothing.
+  // Prefetches rows of a block. Always inlined, because GCC otherwise removes the call as having no effect.
   __attribute__((always_inline)) void fetch_block(int i, int first, int rows) const {
     for (int k = 0; blocks[i] && k < 2 * channels + 3; k++)
       for (int y = first; y < first + rows; y++) __builtin_prefetch(blocks[i] + k * BLOCK_PIXELS + y * BLOCK);
   }
-  // The block, filled from the image if it is new.
+  // Returns a block; creates it from the image if there is none.
   Block make_block(int i);
-  // Surface i in a row, from column x on, n pixels within one block column: pointers to light of each channel, coc and
-  // weight (null: 1, and for a second surface 0).
+  // Surface i at n pixels of a row from column x, within one block column: pointers to each channel, coc and weight
+  // (null means 1). Returns false if there is no such surface.
   bool row(int i, int y, int x, const float **light_of, const float *&coc_of, const float *&weight_of) const {
     const size_t at = (size_t)y * width + x;
-    if (whole()) {
+    if (full_planes()) {
       for (int c = 0; c < channels; c++) light_of[c] = lights[i] + c * area() + at;
       coc_of = cocs[i] + at;
       weight_of = weights[i] ? weights[i] + at : nullptr;
@@ -196,43 +197,43 @@ class Surfaces {
     const Block b = block(which);
     for (int c = 0; c < channels; c++) light_of[c] = (i ? b.other : b.own) + c * BLOCK_PIXELS + within;
     coc_of = i ? b.coc + within : coc + at;
-    weight_of = (i ? b.weight : b.seen) + within;
+    weight_of = (i ? b.weight : b.own_weight) + within;
     return true;
   }
 
  private:
   static constexpr int BLOCKS_AT_ONCE = 64;
   std::mutex mutex_;
-  std::vector<Buffer<float>> memory_;  // of blocks, so many at once
+  std::vector<Buffer<float>> memory_;  // BLOCKS_AT_ONCE blocks each
   int blocks_left_ = 0;
 };
 
 struct Ray {
   int row, column;
-  int radius;  // index of the smaller of its two kernels
-  float part;  // of the larger one, which is the next
+  int radius;  // index of the smaller of the two kernels around its radius
+  float part;  // interpolation weight of the next larger kernel
   float coc;
 };
 
-// One layer, and how it is spread.
+// A layer and its blur kernel.
 struct Kernel {
   int half = 0;
-  bool symmetric = true;       // left on right
+  bool symmetric = true;       // about the vertical axis
   float sum = 0;
   std::vector<float> taps;     // see convolution.cpp
-  std::vector<int> first, last;  // columns apart from where each input row has taps; none: first > last
+  std::vector<int> first, last;  // range of column offsets with taps for each input row; empty if first > last
 };
 struct Layer {
   int scale = 1, half = 0;
   double node = 0;
-  float before = 0, per_before = 0, at = 0, per_after = 0;  // ramps to the layer and beyond it
+  float before = 0, per_before = 0, at = 0, per_after = 0;  // ends and slopes of the ramps before and after the layer
   bool first = false;
   const torchdof_shares *shares = nullptr;
-  bool spots = false;           // shares are 0 where their samples end, and beyond
-  std::vector<Kernel> kernels;  // one, or one a colour
+  bool spots = false;           // shares are 0 at and beyond the edge of their samples
+  std::vector<Kernel> kernels;  // 1, or one for each colour
 };
 
-// The blur axis, as render/layer_weights.py tells it: the place of a signed coc, from low to high, and the coc of a place.
+// The blur axis of render/layer_weights.py: the position of a signed coc, clamped to [low, high], and its inverse.
 constexpr double SQUARE_PX = 0.5, IN_FOCUS = 2e-4;
 template <typename V>
 inline V axis(V coc, float low, float high) {
@@ -244,9 +245,9 @@ inline float coc_at(double node) {
   return (float)(node == 0 ? 0 : std::copysign(beyond + std::sqrt(beyond * (beyond + 2 * SQUARE_PX)), node));
 }
 
-constexpr float FOOT = 0.15f;                 // share up to which a ramp between layers rises by its square,
-constexpr float SLOPE = 1 / (1 - FOOT / 2);  // and how it goes on
-// A ramp from 0 to 1, exactly, whose foot is a parabola.
+constexpr float FOOT = 0.15f;                 // share up to which the ramp between two layers is a parabola
+constexpr float SLOPE = 1 / (1 - FOOT / 2);  // slope of the straight part above it
+// A ramp from 0 to 1 with a parabola as its foot; exact at both ends.
 template <typename V>
 inline V eased(V v) {
   const V foot = least(v, V{} + FOOT);
@@ -258,7 +259,8 @@ inline V ramp(V v, bool ease) {
   v = least(most(v, zero), zero + 1.0f);
   return ease ? eased(v) : v;
 }
-// Of what lies at a place, the part of a layer and those behind it, and that of those behind it alone; eased under occlusion.
+// Share of a surface at place `place` that belongs to the layer or to layers behind it; and to layers behind it. Eased
+// under occlusion.
 template <typename V>
 inline V at_or_behind(const Layer &l, V place, bool ease) {
   return ramp((place - l.before) * l.per_before + (l.first ? 1.0f : 0.0f), ease);
@@ -268,18 +270,21 @@ inline V behind(const Layer &l, V place, bool ease) {
   return ramp((place - l.at) * l.per_after, ease);
 }
 
-constexpr float HAIR = 0.06f;  // share of a surface up to which, in a layer, it does not yet hide what is known behind it
-constexpr float GOES_ON = 0.1f;  // share of a pixel, beyond a hidden one's, from which on its farther surface goes on wholly
-// By how much the farther surface of a mixed pixel, which goes on behind the nearer one, may count more than its share; and by
-// how much it does in a layer that has so much of the nearer one at or behind it.
+// share in a layer at which a surface fully hides those behind it; a smaller share hides in proportion
+constexpr float HIDING_SHARE = 0.06f;
+// share of a mixed pixel's farther surface, above HIDDEN_WEIGHT, at which its continuation is full
+constexpr float CONTINUATION_SHARE = 0.1f;
+// The farther surface of a mixed pixel continues behind the nearer one. The first function gives the extra weight for
+// that continuation, from the farther surface's share of the pixel; the second the part of it that is visible in a
+// layer, from the nearer surface's share at or behind the layer.
 template <typename V>
-inline V going_on(V share) {
-  const V zero = {}, known = (share - HIDDEN_WEIGHT) * (1.0f / GOES_ON);
+inline V continuation(V share) {
+  const V zero = {}, known = (share - HIDDEN_WEIGHT) * (1.0f / CONTINUATION_SHARE);
   return (1.0f - share) * least(most(known, zero), zero + 1.0f);
 }
 template <typename V>
-inline V where_it_shows(V going_on, V nearer) {
-  return going_on * (1.0f - least(nearer * (1.0f / HAIR), V{} + 1.0f));
+inline V visible_continuation(V continuation, V nearer) {
+  return continuation * (1.0f - least(nearer * (1.0f / HIDING_SHARE), V{} + 1.0f));
 }
 
 struct Job {
@@ -288,26 +293,26 @@ struct Job {
   void finish(const RayKernels &kernels, float *out);
 
   const torchdof_scene &scene;
-  int height, width, channels, colours;  // colours: kernels a layer, 1 or channels
+  int height, width, channels, colours;  // colours: kernels of each layer, 1 or channels
   std::vector<Layer> layers;
   Surfaces surfaces;
-  std::vector<int32_t> radii;  // of highlights, in steps of 1/32 px
-  std::vector<Ray> rays;       // sorted by surface and place
+  std::vector<int32_t> radii;  // radii of highlight kernels, in steps of 1/32 px
+  std::vector<Ray> rays;       // sorted by surface and position
   std::vector<float> ray_light;  // [rays, channels]
 
-  // light behind all surfaces, at every fourth pixel [channels, behind_height, behind_width]; empty: nothing is known
+  // light behind all surfaces at every fourth pixel [channels, behind_height, behind_width]; empty if unknown
   std::vector<float> behind;
   int behind_height = 0, behind_width = 0;
   int levels = 0;  // of the pyramid that fills hidden surfaces
 
-  // Highlight threshold of cells, the first of which begins before the image
+  // Highlight threshold of each cell; the first cell begins before the image.
   std::vector<float> threshold;
   int threshold_rows = 0, threshold_columns = 0, threshold_top = 0, threshold_left = 0;
 
-  Buffer<float> clean_light, clean_coc, validity;  // copies of what is given, where it may not be taken as it is
+  Buffer<float> clean_light, clean_coc, validity;  // copies of inputs that had to be changed
   std::vector<Buffer<float>> copies;
   std::vector<float> light_least, light_most;        // of each channel
-  Buffer<float> block_low, block_high, block_peak;  // of each block the least and largest coc, and the largest light
+  Buffer<float> block_low, block_high, block_peak;  // smallest and largest coc and largest light of each block
 
   template <typename Body>
   void parallel(int count, const Body &body) const {
@@ -319,20 +324,20 @@ struct Job {
   void find_threshold();                  // highlights.cpp
   void split_mixed();                     // matting.cpp
   void fill_hidden();                     // disocclusion.cpp
-  void put_before_background();           // matting.cpp
+  void add_background();           // matting.cpp
   void extract_highlights();              // highlights.cpp
   double change_of_coc() const;
 };
 
-// Least highlight threshold of a block.
+// Smallest highlight threshold in a block.
 float least_threshold(const Job &job, int y0, int x0);
 // Highlight threshold of a pixel.
 float threshold_at(const Job &job, int y, int x);
 
-// Light beyond the frame; border.cpp
+// Estimate of the light beyond the frame; border.cpp
 class Border {
  public:
-  // Light of a surface at a place beyond the frame, given that of the nearest pixel.
+  // Light of a surface at a position beyond the frame; nearest: light of the nearest pixel inside.
   float light(int surface, int channel, int y, int x, float nearest) const {
     if (dark_) return 0;
     const int far = y < 0 ? -y : std::max(y - height_ + 1, 0), across = x < 0 ? -x : std::max(x - width_ + 1, 0);
@@ -351,7 +356,7 @@ class Border {
     const float on = !across ? from_row : !far ? from_column : (from_row * far + from_column * across) / (far + across);
     return 0.5f * (nearest * share + on);
   }
-  // The mean of it over n places one behind the other, away from a side of the frame: rows or columns from the given one on.
+  // Mean of the light at n positions in a line away from the frame; the line covers rows or columns y, x to + n - 1.
   float mean_light(int surface, int channel, int y, int x, int n, float nearest) const {
     if (dark_) return 0;
     const bool upright = y >= 0 && y < height_;
@@ -362,7 +367,7 @@ class Border {
     for (int i = 0; i < n; i++) on += mean(side, surface, channel, nearest_distance + i, place);
     return 0.5f * (nearest * shares_[side][(size_t)surface * length(side) + place] + on / n);
   }
-  // Light of n pixels above or below the frame.
+  // Overwrites n pixels of a row above or below the frame with the estimate.
   void continue_row(int surface, int channel, int y, int x, int n, float *row) const;
 
  private:
@@ -378,79 +383,84 @@ class Border {
     return *nearer + part * (*farther - *nearer);
   }
   int height_ = 0, width_ = 0, channels_ = 0, levels_ = 0;
-  std::vector<int> level_of_;   // of each distance, and how far it lies on the way to the next one
+  // for each distance beyond the frame: level of the means, and fraction of the way to the next level
+  std::vector<int> level_of_;
   std::vector<float> part_of_;
-  bool dark_ = false;  // nothing comes from there
-  std::vector<float> shares_[4];  // of each side, [surfaces, length]: of the light there, what is no highlight's
-  std::vector<float> means_[4];  // of each side, [surfaces, channels, levels, length]; level l is that of 2^l pixels
+  bool dark_ = false;  // the light beyond the frame is 0
+  // for each side [surfaces, length]: share of the border's light below the highlight threshold
+  std::vector<float> shares_[4];
+  // for each side [surfaces, channels, levels, length]; level l holds means for distance 2^l pixels
+  std::vector<float> means_[4];
 };
 Border border_of(const Job &job, int farthest);
 
-// What the image shows, as rays of highlights meet it; highlights.cpp
+// Where surfaces may block the rays of highlights; highlights.cpp
 struct Visibility {
-  static constexpr int CLASSES = 62;  // of coc, a bit each
+  static constexpr int CLASSES = 62;  // of coc; one bit for each
   float low = 0, class_width = 1;
-  std::vector<int> bins;  // of 1 px of coc in which there may be something, or in the one before
+  std::vector<int> bins;  // bins of 1 px of coc that may contain a surface, or whose previous bin may
   int cell_rows = 0, cell_columns = 0;
-  std::vector<uint64_t> cells;  // classes of coc that occur in each cell that rays may pass
-  // Classes of what may lie in a bin, or in the one before.
+  std::vector<uint64_t> cells;  // classes of coc in each cell that a ray may cross
+  // Classes that may contain a surface of a bin or of the bin before.
   uint64_t classes_of(int bin) const {
     const int first = std::min((int)(std::max(0, bin - 1) / class_width), CLASSES - 1), last = std::min((int)((bin + 1) / class_width), CLASSES - 1);
     return (2ull << last) - (1ull << first);
   }
 };
-Visibility look_at(const Job &job, const RayKernels &kernels);
+Visibility find_visibility(const Job &job, const RayKernels &kernels);
 // Adds the light of rays to a tile [channels, TILE, TILE].
 void splat(const Job &job, const Visibility &visibility, int y0, int x0, const int *rays, int count,
            const RayKernels &kernels, const std::vector<float> &gains, float *tile);
-// By how much the light that the field lets through of each ray's kernel is made brighter, [rays, colours]: 0 where none is,
-// and the kernel stays whole. Empty: kernels are alike everywhere.
+// For each ray and colour the gain that keeps a kernel's sum after masking by the field [rays, colours]; 0: the kernel
+// is not masked. Empty if the lens has no field.
 std::vector<float> gains_of(const Job &job, const RayKernels &kernels);
 
-// For each pixel of each surface the node before it, and for each cell the layers in it.
+// The node before each pixel of each surface, and the layers that occur in each cell.
 struct LayerIndex {
-  float low, high;            // the outermost nodes
-  int words, rows, columns;   // words of bits of a cell; cells
-  std::vector<uint64_t> bits;    // layers that occur in each cell, a bit each
-  std::vector<uint8_t> single;   // cells that show the first surface alone, whole
-  std::vector<uint8_t> mixed;    // those with pixels, of two surfaces, whose farther one goes on behind the nearer
+  float low, high;            // first and last node
+  int words, rows, columns;   // words of `bits` for each cell; number of cells
+  std::vector<uint64_t> bits;    // layers that occur in each cell, one bit for each
+  std::vector<uint8_t> single;   // cells in which every pixel shows only the first surface
+  std::vector<uint8_t> mixed;    // cells with mixed pixels whose farther surface continues behind the nearer one
   std::vector<Buffer<uint16_t>> intervals;
 
   const uint64_t *cell(size_t i) const { return &bits[i * words]; }
-  // The node before all pixels of a cell, or -1 where they lie between several.
+  // The node before all pixels of a cell, or -1 if there are several.
   int only_interval(size_t i) const;
-  // Places on the blur axis, within the nodes.
+  // Position on the blur axis.
   template <typename V>
   V place(V coc) const { return axis(coc, low, high); }
 };
 
-// Parts of blocks of pixels that lie between two nodes, row by row of blocks: start[r] to start[r + 1] are those of row r.
-// values: weight and light; and these times how far between the nodes each pixel lies. With the bit ROOM_ONLY a node is that
-// of weight which is room alone.
+// Sparse block means: contributions of a block's pixels between two nodes, sorted by row of blocks. Row r has pieces
+// start[r] to start[r + 1]. values: weight and light, and both times the pixel's position between the nodes. A node
+// with the bit NORMALIZER_ONLY adds its weight to the normalizer alone.
 struct Pieces {
-  static constexpr uint16_t ROOM_ONLY = 0x8000;
+  static constexpr uint16_t NORMALIZER_ONLY = 0x8000;
   std::vector<int> start, column;
   std::vector<uint16_t> node;
   std::vector<float> values;
 };
 
-// Means of the surfaces over blocks of `scale` x `scale` pixels, and around the frame; see downsampling.cpp.
+// Means of the surfaces over blocks of scale x scale pixels, in the frame and around it; see downsampling.cpp.
 class Downsampled {
  public:
   Downsampled(const Job &job, int scale, int margin);
   void take(const Job &job, const LayerIndex &index, const Border &border);
 
   int scale, margin, rows, columns, channels, pitch, first_band;  // margin: blocks around the frame
-  std::vector<Pieces> pieces;  // of each band of BLOCK rows of pixels: what the planes have no place for
-  // of intervals between nodes: whether a layer here spreads them; lies before them; and the one that has their place
+  // for each band of BLOCK rows of pixels: contributions beyond the first of a block, which is in the planes
+  std::vector<Pieces> pieces;
+  // For each interval between nodes: whether a layer of this scale blurs it, whether it lies behind such a layer, and
+  // the interval that represents it.
   std::vector<uint8_t> wanted, behind;
   std::vector<uint16_t> stands_for;
-  std::vector<uint8_t> near;  // blocks of BLOCK pixels that matter to the layers here
+  std::vector<uint8_t> near;  // blocks of BLOCK x BLOCK pixels that layers of this scale may reach
 
-  int stride() const { return 2 * (channels + 1); }  // of a piece's values
+  int stride() const { return 2 * (channels + 1); }  // number of values of a piece
   bool needed(int interval) const { return wanted[interval] || behind[interval]; }
-  // A row of a plane, from the frame's first block on. Planes: node before, weight, weight times how far between nodes,
-  // light, light times how far.
+  // A row of a plane, from the frame's first block. Planes: node before, weight, weight times position between the
+  // nodes, light, light times position.
   float *row(int plane, int y) const { return planes.data() + plane * size + (size_t)(y + margin) * pitch + margin; }
 
  private:
@@ -458,18 +468,18 @@ class Downsampled {
   Buffer<float> planes;
 };
 
-// What is spread at once: rows, and columns beside each other.
+// Size of the block of output pixels computed at once.
 constexpr int STRIP_ROWS = 4, STRIP_COLUMNS = 2 * LANES, STRIP = STRIP_ROWS * STRIP_COLUMNS;
 Kernel make_kernel(const float *values, int half, bool one_sided);
 
-// What the field lets through of a kernel at a place in the frame: optics/placed_kernels.py.
-class Turned {
+// Transmittance of the lens's field over a blur kernel at one position in the frame; see optics/placed_kernels.py.
+class FieldMask {
  public:
-  static constexpr int ROWS = 8, COLUMNS = 16;  // whose pixels share a kernel
-  static constexpr float LEAST = 1e-6f;         // share of a kernel; where less passes it stays whole
+  static constexpr int ROWS = 8, COLUMNS = 16;  // pixels that share one masked kernel
+  static constexpr float LEAST = 1e-6f;         // share of a kernel's light below which the kernel is left unmasked
 
-  // Of one radius (b null) or of two, b by `part`, at a place in half diagonals from the middle of the frame.
-  Turned(const torchdof_scene &scene, const torchdof_shares &a, const torchdof_shares *b, float part, int colour, float y, float x)
+  // For the samples a, or the mix of a and b with weight `part` of b. y, x: position in half diagonals from the centre.
+  FieldMask(const torchdof_scene &scene, const torchdof_shares &a, const torchdof_shares *b, float part, int colour, float y, float x)
       : squeeze_(scene.squeeze), part_(part), both_(b != nullptr) {
     x += ASIDE;
     const float distance = std::sqrt(y * y + x * x), place = std::min(distance, 1.0f) * (scene.distances - 1);
@@ -503,7 +513,7 @@ class Turned {
     const float first = samples_[0].at(u, v);
     return both_ ? (1.0f - part_) * first + part_ * samples_[1].at(u, v) : first;
   }
-  // The same at dy, dy - 1 and so on of one radius.
+  // Shares at dy, dy - 1, ... for samples of a single radius.
   vec shares(float dy, float dx) const {
     const float across = dx * squeeze_;
     vec step;
@@ -511,7 +521,7 @@ class Turned {
     const vec u = step * down_ + across * right_, v = across * down_ - step * right_;
     return samples_[0].at(u, most(v, -v));
   }
-  // From where to where in a column there are samples.
+  // Range of rows of a column that the samples cover.
   void rows_of(float dx, float &low, float &high) const {
     const float across = dx * squeeze_;
     low = -FAR, high = FAR;
@@ -527,11 +537,11 @@ class Turned {
  private:
   static constexpr float ASIDE = 1e-6f, FAR = 1e6f;
   struct Samples {
-    const float *values, *next;  // of the distance before the place and of the one after it
+    const float *values, *next;  // samples at the field distances before and after the position
     int columns;
     float near, last_row, last_column, per_u, first_u, per_v;
     float at(float u, float v) const {
-      // what is no number is 0
+      // NaN becomes 0
       const float row = std::min(std::max(0.0f, u * per_u + first_u), last_row), column = std::min(std::max(0.0f, v * per_v), last_column);
       const int i = std::min((int)row, (int)last_row - 1), j = std::min((int)column, (int)last_column - 1);
       const float down = row - i, right = column - j;
@@ -569,34 +579,35 @@ class Turned {
 inline float per_half_diagonal(const torchdof_scene &scene) {
   return 2.0f / std::sqrt((float)scene.height * scene.height + (float)scene.width * scene.width);
 }
-// Whether shares are 0 at the borders of their samples.
+// Whether shares are 0 at the edge of their samples.
 bool ends_dark(const torchdof_shares &shares, int distances);
-// A kernel of a layer, made not one-sided, with what does not pass left out and its light made whole again.
-void cut_kernel(const Layer &layer, int colour, const Turned &turned, Kernel &cut);
-// So many columns of an input share a bit that tells whether something is there; this is the bit of a column.
+// Multiplies a layer's kernel by the field's transmittance and restores its sum.
+void mask_kernel(const Layer &layer, int colour, const FieldMask &turned, Kernel &cut);
+// Occupancy of rows is recorded as one bit for every MARKED columns; this is the bit of column x.
 constexpr int MARKED = 8;
 inline uint32_t mark(int x) { return 1u << std::min(x / MARKED, 31); }
-// The bits of the columns from the first to the last.
+// The bits of the columns from first to last.
 inline uint32_t marks(int first, int last) { return (mark(last) | (mark(last) - 1)) & ~(mark(first) - 1); }
-// Marks of the columns from which a strip at column x is spread, counted from its input's first.
+// The bits of the input columns of a strip at output column x.
 inline uint32_t strip_inputs(int x, int half) { return marks(x, x + STRIP_COLUMNS - 1 + 2 * half); }
-// Spreads values (of rows with a gap `pitch`) with a kernel to a strip: out [STRIP_ROWS, STRIP_COLUMNS]. The input has the
-// kernel's half more on each side and begins there. Input row i matters where rows[i] has one of the bits of `columns`.
+// Convolves rows (`pitch` values apart) with a kernel: out [STRIP_ROWS, STRIP_COLUMNS]. The input begins `half` rows
+// and columns before the output. Input row i is skipped if rows[i] has none of the bits of `columns`.
 void convolve_strip(const float *in, int pitch, const uint32_t *rows, uint32_t columns, const Kernel &kernel, float *out);
 
-// Least and largest of numbers; NaN both if one of them is NaN.
+// Smallest and largest value; both NaN if any value is NaN.
 void find_ends(const float *values, int64_t count, int threads, float *low, float *high);
 
-// Signed coc of a frame's depths, all between two distances in focus; plan.cpp
+// Signed coc of depths; everything between the two distances is in focus; plan.cpp
 void coc_of_depth(const float *depth, int64_t count, float scale, float nearest, float farthest, int threads, float *out);
 
-// Places of the layers of some maps [maps, height, width] of one frame, and the tolerance they are for; plan.cpp
+// Positions of the layers for maps of coc [maps, height, width] of one frame; reduces the tolerance of a small frame;
+// plan.cpp
 std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads);
 
 // Kernels from the templates of a lens; kernels.cpp
 void make_kernels(const torchdof_spots &spots, int threads, float *const *out);
 
-// Depth edges; false if they are right as they are; edges.cpp
+// Repairs depth edges; false if the map needs no repair; edges.cpp
 bool repair_edges(const torchdof_map &map);
 
 void composite(const Job &job, const RayKernels &ray_kernels, float *out);

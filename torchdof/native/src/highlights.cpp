@@ -1,30 +1,32 @@
-// Highlights: light far brighter than what is around it, extracted from the layers and splatted ray by ray. The
-// formulas are told in render/highlights.py.
+// Highlights: light far brighter than its surroundings is removed from the layers and rendered ray by ray, as described
+// in render/highlights.py.
 #include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float FACTOR = 8.0f;          // times the ordinary light around: a highlight
-constexpr int STEP = 3;                 // every so many pixels one tells the threshold,
-constexpr int CELL_STEPS = 11;          // so many of them a cell's
+constexpr float FACTOR = 8.0f;          // a highlight exceeds the usual light around by this factor; larger extracts fewer
+constexpr int STEP = 3;                 // every STEP-th pixel is sampled for the threshold
+constexpr int CELL_STEPS = 11;          // samples along the side of a threshold cell
 constexpr int THRESHOLD_CELL = STEP * CELL_STEPS;
-constexpr float LEAST_PX = 1.0f;        // blur from which on there are rays
-constexpr float NEARER_PX = 1.0f;       // difference in coc from which on a surface is another one, in front
-constexpr float WHOLE = 4.0f;           // times the share of a highlight that is splatted is what counts of its rays
-constexpr int TAPS_PER_PIXEL = 16;      // of the frame: rays beyond this number are left to the layers,
-constexpr double FREE_CHANGE_PX = 1.6;  // or a smaller one in proportion where the coc of neighbours differs by more
-constexpr int STEPS_PER_PX = 32;        // of radius: kernels of rays
-constexpr int PATCH = 16;               // rays a side that are looked at together
+constexpr float LEAST_PX = 1.0f;        // blur radius in pixels up to which highlights stay in the layers
+constexpr float NEARER_PX = 1.0f;       // difference in coc at which a nearer surface starts to block rays
+// a highlight's cost counts in full where 1 / WHOLE of its light or more is extracted
+constexpr float WHOLE = 4.0f;
+// budget of kernel taps for each pixel of the frame; highlights beyond it stay in layers
+constexpr int TAPS_PER_PIXEL = 16;
+constexpr double FREE_CHANGE_PX = 1.6;  // mean change of coc between neighbours above which the limit shrinks in proportion
+constexpr int STEPS_PER_PX = 32;        // resolution of the radii of ray kernels
+constexpr int PATCH = 16;               // side in pixels of the squares in which rays are processed
 
 struct Candidate {
   int row, column;
   float peak, coc, limit;
-  float weight;  // part of the pixel whose light it sends
+  float weight;  // share of the pixel that emits
 };
 
-// Cells along an axis, and pixels of the first before the image: as many as there are behind the last.
+// Number of cells along an axis, centred on the image; before: pixels of the first cell that lie before the image.
 int cells_of(int size, int &before) {
   int count = (size + 2 * THRESHOLD_CELL - 1) / THRESHOLD_CELL;
   count += (count + size) % 2;
@@ -32,14 +34,14 @@ int cells_of(int size, int &before) {
   return count;
 }
 
-// The pixel of an axis at a place; beyond its ends it is mirrored.
+// Mirrors an index into the image.
 int mirrored(int at, int size) {
   at = (at % (2 * size) + 2 * size) % (2 * size);
   return std::min(at, 2 * size - 1 - at);
 }
 
-// The rank-th largest of so many vectors of values, 0 if it is below that: bit by bit, for bits of positive numbers are in
-// their order.
+// The rank-th largest of the values, or 0 if it is negative: binary search on the bit pattern, which for positive
+// floats has the order of the values.
 float ranked(int rank, const float *values, int vectors) {
   int32_t bits = 0;
   for (int bit = 30; bit >= 0; bit--) {
@@ -71,7 +73,7 @@ float threshold_at(const Job &job, int y, int x) {
 float least_threshold(const Job &job, int y0, int x0) {
   auto cell = [](int at, int before, int count) { return std::clamp((at + before - THRESHOLD_CELL / 2) / THRESHOLD_CELL, 0, count - 1); };
   const int rows = job.threshold_rows, columns = job.threshold_columns, top = job.threshold_top, left = job.threshold_left;
-  float least = INFINITY;  // none too large
+  float least = INFINITY;
   for (int row = cell(y0, top, rows); row <= std::min(cell(y0 + BLOCK, top, rows) + 1, rows - 1); row++)
     for (int column = cell(x0, left, columns); column <= std::min(cell(x0 + BLOCK, left, columns) + 1, columns - 1); column++)
       least = std::min(least, job.threshold[(size_t)row * columns + column]);
@@ -104,12 +106,13 @@ void Job::find_threshold() {
   });
 }
 
-// Of a bright pixel of the first or the second surface the part whose light goes out as rays. Behind a nearer, dark surface it
-// is the whole: that one is in the way of the rays. But not where depth around has values between the two: it is not exact.
+// Share of a bright pixel's surface whose light is emitted as rays. Behind a nearer, dark surface all of it is, because
+// that surface blocks the rays itself; but not where coc around has values between the two surfaces, since the edge is
+// then blurred.
 static float part_sent(const Surfaces &surfaces, int channels, int second, int y, int x, float coc, float limit) {
   const Block block = surfaces.block(y / BLOCK * surfaces.block_columns + x / BLOCK);
   const int within = y % BLOCK * BLOCK + x % BLOCK;
-  const float cover = (second ? block.weight : block.seen)[within];
+  const float cover = (second ? block.weight : block.own_weight)[within];
   const float gap = coc - (second ? surfaces.coc[(size_t)y * surfaces.width + x] : block.coc[within]);
   const float stopped = clamp(gap - NEARER_PX, 0.0f, 1.0f);
   if (!(stopped > 0)) return cover;
@@ -118,17 +121,18 @@ static float part_sent(const Surfaces &surfaces, int channels, int second, int y
   for (int dy = -2; dy <= 2; dy++) {
     const float *row = surfaces.coc + (size_t)std::clamp(y + dy, 0, surfaces.height - 1) * surfaces.width;
     for (int dx = -2; dx <= 2; dx++) {
-      const float off_middle = std::fabs(row[std::clamp(x + dx, 0, surfaces.width - 1)] - middle) / gap;  // 1/2 on either surface
+      // 1/2 on either surface
+      const float off_middle = std::fabs(row[std::clamp(x + dx, 0, surfaces.width - 1)] - middle) / gap;
       between += clamp(3.5f - 8.0f * off_middle, 0.0f, 1.0f);
     }
   }
   const float is_step = clamp(1.5f - 10.0f * (between / 25.0f), 0.0f, 1.0f);
   const float beside = peak_of((second ? block.own : block.other) + within, BLOCK_PIXELS, channels);
   const float is_dark = clamp(2.0f - beside / std::max(limit, TINY), 0.0f, 1.0f);
-  return cover + going_on(cover) * (stopped * is_dark * is_step);
+  return cover + continuation(cover) * (stopped * is_dark * is_step);
 }
 
-// Mean change of the coc from a pixel to the next one, across and down together.
+// Mean change of coc between neighbours, horizontal plus vertical.
 double Job::change_of_coc() const {
   std::vector<double> changes(height);
   parallel(height, [&](int y, int) {
@@ -142,10 +146,15 @@ double Job::change_of_coc() const {
   return sum / surfaces.area();
 }
 
+// Moves light above the threshold from the surfaces to rays.
+//
+// 1. Collect the bright, blurred pixels of each surface.
+// 2. If their kernels have more taps than the budget, raise the limit above which light is moved.
+// 3. Subtract the light from the surface and store it in rays.
+// 4. List the radii for which kernels are needed.
 void Job::extract_highlights() {
   const size_t area = surfaces.area();
   const float from_px = scene.occlusion ? LEAST_PX : std::max(scene.crisp_px - 1.0f, LEAST_PX);
-  // bright pixels of each surface
   const int count = surfaces.count;
   std::vector<std::vector<Candidate>> bands((size_t)surfaces.block_rows * count);
   parallel(surfaces.block_rows, [&](int by, int) {
@@ -154,7 +163,7 @@ void Job::extract_highlights() {
     for (int bx = 0; bx < surfaces.block_columns; bx++) {
       const int x0 = bx * BLOCK, n = std::min(BLOCK, width - x0), block = by * surfaces.block_columns + bx;
       const float least_limit = least_threshold(*this, by * BLOCK, x0);
-      if (!surfaces.whole()) {
+      if (!surfaces.full_planes()) {
         vec peak = all(block_peak[block]);
         const float *of_block = surfaces.blocks[block];  // light of both surfaces comes first
         for (int i = 0; of_block && i < 2 * channels * BLOCK_PIXELS; i += LANES) peak = most(peak, load<vec>(of_block + i));
@@ -170,7 +179,7 @@ void Job::extract_highlights() {
             const float limit = threshold_at(*this, y, x0 + x);
             if (!(brightest > limit)) continue;
             float part = weight ? weight[x] : 1.0f;
-            if (!surfaces.whole() && surfaces.has_block(block)) part = part_sent(surfaces, channels, i, y, x0 + x, coc[x], limit);
+            if (!surfaces.full_planes() && surfaces.has_block(block)) part = part_sent(surfaces, channels, i, y, x0 + x, coc[x], limit);
             bands[(size_t)i * surfaces.block_rows + by].push_back({y, x0 + x, brightest, coc[x], limit, part});
           }
         }
@@ -194,7 +203,7 @@ void Job::extract_highlights() {
     };
     double taps_of_all = 0;
     for (const Candidate &p : all) taps_of_all += taps(p);
-    if (taps_of_all > budget) {  // too many: the brightest of them, and only what they are brighter by
+    if (taps_of_all > budget) {  // over budget: keep only the brightest, and of these only the light above a common limit
       std::vector<Candidate> sorted(all);
       std::sort(sorted.begin(), sorted.end(), [](const Candidate &a, const Candidate &b) { return a.peak > b.peak; });
       double least = 0, sum = 0, slope = 0;
@@ -210,12 +219,12 @@ void Job::extract_highlights() {
     }
     for (const Candidate &p : all) {
       const float share = (1.0f - p.limit / p.peak) * fades(p);
-      const float left = (1.0f - fades(p)) + fades(p) * (p.limit / p.peak);  // 1 - share, whose rounding is seen beside it
+      const float left = (1.0f - fades(p)) + fades(p) * (p.limit / p.peak);  // 1 - share without cancellation
       const size_t at = (size_t)p.row * width + p.column;
       float *light;
       size_t step;
-      if (surfaces.whole()) {
-        light = const_cast<float *>(surfaces.lights[i]) + at;  // of our own copy
+      if (surfaces.full_planes()) {
+        light = const_cast<float *>(surfaces.lights[i]) + at;  // a copy owned by this job
         step = area;
       } else {
         const Block b = surfaces.make_block(p.row / BLOCK * surfaces.block_columns + p.column / BLOCK);
@@ -238,18 +247,17 @@ void Job::extract_highlights() {
   for (Ray &ray : rays) ray.radius = (int)(std::lower_bound(radii.begin(), radii.end(), ray.radius) - radii.begin());
 }
 
-// The surfaces that pixels show, own and other, in a row of a block column from column x on, with the part of a pixel that
-// each covers: the weight (null: 1) beyond a least one, for what is hidden covers nothing. The body is told whether it is the
-// own one.
+// Calls body(is_own, coc, weight, least_weight) for the surfaces shown in a row of a block column, from column x. A
+// surface covers weight - least_weight of a pixel (weight null: 1), so that hidden surfaces cover nothing.
 template <typename Body>
 static void each_shown(const Surfaces &surfaces, int y, int x, const float **light, const Body &body) {
-  const int own = surfaces.whole() ? 1 : 0;  // before a known background the other surface comes first
+  const int own = surfaces.full_planes() ? 1 : 0;  // with a given background the first plane is the other surface
   const float *coc, *weight;
   for (int i : {own, 1 - own})
     if (surfaces.row(i, y, x, light, coc, weight)) body(i == own, coc, weight, i == own ? 0.0f : HIDDEN_WEIGHT);
 }
 
-// For each cell the number of rays on whose way to where they land it lies, as far as surfaces from a coc on may be in their way.
+// For each cell the number of rays that may cross it on surfaces with coc `low` or larger.
 static std::vector<int> passing(const Job &job, const RayKernels &kernels, float low, int cell_rows, int cell_columns) {
   std::vector<int> count((size_t)cell_rows * cell_columns, 0);
   auto add = [&](int row, int column, int n) {
@@ -262,7 +270,7 @@ static std::vector<int> passing(const Job &job, const RayKernels &kernels, float
     const int c0 = std::max(ray.column - reach, 0) / CELL, c1 = std::min(ray.column + reach, job.width - 1) / CELL + 1;
     add(r0, c0, 1), add(r0, c1, -1), add(r1, c0, -1), add(r1, c1, 1);
   }
-  for (int row = 0; row < cell_rows; row++)  // sums over all cells above and to the left
+  for (int row = 0; row < cell_rows; row++)  // prefix sums
     for (int column = 0, in_row = 0; column < cell_columns; column++) {
       int &cell = count[(size_t)row * cell_columns + column];
       in_row += cell;
@@ -271,7 +279,7 @@ static std::vector<int> passing(const Job &job, const RayKernels &kernels, float
   return count;
 }
 
-Visibility look_at(const Job &job, const RayKernels &kernels) {
+Visibility find_visibility(const Job &job, const RayKernels &kernels) {
   Visibility v;
   const int H = job.height, W = job.width;
   float low = NEVER, high = -NEVER;
@@ -301,9 +309,9 @@ Visibility look_at(const Job &job, const RayKernels &kernels) {
       bool passes = false;
       for (int j = 0; j < n; j += CELL) passes |= passed[(size_t)row * v.cell_columns + (x + j) / CELL] > 0;
       if (!passes) continue;
-      // the image's own surface within 1 px has no other classes than its ends
+      // all coc of a block lie within 1 px: its two extremes give its classes
       const float ends[2] = {job.block_low[block], job.block_high[block]};
-      const bool flat = !surfaces.whole() && ends[1] - ends[0] < 1;
+      const bool flat = !surfaces.full_planes() && ends[1] - ends[0] < 1;
       wide bits[BLOCK / CELL] = {};
       for (wide &of_cell : bits)
         for (float coc : ends) of_cell |= bits_of(all(coc), ivec{} - flat);
@@ -332,7 +340,8 @@ Visibility look_at(const Job &job, const RayKernels &kernels) {
 
 namespace {
 
-// How much of the pixels of a row, in block columns from the first on, the surfaces at a place cover; whether any.
+// Coverage of a row of pixels, from a block column, by surfaces within 1 px of coc `place`; returns whether there is
+// any.
 bool cover_row(const Job &job, int y, int block_column, int block_columns, float place, const float **light, float *covered) {
   vec most_cover = {};
   for (int i = 0; i < block_columns; i++, covered += BLOCK) {
@@ -357,10 +366,10 @@ bool cover_row(const Job &job, int y, int block_column, int block_columns, float
   return any_positive(most_cover);
 }
 
-// Adds how much of the rays that land in a patch, rows by columns pixels from y, x on, surfaces at a place take.
+// Adds, for rays that land in a patch of rows x columns pixels at y, x, the share blocked by surfaces at coc `place`.
 void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y, int x, int rows, int columns, const float **light,
                  float (*blocked)[PATCH]) {
-  constexpr int LONGEST = 256;  // columns of the image that are looked at together
+  constexpr int LONGEST = 256;  // columns of the image processed together
   const int H = job.height, W = job.width;
   const float along = 1.0f - place / ray.coc;
   int column[PATCH];
@@ -370,8 +379,8 @@ void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y
     column[i] = (int)at_x;
     across[i] = at_x - column[i];
   }
-  // of a row of the image what it takes of each column of rays; kept of one odd and one even row, for rays of neighbouring
-  // rows meet the same
+  // covered share of an image row at each column's ray; an even and an odd row are kept, because rays of adjacent rows
+  // cross the same ones
   float met[2][PATCH] = {};
   int known[2] = {-1, -1};
   bool meets[2];
@@ -406,15 +415,15 @@ void add_blocked(const Job &job, const Ray &ray, float place, float fades, int y
 
 }  // namespace
 
-// What the field lets through of a ray's kernel.
-static Turned turned_of(const Job &job, const RayKernels &kernels, const Ray &ray, int colour) {
+// Transmittance of the lens's field for a ray's kernel.
+static FieldMask mask_of(const Job &job, const RayKernels &kernels, const Ray &ray, int colour) {
   const auto *shares = kernels.shares;
   int low = 0;
   while (low < kernels.shares_count - 2 && shares[low + 1].radius <= ray.coc) low++;
   const float part = clamp01((ray.coc - shares[low].radius) / (shares[low + 1].radius - shares[low].radius));
   const float per = per_half_diagonal(job.scene);
   const float y = (ray.row + 0.5f - 0.5f * job.height) * per, x = (ray.column + 0.5f - 0.5f * job.width) * per;
-  return Turned(job.scene, shares[low], &shares[low + 1], part, colour, y, x);
+  return FieldMask(job.scene, shares[low], &shares[low + 1], part, colour, y, x);
 }
 
 std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
@@ -424,7 +433,7 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
   job.parallel((int)job.rays.size(), [&](int r, int) {
     const Ray &ray = job.rays[r];
     for (int e = 0; e < E; e++) {
-      const Turned turned = turned_of(job, kernels, ray, e);
+      const FieldMask mask = mask_of(job, kernels, ray, e);
       double all_light = 0, left = 0;
       for (int which = ray.radius; which <= ray.radius + 1; which++) {
         const int h = kernels.halves[which], side = 2 * h + 1;
@@ -434,31 +443,37 @@ std::vector<float> gains_of(const Job &job, const RayKernels &kernels) {
             const float light = part * values[y * side + x];
             if (light == 0) continue;
             all_light += light;
-            left += light * turned.share((float)(y - h), (float)(x - h));
+            left += light * mask.share((float)(y - h), (float)(x - h));
           }
       }
-      gains[(size_t)r * E + e] = left > Turned::LEAST * all_light ? (float)(all_light / left) : 0.0f;
+      gains[(size_t)r * E + e] = left > FieldMask::LEAST * all_light ? (float)(all_light / left) : 0.0f;
     }
   });
   return gains;
 }
 
+// For each ray that reaches the tile:
+//
+// 1. Interpolate its kernel between the two nearest radii and mask it by the field, patch by patch.
+// 2. Let p be a pixel of the patch and q the ray's source: the ray to p crosses a surface of coc c at
+//    q + (p - q) (1 - c / coc of the ray). Sum the coverage there over all nearer bins of coc.
+// 3. Add light * tap * (1 - blocked), with blocked at most 1.
 void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays, int count, const RayKernels &ray_kernels,
            const std::vector<float> &gains, float *tile) {
   const float *const *kernels = ray_kernels.kernels;
   const int32_t *halves = ray_kernels.halves;
   const int H = job.height, W = job.width, C = job.channels, E = job.colours;
-  std::vector<int> nearer;  // bins that may take of its light
+  std::vector<int> nearer;  // bins of surfaces that may block the ray
   std::vector<const float *> surface_light(C);
-  std::vector<Turned> turned;  // of each colour
-  std::vector<float> taps((size_t)E * PATCH * PATCH);  // the same
+  std::vector<FieldMask> masks;  // one for each colour
+  std::vector<float> taps((size_t)E * PATCH * PATCH);  // [colours, PATCH, PATCH]
   for (int r = 0; r < count; r++) {
     const Ray &ray = job.rays[rays[r]];
     const float *light = job.ray_light.data() + (size_t)rays[r] * C;
     const int half = std::max(halves[ray.radius], halves[ray.radius + 1]);
-    turned.clear();
-    for (int e = 0; e < E && !gains.empty(); e++) turned.push_back(turned_of(job, ray_kernels, ray, e));
-    // adds a row of one of its two kernels
+    masks.clear();
+    for (int e = 0; e < E && !gains.empty(); e++) masks.push_back(mask_of(job, ray_kernels, ray, e));
+    // adds a row of one of the ray's two kernels
     auto add_taps = [&](int which, float part, int e, int y, int x, int n, float *taps) {
       const int h = halves[which], first = std::max(x, ray.column - h), last = std::min(x + n - 1, ray.column + h);
       if (std::abs(y - ray.row) > h) return;
@@ -466,12 +481,11 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
       const float *from = kernels[which] + e * side * side + (y - ray.row + h) * side + h - ray.column;
       for (int i = first; i <= last; i++) taps[i - x] += part * from[i];
     };
-    // the part of the tile in which its rays land
     const int top = std::max(y0, ray.row - half), bottom = std::min(std::min(y0 + TILE, H), ray.row + half + 1);
     const int left = std::max(x0, ray.column - half), right = std::min(std::min(x0 + TILE, W), ray.column + half + 1);
-    // whether rays that land in a part of it may meet a surface of a bin
+    // whether rays that land in a rectangle may cross a surface of bin k
     auto may_meet = [&](int k, int y, int x, int rows, int columns) {
-      // a ray that lands so many pixels away met the surface at this share of them
+      // a ray to a pixel at distance d from its source crosses the surface at distance along * d
       const float along = 1.0f - (v.low + k) / ray.coc;
       const float ya = ray.row + (y - ray.row) * along, yb = ray.row + (y + rows - 1 - ray.row) * along;
       const float xa = ray.column + (x - ray.column) * along, xb = ray.column + (x + columns - 1 - ray.column) * along;
@@ -489,7 +503,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
         if (!(ray.coc - NEARER_PX > v.low + k)) break;
         if (may_meet(k, top, left, bottom - top, right - left)) nearer.push_back(k);
       }
-    // how much of the rays that land in a patch nearer surfaces take; whether that is all of them
+    // accumulates the blocked share of the rays that land in a patch; true if all are blocked
     auto block_all = [&](int y, int x, int rows, int columns, float (&blocked)[PATCH][PATCH]) {
       for (int k : nearer) {
         const float place = v.low + k;
@@ -514,7 +528,7 @@ void splat(const Job &job, const Visibility &v, int y0, int x0, const int *rays,
             add_taps(ray.radius, 1.0f - ray.part, e, py + i, px, nx, row);
             add_taps(ray.radius + 1, ray.part, e, py + i, px, nx, row);
             for (int x = 0; x < nx && gain > 0; x++)
-              if (row[x] != 0) row[x] *= gain * turned[e].share((float)(py + i - ray.row), (float)(px + x - ray.column));
+              if (row[x] != 0) row[x] *= gain * masks[e].share((float)(py + i - ray.row), (float)(px + x - ray.column));
             for (int x = 0; x < PATCH; x += LANES) any |= any_positive(load<vec>(row + x));
           }
         }

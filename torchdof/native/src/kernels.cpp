@@ -1,4 +1,4 @@
-// Kernels of any radius from the templates of a lens; the formulas stand in optics/kernel_bank.py and optics/psf.py.
+// Makes kernels of any radius from a lens's templates; formulas in optics/kernel_bank.py and optics/psf.py.
 #include "engine.h"
 
 #include "variants.h"
@@ -7,11 +7,12 @@ namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr int AROUND = 2;   // pixels around a kernel on which its values depend
-constexpr int FAR = 11;     // px from which on the interpolator of a pixel is nothing (5e-7)
+constexpr int AROUND = 2;   // pixels around a kernel that influence its values
+constexpr int FAR = 11;     // distance in pixels beyond which the spline is below 5e-7
 constexpr double ROOT = 1.7320508075688772, PI = 3.141592653589793;
 
-// The cardinal cubic spline, 1 at 0 and 0 at every other integer, between samples of it.
+// The cardinal cubic spline: 1 at 0 and 0 at every other integer. Linear interpolation of PER_PX samples for each
+// pixel.
 class Spline {
  public:
   Spline() : samples_(FAR * PER_PX + 2) {
@@ -35,20 +36,20 @@ class Spline {
   std::vector<float> samples_;
 };
 
-// Sum of the interpolator of a pixel over cells of a size, times the size.
+// Sum of the spline over samples `cell` apart, times `cell`, at integer distances from one of them.
 double ripple(int pixel, double cell) {
   const double cycles = 1 / std::min(std::max(cell, 1.0 / 16), 1.0), turn = PI * cycles, sinc = std::sin(turn) / turn;
   const double spectrum = 3 * sinc * sinc * sinc * sinc / (2 + std::cos(2 * turn));
   return 1 + 2 * spectrum * std::cos(2 * turn * pixel);
 }
 
-// What each cell along an axis of a template gives each pixel along one of a kernel, by the interpolator and linearly. Of a
-// kernel that is symmetric about its centre both are from there on, and a cell stands for the one on the other side as well.
+// Weights that resample a template's cells to a kernel's pixels along one axis, by the spline and linearly. If the
+// kernel is symmetric (folded), only the half from its centre is kept, and each cell also represents its mirror image.
 struct Axis {
   int pixels, cells;
   std::vector<float> splines, lines;  // [cells, pixels]
-  std::vector<int> first, last;       // pixels that a cell reaches by the interpolator
-  std::vector<int> nearest, farthest;  // and linearly
+  std::vector<int> first, last;       // pixels within reach of each cell's spline
+  std::vector<int> nearest, farthest;  // pixels within reach of each cell's linear weights
 
   Axis(int half, int count, double cell, bool folded)
       : pixels(folded ? half + 1 : 2 * half + 1), cells(folded ? count + 1 : 2 * count + 1), splines((size_t)pixels * cells),
@@ -79,7 +80,7 @@ struct Axis {
   }
 };
 
-// out [down.pixels, across.pixels] = the template's light as pixels see it: by the interpolator, or linearly.
+// Resamples the template: out [down.pixels, across.pixels]; row is a buffer.
 void product(const Axis &down, const Axis &across, const float *light, bool linear, std::vector<float> &row, float *out) {
   const std::vector<float> &by_row = linear ? down.lines : down.splines, &by_column = linear ? across.lines : across.splines;
   const std::vector<int> &first_row = linear ? down.nearest : down.first, &last_row = linear ? down.farthest : down.last;
@@ -138,7 +139,7 @@ class Maker {
     for (const float *const end = to; out < end; out++) *out /= (float)count;
   }
 
-  // A kernel from the templates of two nodes.
+  // A kernel interpolated between the templates of two nodes.
   void level(const int32_t *which, float part, double reach, int colour, int half, float *out) {
     const int count = s_.cells[which[0]] + 1, across_all = 2 * count + 1;
     const size_t area = (size_t)across_all * across_all;
@@ -161,7 +162,7 @@ class Maker {
     product(down, across, light_.data(), false, row_, kernel_.data());
     product(down, across, light_.data(), true, row_, at_most_.data());
     settle(n);
-    // without the pixels around, and all of it
+    // crop the pixels around; normalize
     const int start = folded_ ? 0 : AROUND, side = 2 * half + 1;
     double sum = 0;
     for (int y = 0; y < side; y++)
@@ -170,7 +171,7 @@ class Maker {
         sum += out[(size_t)y * side + x] = settled_[(size_t)row * n + column];
       }
     const double widest = reach * std::max(1.0, 1.0 / s_.squeeze);
-    if (half < widest - 1e-9) {  // a part of it: what all pixels have
+    if (half < widest - 1e-9) {  // the kernel is cropped: normalize by the whole template's sum
       sum = 0;
       for (size_t k = 0; k < area; k++) sum += a[k] + part * (b[k] - a[k]);
       sum *= std::max(high, 1.0) * std::max(wide, 1.0);
@@ -179,13 +180,14 @@ class Maker {
     for (int k = 0; k < side * side; k++) out[k] = (float)(out[k] * per_sum);
   }
 
-  // Limits the values of a kernel [n, n], and takes what a negative one lacks from its four neighbours.
+  // Limits a kernel [n, n] to twice its linear interpolation, and takes the deficit of negative values from their four
+  // neighbours in proportion.
   void settle(int n) {
     const int pitch = n + 2;
     positive_.assign((size_t)pitch * pitch, 0.0f);
     rate_.assign(positive_.size(), 0.0f);
     settled_.resize((size_t)n * n);
-    auto mirror = [&](std::vector<float> &values) {  // what lies before the centre of a symmetric kernel
+    auto mirror = [&](std::vector<float> &values) {  // fills the values before the centre of a symmetric kernel
       if (!folded_) return;
       for (int k = 0; k < pitch; k++) values[k] = values[2 * pitch + k];
       for (int k = 0; k < pitch; k++) values[(size_t)k * pitch] = values[(size_t)k * pitch + 2];

@@ -1,26 +1,28 @@
-// Matting: pixels at depth edges carry the light of two surfaces and the depth of one. The formulas are told in
-// render/matting.py.
+// Matting: a pixel at a depth edge mixes the light of two surfaces but has the depth of one. Splits it into both, as
+// described in render/matting.py.
 #include "engine.h"
 
 namespace torchdof {
 namespace TORCHDOF_SIMD {
 namespace {
 
-constexpr float EDGE_PX = 0.5f;   // difference in coc of neighbours from which on they may be two surfaces
-constexpr float UNCLEAN = 1e-2f;  // weight of a pixel that may be mixed itself
-constexpr float TRUST = 4.0f;     // how much texture discredits the contrast of the two surfaces
-constexpr float ALIKE = 1.0f / 255;  // contrast, as a share of the brightest light around, that is worth as much as none
-constexpr float UNBOUNDED = 1e6f;  // times the brightest pixel around: so bright is neither part of a pixel
-constexpr int EMITTER_REACH = 3;  // pixels around a highlight that tell on which surface it lies
-constexpr int TOUCHING = 2;       // pixels around an emitter into which a soft picture spreads its light
-constexpr float DIM = 0.1f;         // times the light of a highlight's pixel: what is darker is as sure to be none of it
-constexpr float MOST_WEIGHT = 0.98f;  // of a highlight's pixel that an emitter of another surface may have
-constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is the surface that the image shows
+constexpr float EDGE_PX = 0.5f;   // difference in coc of neighbours, in pixels, above which they may be two surfaces
+// weight of a neighbour that may be mixed itself; larger lets mixed pixels colour the two surfaces
+constexpr float UNCLEAN = 1e-2f;
+constexpr float TRUST = 4.0f;     // larger trusts the contrast of two textured surfaces less
+constexpr float ALIKE = 1.0f / 255;  // contrast, as a share of the brightest light around, at which trust is halved
+// limit for either part's light, as a multiple of the brightest neighbour; avoids 0 * inf
+constexpr float UNBOUNDED = 1e6f;
+constexpr int EMITTER_REACH = 3;  // pixels around a highlight in which its surface is looked for
+constexpr int TOUCHING = 2;       // pixels around an emitter over which a soft image spreads its light
+constexpr float DIM = 0.1f;         // share of a highlight's light below which all pixels count as equally dark
+constexpr float MOST_WEIGHT = 0.98f;  // largest weight of another surface's emitter in a highlight's pixel
+constexpr float SAME_PX = 0.5f;   // a background whose coc differs by less is the same surface as the image's
 
-constexpr int REACH = 1;                   // pixels around a mixed pixel that tell what its two surfaces look like
+constexpr int REACH = 1;                   // pixels around a mixed pixel that define its two colours
 constexpr int AROUND = 2 * REACH + 1;
 constexpr int TAPS = AROUND * AROUND;
-constexpr int MARGIN = REACH + 1;          // an edge is told by its neighbours
+constexpr int MARGIN = REACH + 1;          // edges depend on the pixels next to them
 constexpr int SIDE = BLOCK + 2 * MARGIN;   // of the window of coc
 constexpr int EDGES = BLOCK + 2 * REACH;   // of the windows of edges and light
 constexpr int PITCH = 24;                  // of both
@@ -30,10 +32,11 @@ float falloff_at(int dy, int dx) { return (float)std::exp(-(dy * dy + dx * dx) /
 struct Window {
   float coc[SIDE * PITCH], valid[SIDE * PITCH], edge[EDGES * PITCH];
   std::vector<float> light;  // [channels, EDGES, PITCH]
-  std::vector<vec> around;   // light around some pixels, [channels, TAPS], and of their surfaces
+  std::vector<vec> around;   // of LANES pixels: light around them [channels, TAPS] and the colours of their surfaces
 };
 
-// How surely the pixels of a block, and those around it, lie beside another surface; false if none of the block does.
+// Computes for each pixel in and around a block how likely it lies at an edge, 0 to 1. False if no pixel of the block
+// does.
 bool find_edges(const Job &job, int y0, int x0, Window &w) {
   const int H = job.height, W = job.width;
   const float *coc = job.surfaces.coc, *valid = job.surfaces.valid;
@@ -88,7 +91,7 @@ bool find_edges(const Job &job, int y0, int x0, Window &w) {
   return any;
 }
 
-// Weighted mean of the light around pixels [channels, TAPS], and its variance, summed over colours.
+// Weighted mean of the light around pixels [channels, TAPS]. Returns its variance, summed over channels.
 template <int CHANNELS>
 vec mean(const vec *light, int channels, const vec *weight, vec *mean) {
   const int C = CHANNELS ? CHANNELS : channels;
@@ -105,7 +108,13 @@ vec mean(const vec *light, int channels, const vec *weight, vec *mean) {
   return variance;
 }
 
-// Splits those of LANES pixels of a row that lie beside another surface.
+// Splits the pixels of `beside`, out of LANES pixels of a row.
+// 1. The near and far coc are the extremes of the 3 x 3 neighbours.
+// 2. The colour of each surface is the mean of its unmixed neighbours. If a thin foreground has none, neighbours count
+// by their difference from the background.
+// 3. The share of the near surface is the projection of the pixel's colour onto the line between both colours.
+// 4. The share of the other surface is at most 1/2, and smaller where texture makes the projection unreliable.
+// 5. The residual colour goes to both in proportion to their shares, within the range of the image's light.
 template <int CHANNELS>
 void split(const Job &job, Window &w, int y, int x, ivec beside, const float *falloff, const Block &block) {
   const int C = CHANNELS ? CHANNELS : job.channels;
@@ -138,7 +147,6 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
     whole += nearer[i];
   }
   const vec behind_variance = mean<CHANNELS>(light, C, farther, behind);
-  // a thin foreground has no clean pixel: trust the one that differs most from what is behind
   const vec clean = clamp01(whole * (0.1f / UNCLEAN) - 1.0f);
   if (any_of(clean < all(1.0f))) {
     vec differs[TAPS] = {}, most_of = {};
@@ -172,27 +180,27 @@ void split(const Job &job, Window &w, int y, int x, ivec beside, const float *fa
   const vec trust = strength / (strength + TRUST * (behind_variance + front_variance + misfit) + ALIKE * ALIKE);
   const vec aside = (here - near) - (far - here), sided = most(aside, -aside) * per_gap;
   const vec certainty = load<vec>(w.edge + first + tap(TAPS / 2)) * trust * clamp01(4.0f * sided - 2.0f);
-  const vec weight = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * certainty, rest = 1.0f - weight;
-  const vec per_rest = 1.0f / rest, per_weight = 1.0f / most(weight, all(1e-12f)), of_each = weight / (weight * weight + rest * rest);
+  const vec weight = least(is_near ? 1.0f - fitted : fitted, all(0.5f)) * certainty, own_weight = 1.0f - weight;
+  const vec per_own = 1.0f / own_weight, per_weight = 1.0f / most(weight, all(1e-12f)), of_each = weight / (weight * weight + own_weight * own_weight);
   auto put = [&](float *plane, vec value) {
     float *const to = plane + y * BLOCK + x;
     store(to, beside ? value : load<vec>(to));
   };
   for (int c = 0; c < C; c++) {
     const vec own_mean = is_near ? front[c] : behind[c], other_mean = is_near ? behind[c] : front[c];
-    const vec unexplained = colour[c] - rest * own_mean - weight * other_mean;
+    const vec unexplained = colour[c] - own_weight * own_mean - weight * other_mean;
     const vec darkest = most(job.light_least[c] * per_scale, all(-UNBOUNDED)), brightest = least(job.light_most[c] * per_scale, all(UNBOUNDED));
-    // what the mean colours do not explain goes to both; no light is lost, and none is brighter or darker than the image
+    // the two parts still sum to the pixel, and neither is brighter or darker than the image
     vec moved = weight * (other_mean + unexplained * of_each);
-    moved = least(most(moved, colour[c] - rest * brightest), colour[c] - rest * darkest);
+    moved = least(most(moved, colour[c] - own_weight * brightest), colour[c] - own_weight * darkest);
     moved = least(most(moved, weight * darkest), weight * brightest);
-    put(block.own + c * BLOCK_PIXELS, (colour[c] - moved) * per_rest * scale);
+    put(block.own + c * BLOCK_PIXELS, (colour[c] - moved) * per_own * scale);
     put(block.other + c * BLOCK_PIXELS, weight > vec{} ? moved * per_weight * scale : vec{});
   }
   const vec valid = masked ? load<vec>(w.valid + in_coc + tap(TAPS / 2)) : all(1.0f);
   put(block.coc, is_near ? far : near);
   put(block.weight, weight * valid);
-  put(block.seen, rest * valid);
+  put(block.own_weight, own_weight * valid);
 }
 
 void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
@@ -217,7 +225,7 @@ void split_block(Job &job, int by, int bx, Window &w, const float *falloff) {
     }
 }
 
-// What the pixels around a highlight's tell of where its emitter lies.
+// Estimates from the pixels around a highlight on which surface its emitter lies.
 class Around {
  public:
   Around(const Surfaces &s, int y, int x, const float *falloff) : s_(s), falloff_(falloff) {
@@ -231,9 +239,10 @@ class Around {
       }
   }
 
-  // How surely it lies behind (side 1) or before (-1) surfaces of a coc, for a pixel of so much light and a threshold, if
-  // what is there has more than a share of their largest light.
-  float beyond(float coc, int side, float share, float light, float limit) {
+  // How certain it is, 0 to 1, that the emitter lies behind (side 1) or in front of (-1) the surface at `coc`. light:
+  // of the highlight's pixel; limit: the highlight threshold; share: minimum light there, relative to the surface's
+  // brightest pixel.
+  float certainty_beyond(float coc, int side, float share, float light, float limit) {
     if (!((side > 0 ? farthest_ - coc : coc - nearest_touching_) > 1)) return 0.0f;
     if (!scale)
       for (int i = 0; i < COUNT; i++) scale = std::max(scale, peaks_[i] = peak_of(s_.light + at_[i], s_.area(), s_.channels));
@@ -252,8 +261,8 @@ class Around {
     return clamp01(light / limit - 1.0f) * std::min(10.0f * dim_sum, 1.0f) * clamp01(10.0f * (emitter_peak / same_peak - share));
   }
 
-  // Of what was asked last: light of these surfaces where they are dimmest, and coc of the emitter.
-  float look(float light, std::vector<float> &surface) const {
+  // For the last call of `certainty_beyond`: returns the emitter's coc; surface: light of the surface's darkest pixels.
+  float measure_emitter(float light, std::vector<float> &surface) const {
     const float own_peak = light / scale, least_dim = DIM * own_peak;
     float dimmest_sum = 0, lit_sum = 0, lit_coc = 0;
     surface.assign(s_.channels, 0.0f);
@@ -278,10 +287,11 @@ class Around {
   float coc_[COUNT], peaks_[COUNT], there_[COUNT], dim_[COUNT], nearest_ = NEVER, nearest_touching_ = NEVER, farthest_ = -NEVER;
 
  public:
-  float scale = 0, top = 0;  // largest light around, and of what was asked last, in parts of that
+  float scale = 0, top = 0;  // scale: largest light around; top: largest light of both surfaces, relative to scale
 };
 
-// Gives the light of a highlight's pixel to the surface on which the emitter lies.
+// Assigns the light of a highlight's pixel to the surface of its emitter, which lies in front of (side -1) or behind (1)
+// the pixel's own. First the emitter's surface gets the light; then a dark surface gives back what matting gave to it.
 void attribute_emitter(Job &job, int y, int x, float least_limit, const float *falloff) {
   Surfaces &s = job.surfaces;
   const int channels = job.channels;
@@ -295,16 +305,16 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
   std::vector<float> surface, emitter;
   bool changed = false;
   for (const int side : {-1, 1}) {
-    float sureness = around.beyond(own_coc, side, side < 0 ? 1.0f : 0.5f, light, limit);
+    float sureness = around.certainty_beyond(own_coc, side, side < 0 ? 1.0f : 0.5f, light, limit);
     if (sureness > 0) {
       const Block block = s.make_block(i);
-      const float coc = around.look(light, surface), floor = *std::max_element(surface.begin(), surface.end());
+      const float coc = around.measure_emitter(light, surface), floor = *std::max_element(surface.begin(), surface.end());
       const float share = clamp((light / around.scale - floor) / std::max(around.top - floor, 1e-12f), 1.0f - MOST_WEIGHT, MOST_WEIGHT);
       emitter.resize(channels);
       for (int c = 0; c < channels; c++)
         emitter[c] = std::max(s.light[c * area + at] / around.scale - (1.0f - share) * surface[c], 0.0f) * around.scale;
-      // what is seen through a surface is not before it
-      if (side < 0) sureness *= 1.0f - around.beyond(coc, 1, 0.5f, light, limit);
+      // an emitter seen behind a surface is not in front of it
+      if (side < 0) sureness *= 1.0f - around.certainty_beyond(coc, 1, 0.5f, light, limit);
       const float given = std::max(side < 0 ? sureness : 2.0f * sureness - 1.0f, 0.0f);
       const float kept = std::max(side < 0 ? 1.0f - sureness : 1.0f - 2.0f * sureness, 0.0f) * block.weight[within];
       const float weight = kept + given * share, per_weight = weight > 0 ? 1.0f / std::max(weight, 1e-12f) : 0.0f;
@@ -318,12 +328,12 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
     }
     if (!s.has_block(i)) continue;
 
-    // of its own pixels a surface that is dim around gets nothing
+    // return light of this pixel that was given to the other surface, if that surface is dark around it
     const Block block = s.block(i);
     const float other_light = peak_of(block.other + within, BLOCK_PIXELS, channels);
     const float taken = clamp01(side * (own_coc - block.coc[within]) - 1.0f) * clamp01(other_light / std::max(limit, TINY) - 1.0f);
     if (!(block.weight[within] * taken > 0)) continue;
-    const float given_back = taken * around.beyond(block.coc[within], side, 1.0f, light, limit);
+    const float given_back = taken * around.certainty_beyond(block.coc[within], side, 1.0f, light, limit);
     block.weight[within] *= 1.0f - given_back;
     changed |= given_back > 0;
   }
@@ -332,7 +342,7 @@ void attribute_emitter(Job &job, int y, int x, float least_limit, const float *f
   const float weight = block.weight[within];
   for (int c = 0; c < channels; c++)
     block.own[c * BLOCK_PIXELS + within] = (s.light[c * area + at] - weight * block.other[c * BLOCK_PIXELS + within]) / (1.0f - weight);
-  block.seen[within] = 1.0f - weight;
+  block.own_weight[within] = 1.0f - weight;
 }
 
 }  // namespace
@@ -357,7 +367,7 @@ Block Surfaces::make_block(int i) {
     for (int c = 0; c < channels; c++)
       memcpy(made.own + c * BLOCK_PIXELS + y * BLOCK, light + c * area() + from, columns * sizeof(float));
     memcpy(made.coc + y * BLOCK, coc + from, columns * sizeof(float));
-    for (int x = 0; x < columns; x++) made.seen[y * BLOCK + x] = valid ? valid[from + x] : 1.0f;
+    for (int x = 0; x < columns; x++) made.own_weight[y * BLOCK + x] = valid ? valid[from + x] : 1.0f;
   }
   return made;
 }
@@ -368,7 +378,7 @@ void Job::split_mixed() {
   std::vector<float> around_emitter;
   for (int dy = -EMITTER_REACH; dy <= EMITTER_REACH; dy++)
     for (int dx = -EMITTER_REACH; dx <= EMITTER_REACH; dx++) around_emitter.push_back(falloff_at(dy, dx));
-  const bool emitters = scene.kind != TORCHDOF_BACKGROUND;  // what lies behind is known then
+  const bool emitters = scene.kind != TORCHDOF_BACKGROUND;  // a given background replaces the light behind
   const int rows = surfaces.block_rows, columns = surfaces.block_columns;
   std::vector<std::unique_ptr<Window>> windows(std::max(1, scene.threads));
   parallel(rows, [&](int by, int worker) {
@@ -396,7 +406,7 @@ void Job::split_mixed() {
   });
 }
 
-void Job::put_before_background() {
+void Job::add_background() {
   const size_t area = surfaces.area();
   const float *coc = surfaces.coc, *valid = surfaces.valid;
   for (int i = 0; i < 3; i++) copies.emplace_back(area * (channels + 2));
@@ -412,7 +422,7 @@ void Job::put_before_background() {
       surfaces.row(0, y, x, own.data(), own_coc, seen);
       const bool mixed = surfaces.row(1, y, x, other.data(), other_coc, weight);
       const float valid_here = valid ? valid[at] : 1.0f, here = coc[at];
-      // what shows past a nearer surface of a mixed pixel is the background's to tell
+      // a given background replaces the farther surface of a mixed pixel
       const float share = mixed && *other_coc < here ? *weight : 0.0f;
       bool known = true;
       for (int c = 0; c < channels; c++) {
@@ -424,7 +434,7 @@ void Job::put_before_background() {
       }
       known &= std::isfinite(behind_coc[at]);
       const float there = clamp(behind_coc[at], low, high), apart = clamp01(there - here - SAME_PX);
-      float behind_weight = apart + (1.0f - apart) * share;  // else the image itself shows it
+      float behind_weight = apart + (1.0f - apart) * share;  // else the image already shows it
       if (!known) {
         behind_weight = 0;
         for (int c = 0; c < channels; c++) planes[2][c * area + at] = 0.0f;

@@ -9,8 +9,8 @@
 namespace torchdof {
 namespace {
 
-constexpr size_t KEPT_BYTES = size_t(192) << 20;  // in all
-constexpr size_t LEAST_BYTES = size_t(64) << 10;  // less is malloc's own business
+constexpr size_t KEPT_BYTES = size_t(192) << 20;  // upper limit of the memory kept
+constexpr size_t LEAST_BYTES = size_t(64) << 10;  // smaller blocks are left to malloc
 constexpr size_t HEADER = 64;
 
 struct Header {
@@ -19,7 +19,7 @@ struct Header {
 };
 
 struct Kept {
-  std::mutex mutex;  // only ever tried: after a fork somebody who is gone may hold it
+  std::mutex mutex;  // only try_lock: after a fork a thread that no longer exists may hold it
   std::vector<Header *> blocks;
   size_t bytes = 0;
 };

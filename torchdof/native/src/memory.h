@@ -1,12 +1,13 @@
-// Memory that is kept between pictures: to take it anew each time, page by page, costs a tenth of a rendering.
+// Memory that is reused between pictures. Allocating it each time, page by page, would take a tenth of the rendering
+// time.
 #pragma once
 #include <cstddef>
 
 namespace torchdof {
 
-// At least so many bytes, aligned to 64, as they are found. Throws std::bad_alloc.
+// Returns uninitialized memory, aligned to 64 bytes. Throws std::bad_alloc.
 void *take_memory(size_t bytes);
-// Gives them back; a bounded number of bytes is kept for the next to ask.
+// Frees memory; up to KEPT_BYTES are kept for reuse.
 void give_memory(void *memory);
 
 }  // namespace torchdof

@@ -1,4 +1,4 @@
-// The circle of confusion of a frame, and the places of its layers on the blur axis; the formulas stand in optics/camera.py,
+// Circles of confusion of a frame, and the positions of its layers on the blur axis; formulas in optics/camera.py,
 // render/layer_cocs.py and render/plan.py.
 #include "engine.h"
 
@@ -10,9 +10,9 @@ namespace {
 
 constexpr double FINEST = 0.5, FINEST_PARTS = 40, WIDE = FINEST * FINEST_PARTS;
 constexpr double SPACING = 0.25, SPACING_POWER = 0.8, LOOSE = 4, NEAR = 0.3;
-constexpr double CROWD = 0.03;     // share of the border's pixels that are a place of their own,
-constexpr int LEAST_CROWD = 16;    // and so many at least
-constexpr double SMALL_RADII = 3;  // a frame no larger than so many of its largest blurs is planned for less
+constexpr double CROWD = 0.03;     // share of the border's pixels that get a layer at their own position,
+constexpr int LEAST_CROWD = 16;    // and the minimum number of such pixels
+constexpr double SMALL_RADII = 3;  // a frame smaller than this many of its largest blur radii gets a smaller tolerance
 
 double finest(double x) { return std::max(FINEST, std::fabs(x) / FINEST_PARTS); }
 
@@ -22,7 +22,7 @@ double spacing(double x, double tolerance) {
   return std::max(finest(x), SPACING * loose * std::pow(std::max(std::fabs(x) + 0.5, 1.0), 0.75));
 }
 
-// Places in finest distances from focus, and back.
+// Positions in units of the finest spacing from focus, and the inverse.
 double in_finest(double x) {
   const double steps = std::min(std::fabs(x), WIDE) / FINEST + FINEST_PARTS * std::log(std::max(std::fabs(x) / WIDE, 1.0));
   return std::copysign(steps, x);
@@ -32,7 +32,7 @@ double from_finest(double steps) {
   return std::copysign(WIDE * std::exp(std::fabs(steps) / FINEST_PARTS - 1), steps);
 }
 
-// Places at which much of the frame's border lies, the most crowded first.
+// Positions on the blur axis that many of the border's pixels share, most frequent first.
 std::vector<double> border_nodes(std::vector<float> places) {
   std::vector<double> nodes;
   std::vector<int> bins(places.size());
@@ -50,7 +50,7 @@ std::vector<double> border_nodes(std::vector<float> places) {
     bool is_new = true;
     for (double other : nodes) is_new &= std::fabs(place - other) > 0.6 * finest(place);
     if (!is_new) continue;
-    std::vector<float> there;  // one that occurs: its pixels then lie in no other layer
+    std::vector<float> there;  // an actual position, so that its pixels lie in this layer alone
     for (size_t k = 0; k < bins.size(); k++)
       if (std::abs(bins[k] - first - i) <= 1) there.push_back(places[k]);
     std::nth_element(there.begin(), there.begin() + (there.size() - 1) / 2, there.end());
@@ -82,11 +82,14 @@ void coc_of_depth(const float *depth, int64_t count, float scale, float nearest,
   });
 }
 
+// 1. Fixed nodes: the nearest and the farthest place, and places with much of the border, with a neighbour on each side.
+// 2. Nodes from the focus outwards, with a spacing that grows with the blur and the tolerance.
+// 3. Nodes close to a fixed one move towards it, so that the nodes change continuously with the scene.
 std::vector<double> plan(const float *coc, int maps, int height, int width, double &tolerance, int threads) {
   float low, high;
   const int64_t area = (int64_t)height * width;
   find_ends(coc, maps * area, threads, &low, &high);
-  if (std::isnan(low)) {  // what is no number is in focus
+  if (std::isnan(low)) {  // NaN is in focus
     low = high = 0;
     for (int64_t i = 0; i < maps * area; i++) low = std::min(low, coc[i]), high = std::max(high, coc[i]);
   }
@@ -119,7 +122,7 @@ std::vector<double> plan(const float *coc, int maps, int height, int width, doub
     for (double x = spacing(0, tolerance), limit = sign < 0 ? -nearest : farthest; x < limit; x += spacing(x, tolerance)) {
       const double node = sign * x;
       if (!(nearest < node && node < farthest)) continue;
-      double near = fixed[0];  // one that comes near a fixed one moves towards it, and in the end onto it
+      double near = fixed[0];  // a node close to a fixed one moves towards it, or onto it
       for (double other : fixed)
         if (std::fabs(node - other) < std::fabs(node - near)) near = other;
       const double gap = std::fabs(node - near) / spacing(node, tolerance);

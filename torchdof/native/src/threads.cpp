@@ -21,7 +21,7 @@ struct Task {
   const volatile int *cancelled;
   int count;
   std::atomic<int> next{0}, workers{0};
-  int helping = 0;  // guarded by the pool's mutex, as error is
+  int helping = 0;  // guarded by the pool's mutex, like error
   std::exception_ptr error;
 
   // Takes indices until none is left.
@@ -83,7 +83,7 @@ class Pool {
   int size_ = 0;
 };
 
-// Never destroyed: threads wait in it until the process ends. After a fork none of them is left, so a child starts anew.
+// Never destroyed: its threads wait until the process ends. A forked child has no threads and makes a new pool.
 std::atomic<Pool *> the_pool{nullptr};
 
 Pool &pool() {

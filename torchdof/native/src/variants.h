@@ -1,4 +1,4 @@
-// The engine is compiled once for every set of instructions; the processor decides which one runs.
+// The engine is compiled once for each instruction set and chosen at run time.
 #pragma once
 #include <vector>
 
@@ -6,7 +6,7 @@
 
 namespace torchdof {
 
-// Kernels of highlights: of each radius, and what the field lets through of them.
+// Kernels of highlights, for each radius, and the field's transmittance for some radii.
 struct RayKernels {
   const float *const *kernels;
   const int32_t *halves;
