@@ -486,7 +486,7 @@ def test_what_is_no_plan_is_refused(wrong: Any) -> None:
         lambda: depth_of_field(image, depth, camera, plan=wrong),
         lambda: blur_by_coc(image, depth, plan=wrong),
     ):
-        with pytest.raises(ValueError, match=r"plan must be a Plan, as.* got "):
+        with pytest.raises(ValueError, match=r"plan must be a Plan from.* got "):
             call()
 
 
