@@ -56,7 +56,7 @@ image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m 1e45 | --fov-de
 image.exr depth.npy --focus-m 2 --fov-deg 40 --aperture-radius-m -1 | --aperture-radius-m must be positive
 image.exr depth.npy --focus-m 2 --aperture-radius-m 1 | --aperture-radius-m goes with --fov-deg
 image.exr depth.npy --focus-m 2 --fill-depth x        | --fill-depth expects nearest, far or metres, got 'x'
-image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | blurs a depth of 1.4e-45 m
+image.exr depth.npy --focus-m 2 --fill-depth 1e-45 --depth-unknown 6 | which starts at 1.4e-45 m
 image.exr depth.npy --focus-m 2 --depth-kind disparity | disparity needs a scale (--depth-scale)
 image.exr depth.npy --focus-m 2 --depth-kind distance | --depth-kind distance needs --fov-deg
 image.exr depth.npy --focus-m 2 --depth-kind coc      | --depth-kind coc is the blur itself and takes no camera
