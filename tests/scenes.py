@@ -50,6 +50,18 @@ def halves(left: float, right: float) -> Tensor:
     return values
 
 
+RED, BLUE = torch.tensor([0.7, 0.2, 0.1]), torch.tensor([0.1, 0.3, 0.8])
+
+
+def mixed_edge(share: float, near_px: float = -12.0, far_px: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Red in front of blue. Column 31 is mixed: coverage `share` of red, and the depth of the larger part."""
+    red = (torch.arange(64) < 31).float()
+    red[31] = share
+    image = (red * RED[:, None] + (1 - red) * BLUE[:, None])[None, :, None].expand(1, 3, 48, 64)
+    coc = torch.where(red >= 0.5, near_px, far_px).expand(1, 1, 48, 64)
+    return image, coc
+
+
 def disc(image: Tensor, coc_px: Tensor, table: BlurTable | None = None) -> Tensor:
     """Closed form for a plane: the image, continued outside its border, convolved with a kernel, in float64."""
     image, radius = image.double(), coc_px.flatten()[:1].double()

@@ -1,4 +1,4 @@
-"""Which engine renders: ``TORCHDOF_ENGINE``."""
+"""Choice of the engine by ``TORCHDOF_ENGINE``."""
 
 import pytest
 import torch
@@ -6,14 +6,14 @@ import torch
 from torchdof import blur_by_coc, native
 
 
-def test_the_compiled_engine_is_chosen_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_compiled_engine_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "native")
     assert native.describe() in ("native (avx2)", "native (baseline)")
     monkeypatch.delenv("TORCHDOF_ENGINE")
     assert native.describe().startswith("native (")
 
 
-def test_an_engine_of_another_version_is_not_used_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_engine_of_another_version_is_not_used_and_gives_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TORCHDOF_ENGINE", raising=False)
     monkeypatch.setattr(native, "_REVISION", -1)
     native._library.cache_clear()
@@ -28,7 +28,7 @@ def test_an_engine_of_another_version_is_not_used_and_says_so(monkeypatch: pytes
         native._library.cache_clear()
 
 
-def test_the_plain_engine_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_plain_engine_can_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TORCHDOF_ENGINE", "torch")
     assert native.describe().startswith("torch (")
 
