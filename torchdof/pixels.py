@@ -56,5 +56,5 @@ def corners(item: Tensor, row: Tensor, column: Tensor, height: int, width: int) 
     row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)
     top, left = row.floor().clamp(max=max(0, height - 2)), column.floor().clamp(max=max(0, width - 2))
     first = (item * height + top.long()) * width + left.long()
-    below, beside = min(1, height - 1) * width, min(1, width - 1)
-    return [first, first + beside, first + below, first + (below + beside)], row - top, column - left
+    down, right = min(1, height - 1) * width, min(1, width - 1)  # index steps; 0 on an axis of one pixel
+    return [first, first + right, first + down, first + (down + right)], row - top, column - left

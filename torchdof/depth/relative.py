@@ -43,7 +43,7 @@ def from_relative(
         far_m: Distance of the farthest value, in metres, > ``near_m``; ``inf`` is allowed except for ``"depth"``.
         kind: Kind of the numbers.
         value_range: ``(smallest, largest)``; other values are clamped to this range. None takes the extremes of each
-            item. Give it for the frames of a shot, so that all are scaled alike.
+            item. Give it for the frames of a shot, so that all have the same scale.
         unknown: A value that marks pixels without depth, for example 0.
 
     Returns:
@@ -76,7 +76,7 @@ def from_relative(
         if not is_traced() and not bool((low < high).all()):
             problem = "no value" if bool((low > high).any()) else "one value everywhere"
             raise ValueError(
-                f"relative depth needs two different values to tell near from far, got {problem}; give "
+                f"relative depth needs two different values to distinguish near from far, got {problem}; give "
                 "value_range=(smallest, largest) (--value-range) if the values mean something beyond this map"
             )
     else:
