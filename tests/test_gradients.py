@@ -34,7 +34,7 @@ def case() -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("way", SUMS.values(), ids=SUMS)
 @pytest.mark.parametrize("name", [*NUMBERS, "coc_px"])
-def test_gradients_are_those_of_finite_differences(name: str, way: dict[str, Any]) -> None:
+def test_gradients_equal_finite_differences(name: str, way: dict[str, Any]) -> None:
     given = case()
     if name == "coc_px":  # noise, because an even slope would lie exactly on kinks
         coc = torch.linspace(-2.83, 3.17, 12, dtype=torch.float64) + 0.2 * torch.rand(12, dtype=torch.float64)

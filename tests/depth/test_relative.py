@@ -106,7 +106,7 @@ def test_from_relative_compiles_without_graph_breaks() -> None:
         (row(1.0, 2.0), (1.0, 2.0, "metric"), "must be one of disparity, inverse, depth, got 'metric'"),
         (row(3.0, 3.0), (1.0, 2.0), r"two different values .* one value everywhere; give value_range"),
         (row(3.0), (1.0, 2.0), "two different values"),
-        (row(NAN, INF), (1.0, 2.0), "two different values to tell near from far, got no value"),
+        (row(NAN, INF), (1.0, 2.0), "two different values to distinguish near from far, got no value"),
         (torch.ones(3, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[3, 4\]; add the missing dimensions"),
         (torch.ones(1, 3, 4, 4), (1.0, 2.0), r"must be \[B, 1, H, W\], got \[1, 3, 4, 4\]"),
         (np.ones((3, 4)), (1.0, 2.0), "got ndarray; convert an array with torch.from_numpy"),

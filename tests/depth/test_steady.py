@@ -67,7 +67,7 @@ def shot(frames: int, pan_px: float = 0.0, ball_px: float = 0.0, cut: int = 10**
 
 
 def as_estimated(depth: Tensor, frame: int, noise: float = 0.01, blocks: bool = False) -> Tensor:
-    """Depth with noise, and edges off by up to a pixel: the whole frame alike, or each block of 8 x 8 separately."""
+    """Depth with noise, and edges displaced by up to a pixel: the whole frame at once, or each block of 8 x 8."""
     generator = torch.Generator().manual_seed(1000 + frame)
     size = (HEIGHT // 8, WIDTH // 8) if blocks else (1, 1)
     jitter = torch.randint(-1, 2, (1, 2, *size), generator=generator).float()
@@ -107,7 +107,7 @@ def rendered(frames: Shot, depths: list[Tensor]) -> list[Tensor]:
     ]
 
 
-@pytest.mark.parametrize("blocks", [False, True], ids=["edges jitter alike", "edges jitter each on its own"])
+@pytest.mark.parametrize("blocks", [False, True], ids=["the whole frame jitters", "each block jitters"])
 def test_flicker_of_24_frames_falls_below_a_third(blocks: bool) -> None:
     exact = shot(24)
     given = [(image, as_estimated(depth, t, blocks=blocks)) for t, (image, depth) in enumerate(exact)]
